@@ -1,0 +1,1 @@
+"""Drivers know bytes: async conversations with instruments and controllers, nothing about physics or jobs."""

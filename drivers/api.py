@@ -1,0 +1,143 @@
+"""What devices can do, as small Protocols, and the plain values they return.
+
+Lengths here keep the unit of the wire's meaning (mm for commands, nm or 0.1 nm counts for raw readings) so that nothing is lost before
+storage; the service turns raw counts into arrays in one place. Times ``host_s`` are monotonic host seconds at the last byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from typing import Protocol
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """Who answered."""
+
+    kind: str
+    model: str
+    serial_no: str
+    boot_id: int
+    firmware: str
+
+
+@dataclass(frozen=True, slots=True)
+class BarSample:
+    """One ball-bar sample as the box sent it (docs/protocols/ballbar.md)."""
+
+    seq: int
+    device_us: int
+    reading_nm: int
+    status: int
+
+
+@dataclass(frozen=True, slots=True)
+class BarBatch:
+    """Samples that arrived together. ``missing``: samples the sequence numbers say are lost just before this batch's samples."""
+
+    host_s: float
+    samples: tuple[BarSample, ...]
+    missing: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LaserReading:
+    """One coherent output sample of the laser (docs/protocols/laser.md)."""
+
+    host_s: float
+    sample_count: int
+    device_us: int
+    displacement_tenth_nm: int
+    signal_permille: int
+    status: int
+    air_temp_c: float
+    air_pressure_pa: float
+    humidity_percent: float
+    refractivity: float
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerStatus:
+    """One coherent status block of the controller (docs/protocols/cnc.md)."""
+
+    host_s: float
+    ctrl_us: int
+    bits: int
+    alarm_code: int
+    motion_ack_seq: int
+    motion_result: int
+    motion_done_seq: int
+    position_mm: Point
+    fifo_free: int
+    path_points_done: int
+    path_start_us: int
+    path_end_us: int
+    override_percent: int
+    in_position_us: int
+    fifo_ack_seq: int
+    fifo_result: int
+
+
+@dataclass(frozen=True, slots=True)
+class CompStatus:
+    """One coherent compensation status block, with the generation counter and boot id read around it (seqlock)."""
+
+    boot_id: int
+    gen: int
+    active_bank: int
+    bank_crc: tuple[int, int]
+    bank_state: tuple[int, int]
+    lease_owner: int
+    lease_left_ms: int
+
+
+class BallBar(Protocol):
+    """A telescoping ball-bar."""
+
+    async def identify(self) -> DeviceInfo: ...
+    def stream(self, rate_hz: int) -> AbstractAsyncContextManager[AsyncIterator[BarBatch]]: ...
+    async def close(self) -> None: ...
+
+
+class DisplacementMeter(Protocol):
+    """A laser Doppler displacement meter."""
+
+    async def identify(self) -> DeviceInfo: ...
+    async def zero(self) -> None: ...
+    async def clear_beam(self) -> None: ...
+    async def read(self, *, after_count: int | None = None) -> LaserReading: ...
+    async def close(self) -> None: ...
+
+
+class Controller(Protocol):
+    """Motion, status and compensation banks of a CNC controller."""
+
+    async def identify(self) -> DeviceInfo: ...
+    async def status(self) -> ControllerStatus: ...
+    async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus: ...
+    async def load_path(self, points_mm: Sequence[Point]) -> None: ...
+    async def start_path(self, *, feed_mm_min: float) -> None: ...
+    async def hold(self) -> None: ...
+    async def resume(self) -> None: ...
+    async def abort(self) -> None: ...
+    async def comp_status(self) -> CompStatus: ...
+    async def lease(self, owner: int, lease_ms: int) -> None: ...
+    async def release(self, owner: int) -> None: ...
+    async def write_bank(self, bank: int, image: bytes) -> None: ...
+    async def read_bank(self, bank: int, n_bytes: int | None = None) -> bytes: ...
+    async def seal(self, bank: int, owner: int) -> None: ...
+    async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None: ...
+    async def close(self) -> None: ...
+
+
+class Fixture(Protocol):
+    """Whoever mounts bars and mirrors: the operator at the console, or a remote fixture (docs/protocols/fixture.md)."""
+
+    async def mount_ballbar(self, radius_mm: float) -> None: ...
+    async def mount_laser(self, beam: Point) -> None: ...
+    async def unmount(self) -> None: ...
+    async def close(self) -> None: ...

@@ -1,0 +1,1 @@
+"""Models know physics: pure functions of numpy arrays, no I/O, clock or logging."""

@@ -1,0 +1,1 @@
+"""Service knows the job: it measures, solves, compensates, verifies, stores and reports."""
