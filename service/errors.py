@@ -1,0 +1,82 @@
+"""Errors of the job, with stable codes. The command line prints one line of cause and remedy and exits with 2."""
+
+from __future__ import annotations
+
+
+class AbbeError(Exception):
+    """Something a person has to know: what is wrong, where, and what to do.
+
+    Parameters
+    ----------
+    detail : str
+        What is wrong and where.
+    remedy : str, optional
+        What to do about it.
+    """
+
+    code = "ABB-000"
+
+    def __init__(self, detail: str, remedy: str = "") -> None:
+        self.detail = detail
+        self.remedy = remedy
+        super().__init__(f"{detail}" + (f" - {remedy}" if remedy else ""))
+
+
+class ConfigError(AbbeError):
+    """The machine file is missing, unreadable, or says something impossible."""
+
+    code = "CFG-001"
+
+
+class FileFormatError(AbbeError):
+    """An exchange file is not what run-format demands: file, key, row and what was expected."""
+
+    code = "FMT-001"
+
+
+class StoreError(AbbeError):
+    """The database cannot be opened, is of another version, or does not hold what was asked for."""
+
+    code = "STO-001"
+
+
+class StrokeError(AbbeError):
+    """A planned path leaves the machine's strokes. Raised by the dry run, before anything moves."""
+
+    code = "SEQ-001"
+
+
+class UnsafeToMove(AbbeError):
+    """An interlock forbids motion, or went away during it."""
+
+    code = "SEQ-002"
+
+
+class MeasurementFault(AbbeError):
+    """A run cannot be completed: link lost, beam lost, bar out of range, feed changed."""
+
+    code = "SEQ-003"
+
+
+class NotObservable(AbbeError):
+    """The data cannot carry the claim that was asked for."""
+
+    code = "SOL-001"
+
+
+class TableRefused(AbbeError):
+    """A table breaks a limit (value, step, change). Nothing was written."""
+
+    code = "CMP-001"
+
+
+class TableMismatch(AbbeError):
+    """The controller does not hold the table that was sent. It was not activated."""
+
+    code = "CMP-002"
+
+
+class VerificationFailed(AbbeError):
+    """The machine was not better with the new table; the old one is active again."""
+
+    code = "CMP-003"
