@@ -1,0 +1,1 @@
+"""From error parameters to what a controller stores, and what will be left after it."""

@@ -1,0 +1,133 @@
+"""Nine one-axis tables: correction of each axis as a function of each axis, on the controller's grid.
+
+The best nine tables for a deviation field are its main effects: the mean over the other two axes (least squares on a product grid). What
+angles do at a distance that depends on two axes at once is left over; a 3-D grid (another kind of table) would take it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.geometry.chain import design
+from models.machine import AXES, Machine
+from models.solvers.joint import JointSolution
+from models.volumetric import remove_rigid, volume_grid
+
+
+@dataclass(frozen=True)
+class NineTables:
+    """Correction added to the command: ``correction_mm[a][:, i]`` for output i at ``position_mm[a]`` of input axis a.
+
+    ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the reference position.
+    """
+
+    position_mm: tuple[F1, F1, F1]
+    correction_mm: tuple[F2, F2, F2]
+    u_mm: tuple[F2, F2, F2]
+
+    def correction_at(self, axes_mm: F2) -> F2:
+        """Correction at commanded positions by linear interpolation, end values held, shape (n, 3), mm."""
+        out = np.zeros((axes_mm.shape[0], 3))
+        for a in range(3):
+            for i in range(3):
+                out[:, i] += np.interp(axes_mm[:, a], self.position_mm[a], self.correction_mm[a][:, i])
+        return out
+
+
+def grid_positions(machine: Machine, counts: tuple[int, int, int]) -> tuple[F1, F1, F1]:
+    """Equidistant grid of each axis over its stroke, pitch rounded to whole 10 nm so that the controller stores it exactly."""
+    grids = []
+    for a, n in enumerate(counts):
+        if n < 2:
+            raise ValueError(f"table grid of {AXES[a]}: {n} points, at least 2 are needed")
+        pitch = np.floor(machine.length_mm[a] / (n - 1) * 1e5) / 1e5
+        grids.append(machine.stroke_mm[a, 0] + pitch * np.arange(n))
+    return grids[0], grids[1], grids[2]
+
+
+def nine_tables(solution: JointSolution, counts: tuple[int, int, int], *, nodes: int = 9) -> NineTables:
+    """Best nine tables for the machine as identified, zero at the first grid position of each axis.
+
+    Parameters
+    ----------
+    counts : (int, int, int)
+        Grid points of X, Y, Z.
+    nodes : int
+        Nodes per axis of the average over the other two axes.
+    """
+    machine = solution.machine
+    grids = grid_positions(machine, counts)
+    corrections, uncertainties = [], []
+    for a in range(3):
+        effect = main_effect(machine, solution, a, grids[a], nodes)
+        relative = effect - effect[0]
+        corrections.append(-(relative @ solution.coefficients))
+        variance = np.einsum("nik,kl,nil->ni", relative, solution.term_covariance, relative)
+        uncertainties.append(np.sqrt(np.maximum(variance, 0.0)))
+    return NineTables(grids, (corrections[0], corrections[1], corrections[2]), (uncertainties[0], uncertainties[1], uncertainties[2]))
+
+
+def main_effect(
+    machine: Machine, solution: JointSolution, axis: int, positions_mm: F1, nodes: int
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Design of the mean deviation over the other two axes, shape (len(positions), 3, terms)."""
+    box = machine.stroke_mm.copy()
+    others = [b for b in range(3) if b != axis]
+    plane = np.stack(np.meshgrid(*[_cell_centres(box[b], nodes) for b in others], indexing="ij"), axis=-1).reshape(-1, 2)
+    points = np.empty((positions_mm.size, plane.shape[0], 3))
+    points[:, :, axis] = positions_mm[:, None]
+    points[:, :, others] = plane[None]
+    full = design(machine, solution.terms, points.reshape(-1, 3))
+    return np.asarray(full.reshape(positions_mm.size, plane.shape[0], 3, -1).mean(axis=1))
+
+
+def _cell_centres(stroke_mm: F1, nodes: int) -> F1:
+    step = (stroke_mm[1] - stroke_mm[0]) / nodes
+    return np.asarray(stroke_mm[0] + step * (np.arange(nodes) + 0.5))
+
+
+def quantise(tables: NineTables, lsb_mm: float) -> NineTables:
+    """The tables as the controller will store them: every entry rounded to its unit."""
+    rounded = tuple(np.round(c / lsb_mm) * lsb_mm for c in tables.correction_mm)
+    return NineTables(tables.position_mm, (rounded[0], rounded[1], rounded[2]), tables.u_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """Volumetric rms (rigid motion removed) by the identified model, mm; ``u_model_mm``: rms error of the model itself."""
+
+    before_mm: float
+    after_mm: float
+    u_model_mm: float
+
+
+def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int = 9) -> Predicted:
+    """What the identified model says the machine will do without and with these tables, and how well it knows."""
+    machine = solution.machine
+    grid = volume_grid(machine.stroke_mm, nodes)
+    field = solution.deviation_mm(grid)
+    corrected = field + tables.correction_at(grid)
+
+    def rms(v: F2) -> float:
+        return float(np.sqrt(np.mean(np.sum(remove_rigid(grid, v) ** 2, axis=1))))
+
+    return Predicted(rms(field), rms(corrected), model_uncertainty_mm(solution, nodes=nodes))
+
+
+def model_uncertainty_mm(solution: JointSolution, *, nodes: int = 9, draws: int = 64) -> float:
+    """Rms over volume and posterior draws of the error of the identified field, rigid motion removed, mm.
+
+    Draws use a fixed generator: the same solution always gives the same figure.
+    """
+    grid = volume_grid(solution.machine.stroke_mm, nodes)
+    full = design(solution.machine, solution.terms, grid)
+    values, vectors = np.linalg.eigh(solution.term_covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    rng = np.random.default_rng(230)
+    total = 0.0
+    for _ in range(draws):
+        total += float(np.mean(np.sum(remove_rigid(grid, full @ (root @ rng.standard_normal(values.size))) ** 2, axis=1)))
+    return float(np.sqrt(total / draws))

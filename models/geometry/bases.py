@@ -1,0 +1,88 @@
+"""Smooth error functions of one axis: Legendre polynomials over the stroke, with the field's datum rules built in.
+
+Positioning and angles are zero at the start of the stroke; straightness has no constant and no slope (math.md 1), by construction: the
+Legendre polynomials of order 2 and more are orthogonal to 1 and x over the stroke.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from models.arrays import F1, F2
+
+DIRECTIONS = ("X", "Y", "Z")
+ROTATIONS = ("A", "B", "C")
+
+
+def motion_names(axis: str) -> tuple[str, ...]:
+    """ISO 230-1 names of the six error motions of an axis, translations first: EXX EYX EZX EAX EBX ECX for X."""
+    return tuple(f"E{c}{axis}" for c in DIRECTIONS + ROTATIONS)
+
+
+def legendre_values(x_mm: F1, stroke_mm: F1, order: int) -> F2:
+    """Legendre polynomials P0..P_order over the stroke, shape (n, order + 1); the end value is held outside the stroke."""
+    lo, hi = float(stroke_mm[0]), float(stroke_mm[1])
+    u = np.clip(2.0 * (np.asarray(x_mm, dtype=np.float64) - lo) / (hi - lo) - 1.0, -1.0, 1.0)
+    return np.asarray(legendre.legvander(u, order), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One column of the model: error motion ``motion`` (e.g. ``"EYX"``), Legendre order ``order``, of axis index ``axis``.
+
+    ``component`` 0..2 is a translation X, Y, Z; 3..5 a rotation A, B, C. Squareness is ``C0Y``, ``B0Z``, ``A0Z`` with order 0.
+    """
+
+    motion: str
+    order: int
+    axis: int
+    component: int
+
+    @property
+    def name(self) -> str:
+        """Name as people read it: ``EYX.3``, ``C0Y``."""
+        return f"{self.motion}.{self.order}" if self.order else self.motion
+
+
+def smooth_terms(order: int) -> tuple[Term, ...]:
+    """All terms of the 21 error motions up to a Legendre order: 18 order - 3 columns (math.md 4.6)."""
+    if order < 1:
+        raise ValueError(f"order {order}: must be 1 or more")
+    terms: list[Term] = []
+    for a, axis in enumerate(DIRECTIONS):
+        for c, motion in enumerate(motion_names(axis)):
+            first = 2 if c < 3 and c != a else 1
+            terms.extend(Term(motion, k, a, c) for k in range(first, order + 1))
+    terms.extend(Term(name, 0, axis, comp) for name, axis, comp in (("C0Y", 1, 0), ("B0Z", 2, 0), ("A0Z", 2, 1)))
+    return tuple(terms)
+
+
+def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
+    """Value of each term's own function at commanded positions, before any lever arm.
+
+    Parameters
+    ----------
+    terms : tuple of Term
+    axes_mm : array, shape (n, 3)
+    stroke_mm : array, shape (3, 2)
+
+    Returns
+    -------
+    array, shape (n, len(terms)): Legendre value (zero at stroke start for positioning and angles), or, for squareness, the travel of the
+    axis from its stroke start with the sign of docs/conventions.md.
+    """
+    order = max((t.order for t in terms), default=0)
+    start = legendre_values(np.zeros(1), np.array([0.0, 1.0]), order)[0]  # P_k(-1)
+    tables = [legendre_values(axes_mm[:, a], stroke_mm[a], order) for a in range(3)]
+    out = np.empty((axes_mm.shape[0], len(terms)))
+    for i, t in enumerate(terms):
+        if t.order == 0:
+            travel = axes_mm[:, t.axis] - stroke_mm[t.axis, 0]
+            out[:, i] = travel if t.motion == "B0Z" else -travel
+        else:
+            straight = t.component < 3 and t.component != t.axis
+            out[:, i] = tables[t.axis][:, t.order] - (0.0 if straight else start[t.order])
+    return out

@@ -1,0 +1,107 @@
+"""The nominal machine: which carriage carries what, how far it travels, where it pivots, how long the tool is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from models.arrays import F1, F2, F3
+
+AXES = ("X", "Y", "Z")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Nominal geometry of a 3-axis machine (docs/conventions.md).
+
+    Parameters
+    ----------
+    chain : str
+        Carriages from workpiece ``w`` over the bed ``b`` to the tool ``t``, e.g. ``"w-X-Y-b-Z-t"``; X, Y, Z once each.
+    stroke_mm : array, shape (3, 2)
+        First and last commanded position of X, Y, Z.
+    pivots_mm : array, shape (3, 3)
+        Pivot of the X, Y, Z carriage: table frame for a work-side carriage, relative to the spindle reference for a tool-side one.
+    tool_mm : array, shape (3,)
+        From the spindle reference to the functional point.
+
+    Raises
+    ------
+    ValueError
+        The chain is not made of w, b, t and X, Y, Z once each, or an array has another shape, or a stroke is empty.
+    """
+
+    chain: str
+    stroke_mm: F2
+    pivots_mm: F2 = field(default_factory=lambda: np.zeros((3, 3)))
+    tool_mm: F1 = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        """Check and normalise once, so that everything later can trust the geometry."""
+        for name, shape in (("stroke_mm", (3, 2)), ("pivots_mm", (3, 3)), ("tool_mm", (3,))):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"machine: {name} must be finite numbers of shape {shape}, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        if (self.stroke_mm[:, 1] <= self.stroke_mm[:, 0]).any():
+            raise ValueError("machine: every stroke_mm must run from its smaller to its larger position")
+        split_chain(self.chain)
+
+    @property
+    def length_mm(self) -> F1:
+        """Stroke lengths of X, Y, Z, shape (3,)."""
+        length: F1 = self.stroke_mm[:, 1] - self.stroke_mm[:, 0]
+        return length
+
+    @property
+    def centre_mm(self) -> F1:
+        """Middle of the strokes, shape (3,)."""
+        centre: F1 = 0.5 * (self.stroke_mm[:, 0] + self.stroke_mm[:, 1])
+        return centre
+
+
+def split_chain(chain: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Carriages of a chain string as axis indices: (work side from workpiece to bed, tool side from bed to tool).
+
+    Raises
+    ------
+    ValueError
+        Not ``w-...-b-...-t`` with X, Y, Z once each.
+    """
+    parts = chain.split("-")
+    carriages = [p for p in parts if p in AXES]
+    if len(parts) != 6 or parts[0] != "w" or parts[-1] != "t" or parts.count("b") != 1 or sorted(carriages) != list(AXES):
+        raise ValueError(f"chain {chain!r}: expected w-...-b-...-t with X, Y, Z once each, e.g. w-X-Y-b-Z-t")
+    bed = parts.index("b")
+    return tuple(AXES.index(p) for p in parts[1:bed]), tuple(AXES.index(p) for p in parts[bed + 1 : -1])
+
+
+def lever_masks(chain: str) -> F3:
+    """Which commanded travels belong to the lever arm of each carriage (rule G), shape (3 carriages, 3 axes), 0 or 1.
+
+    Tool side: travels of the carriages nearer the tool. Work side: all travels except those of carriages nearer the workpiece.
+    """
+    work, tool = split_chain(chain)
+    mask = np.zeros((3, 3))
+    for k, j in enumerate(tool):
+        mask[j, list(tool[k + 1 :])] = 1.0
+    for k, j in enumerate(work):
+        mask[j] = 1.0
+        mask[j, list(work[:k])] = 0.0
+    return mask
+
+
+def levers_mm(machine: Machine, axes_mm: F2) -> F3:
+    """Lever arms r_j of rule G at commanded positions.
+
+    Parameters
+    ----------
+    axes_mm : array, shape (n, 3)
+
+    Returns
+    -------
+    array, shape (n, 3 carriages, 3)
+    """
+    travel: F3 = np.asarray(axes_mm, dtype=np.float64)[:, None, :] * lever_masks(machine.chain)[None]
+    return travel + machine.tool_mm - machine.pivots_mm[None]

@@ -1,0 +1,1 @@
+"""Geometry of the tests, shared by sequences and solvers."""

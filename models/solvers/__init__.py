@@ -1,0 +1,1 @@
+"""From observations to error parameters with uncertainty, and to what the observations cannot tell."""

@@ -1,0 +1,111 @@
+"""What observations can and cannot tell: rank with a stated tolerance, and the null space in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+
+RANK_TOLERANCE = 1e-9
+EFFECTIVE_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """A direction of parameter space that the observations do not see.
+
+    ``weights`` relate the parameters in units of their typical size, largest first; ``text`` says it in words.
+    """
+
+    weights: tuple[tuple[str, float], ...]
+    text: str
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Rank analysis of a scaled design.
+
+    Attributes
+    ----------
+    n_parameters, rank, effective_rank : int
+        Singular values above 1e-9 and 1e-3 of the largest (math.md 4.6).
+    condition : float
+        Largest over smallest singular value counted in ``rank``.
+    hidden : tuple of Combination
+        The null space (beyond ``rank``) as sparse combinations.
+    """
+
+    n_parameters: int
+    rank: int
+    effective_rank: int
+    condition: float
+    hidden: tuple[Combination, ...]
+
+
+def project_out(a: F2, nuisance: F2) -> F2:
+    """Design with everything that set-up unknowns could explain taken out: (I - N N+) a."""
+    if nuisance.shape[1] == 0:
+        return a
+    norm = np.linalg.norm(nuisance, axis=0)
+    u, s, _ = linalg.svd(nuisance[:, norm > 0] / norm[norm > 0], full_matrices=False)
+    basis = u[:, s > RANK_TOLERANCE * s[0]] if s.size else u[:, :0]
+    return np.asarray(a - basis @ (basis.T @ a))
+
+
+def analyse(names: tuple[str, ...], a: F2, typical: F1 | None = None, *, tolerance: float = RANK_TOLERANCE) -> Identifiability:
+    """Rank, condition and null space of a design.
+
+    Parameters
+    ----------
+    a : array, shape (n, p)
+        Whitened design, set-up unknowns projected out.
+    typical : array, shape (p,), optional
+        Typical size of each parameter; default: unit-norm columns (the convention of math.md 4.4 to 4.6).
+    """
+    norm = np.linalg.norm(a, axis=0)
+    seen = norm > tolerance * (norm.max() if norm.size else 1.0)
+    scale = np.where(seen, 1.0 / np.where(seen, norm, 1.0), 1.0) if typical is None else typical
+    _, s, vt = linalg.svd(a * scale, full_matrices=True)
+    s = np.concatenate([s, np.zeros(len(names) - s.size)])
+    top = s[0] if s.size and s[0] > 0 else 1.0
+    rank = int((s > tolerance * top).sum())
+    effective = int((s > EFFECTIVE_TOLERANCE * top).sum())
+    condition = float(top / s[rank - 1]) if rank else float("inf")
+    hidden = tuple(_in_words(names, v) for v in sparse_rows(vt[rank:]))
+    return Identifiability(len(names), rank, effective, condition, hidden)
+
+
+def sparse_rows(null: F2) -> F2:
+    """A basis of the same space with as many zeros as elimination gives: reduced row echelon form by largest pivot."""
+    m = np.array(null, dtype=np.float64)
+    row = 0
+    free = np.ones(m.shape[1], dtype=bool)
+    while row < m.shape[0]:
+        block = np.abs(m[row:]) * free
+        i, j = divmod(int(block.argmax()), block.shape[1])
+        if block[i, j] < 1e-9:
+            break
+        swap = np.array([row, row + i])
+        m[swap] = m[swap[::-1]]
+        m[row] /= m[row, j]
+        others = np.arange(m.shape[0]) != row
+        m[others] -= np.outer(m[others, j], m[row])
+        free[j] = False
+        row += 1
+    m[np.abs(m) < 1e-7] = 0.0
+    return m
+
+
+def _in_words(names: tuple[str, ...], v: F1) -> Combination:
+    order = np.argsort(-np.abs(v))
+    parts = tuple((names[i], float(v[i])) for i in order if abs(v[i]) > 1e-3)
+    shown = [n for n, _ in parts[:4]]
+    if len(parts) == 1:
+        text = f"{shown[0]} leaves no trace in these data"
+    else:
+        more = f" and {len(parts) - 4} more" if len(parts) > 4 else ""
+        text = f"{', '.join(shown[:-1])} and {shown[-1]}{more} cannot be told apart"
+    return Combination(parts, text)

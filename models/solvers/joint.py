@@ -1,0 +1,207 @@
+"""One joint solution of ball-bar and laser runs: 21 error motions, lost motion, and every set-up error as an unknown.
+
+Published methods solve the data sets one by one and take the set-ups as perfect (math.md 4.5, 5.4). Here cup offsets, bar lengths, mirror
+tilts, laser zeros and drifts are unknowns with documented priors (`models.solvers.priors`); what the data cannot separate is listed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from models.geometry.chain import design
+from models.machine import Machine
+from models.solvers.identifiability import Identifiability, analyse, project_out
+from models.solvers.least_squares import Estimate, solve_map
+from models.solvers.observations import RunData
+from models.solvers.priors import Priors, term_prior_sd
+
+
+@dataclass(frozen=True)
+class RunFit:
+    """How one run was fitted: its residuals in the order of its readings, and their rms, mm."""
+
+    label: str
+    kind: str
+    residual_mm: F1
+    rms_mm: float
+
+
+@dataclass(frozen=True)
+class JointSolution:
+    """Error motions of the machine from all runs together.
+
+    ``estimate`` holds the smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns.
+    """
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    estimate: Estimate
+    identifiability: Identifiability
+    runs: tuple[RunFit, ...]
+
+    @property
+    def coefficients(self) -> F1:
+        """Coefficients of the smooth terms, shape (len(terms),)."""
+        return self.estimate.theta[: len(self.terms)]
+
+    @property
+    def term_covariance(self) -> F2:
+        """Covariance of the smooth terms' coefficients."""
+        n = len(self.terms)
+        return self.estimate.covariance[:n, :n]
+
+    def deviation_mm(self, axes_mm: F2) -> F2:
+        """Predicted deviation (without lost motion) at commanded positions, shape (n, 3)."""
+        return np.asarray(design(self.machine, self.terms, axes_mm) @ self.coefficients)
+
+    def backlash_mm(self) -> dict[str, tuple[float, float]]:
+        """Lost motion of each axis and its standard uncertainty, mm."""
+        return {a: (self.estimate.value(f"backlash_{a}"), self.estimate.u(f"backlash_{a}")) for a in DIRECTIONS}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Names and priors of the set-up unknowns of a campaign."""
+
+    names: tuple[str, ...]
+    prior_sd: F1
+
+
+def setup_unknowns(runs: tuple[RunData, ...], priors: Priors) -> Setup:
+    """Set-up unknowns of a set of runs: per cup, per bar length, per mirror, per laser run."""
+    sd: dict[str, float] = {}
+    for run in runs:
+        if run.kind == "bar":
+            sd |= {f"cup_{run.setup}_{a}": priors.cup_mm for a in "xyz"}
+            sd[f"bar_length_{run.radius_mm:g}"] = priors.bar_length_mm
+        else:
+            if _bent(run):
+                sd |= {f"tilt_{run.setup}_{k}": priors.tilt_rad for k in "12"}
+            sd[f"zero_{run.label}"] = priors.zero_mm
+            sd[f"drift_{run.label}"] = priors.drift_mm_s
+    return Setup(tuple(sd), np.array(list(sd.values())))
+
+
+def perpendicular(beam: F1) -> F2:
+    """Two unit vectors perpendicular to a beam and to each other, shape (2, 3)."""
+    helper = np.eye(3)[int(np.argmin(np.abs(beam)))]
+    first = np.cross(beam, helper)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(beam, first)])
+
+
+def _bent(run: RunData) -> bool:
+    """Whether the path leaves the beam, so that a tilted mirror shows."""
+    assert run.beam is not None
+    d = run.axes_mm - run.axes_mm[0]
+    return bool(np.abs(d - np.outer(d @ run.beam, run.beam)).max() > 1e-6)
+
+
+def bar_normals(run: RunData) -> F2:
+    """Unit vectors from the nominal cup to the commanded positions, shape (n, 3)."""
+    assert run.centre_mm is not None
+    d = run.axes_mm - run.centre_mm
+    return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))
+
+
+def run_design(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup) -> F2:
+    """Linearised reading per unit of every unknown of the campaign, shape (n, terms + 3 + set-up)."""
+    field = design(machine, terms, run.axes_mm)
+    lost = -0.5 * run.sign
+    out = np.zeros((run.deviation_mm.size, len(setup.names)))
+    at = {name: i for i, name in enumerate(setup.names)}
+    if run.kind == "bar":
+        n = bar_normals(run)
+        for k, a in enumerate("xyz"):
+            out[:, at[f"cup_{run.setup}_{a}"]] = -n[:, k]
+        out[:, at[f"bar_length_{run.radius_mm:g}"]] = 1.0
+        return np.concatenate([np.einsum("ni,nik->nk", n, field), n * lost, out], axis=1)
+    assert run.beam is not None
+    d = run.axes_mm - run.axes_mm[0]
+    if _bent(run):
+        for k, t in enumerate(perpendicular(run.beam)):
+            out[:, at[f"tilt_{run.setup}_{k + 1}"]] = d @ t
+    out[:, at[f"zero_{run.label}"]] = 1.0
+    out[:, at[f"drift_{run.label}"]] = run.t_s - run.t_s[0]
+    seen = np.einsum("i,nik->nk", run.beam, field - field[0])
+    return np.concatenate([seen, (lost - lost[0]) * run.beam, out], axis=1)
+
+
+def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> F1:
+    """Reading of a run for given unknowns; the ball-bar without linearisation, shape (n,)."""
+    if run.kind == "laser":
+        return np.asarray(run_design(machine, terms, run, setup) @ theta)
+    assert run.centre_mm is not None
+    assert run.radius_mm is not None
+    at = {name: i for i, name in enumerate(setup.names)}
+    n_terms = len(terms)
+    tip = run.axes_mm - run.centre_mm + design(machine, terms, run.axes_mm) @ theta[:n_terms]
+    tip = tip - 0.5 * run.sign * theta[n_terms : n_terms + 3]
+    rest = theta[n_terms + 3 :]
+    tip = tip - np.array([rest[at[f"cup_{run.setup}_{a}"]] for a in "xyz"])
+    return np.asarray(np.linalg.norm(tip, axis=1) - run.radius_mm + rest[at[f"bar_length_{run.radius_mm:g}"]])
+
+
+def nominal_reading(run: RunData) -> F1:
+    """Reading of a perfect machine with a perfect set-up: the sagitta of a polyline path for the ball-bar, zero for the laser."""
+    if run.kind == "laser":
+        return np.zeros(run.deviation_mm.size)
+    assert run.radius_mm is not None
+    return np.asarray(np.linalg.norm(run.axes_mm - run.centre_mm, axis=1) - run.radius_mm)
+
+
+def solve_joint(
+    machine: Machine,
+    runs: tuple[RunData, ...],
+    *,
+    order: int,
+    sigma_mm: dict[str, float],
+    floor_mm: dict[str, float],
+    priors: Priors | None = None,
+) -> JointSolution:
+    """Solve all runs of a campaign together.
+
+    Parameters
+    ----------
+    order : int
+        Highest Legendre order of the error motions.
+    sigma_mm, floor_mm : dict with keys "bar", "laser"
+        Standard uncertainty of one raw reading; smallest uncertainty of an averaged value (what smooth functions cannot follow).
+
+    Raises
+    ------
+    ValueError
+        No runs, or a run that cannot be used (named).
+    """
+    if not runs:
+        raise ValueError("joint solution: no runs")
+    priors = priors or Priors()
+    terms = smooth_terms(order)
+    setup = setup_unknowns(runs, priors)
+    names = tuple(t.name for t in terms) + tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
+    prior = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+    blocks = [run_design(machine, terms, run, setup) for run in runs]
+    a = np.concatenate(blocks)
+    sigma = np.concatenate([np.hypot(sigma_mm[r.kind] / np.sqrt(r.weight_n), floor_mm[r.kind]) for r in runs])
+    y = np.concatenate([r.deviation_mm for r in runs])
+    estimate = solve_map(names, a, y - np.concatenate([nominal_reading(r) for r in runs]), sigma, prior)
+    for _ in range(2):  # the ball-bar is slightly non-linear: 0.01 um at 60 um of offset
+        theta = estimate.theta
+        predicted = np.concatenate([predict(machine, terms, r, setup, theta) for r in runs])
+        estimate = solve_map(names, a, y - predicted + a @ theta, sigma, prior)
+    theta = estimate.theta
+    residual = y - np.concatenate([predict(machine, terms, r, setup, theta) for r in runs])
+    n_terms = len(terms)
+    seen = project_out(a[:, :n_terms] / sigma[:, None], a[:, n_terms:] / sigma[:, None])
+    rank = analyse(names[:n_terms], seen, prior[:n_terms])
+    return JointSolution(machine, terms, estimate, rank, _fits(runs, residual))
+
+
+def _fits(runs: tuple[RunData, ...], residual: F1) -> tuple[RunFit, ...]:
+    ends = np.cumsum([r.deviation_mm.size for r in runs])
+    parts = np.split(residual, ends[:-1])
+    return tuple(RunFit(r.label, r.kind, v, float(np.sqrt(np.mean(v**2)))) for r, v in zip(runs, parts, strict=True))

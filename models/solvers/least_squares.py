@@ -1,0 +1,103 @@
+"""Weighted linear least squares with an explicit prior, full covariance, and what the data alone can tell.
+
+The prior is part of the statement, never hidden: `Estimate.data_share` says for every parameter how much of its information came from the
+data. Parameters that live on the prior alone are named by `models.solvers.identifiability`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Solution of one linear problem.
+
+    Attributes
+    ----------
+    names : tuple of str
+    theta : array, shape (p,)
+    covariance : array, shape (p, p)
+        Posterior covariance, scaled by ``variance_factor`` where the residuals are larger than the stated noise.
+    residual : array, shape (n,)
+        Observed minus predicted, in the unit of the observations.
+    chi2, dof : float
+        Sum of squared whitened residuals; observations minus effective number of parameters.
+    variance_factor : float
+        max(1, chi2 / dof): a fit worse than the stated noise widens every uncertainty, a better one does not shrink it.
+    data_share : array, shape (p,)
+        1 - posterior variance / prior variance (before scaling), between 0 (prior only) and 1 (data only).
+    """
+
+    names: tuple[str, ...]
+    theta: F1
+    covariance: F2
+    residual: F1
+    chi2: float
+    dof: float
+    variance_factor: float
+    data_share: F1
+
+    def value(self, name: str) -> float:
+        """Estimate of a parameter by name."""
+        return float(self.theta[self.names.index(name)])
+
+    def u(self, name: str) -> float:
+        """Standard uncertainty of a parameter by name."""
+        i = self.names.index(name)
+        return float(np.sqrt(self.covariance[i, i]))
+
+
+def solve_map(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> Estimate:
+    """Most probable parameters of ``y = a @ theta + noise`` with independent zero-mean normal priors.
+
+    Parameters
+    ----------
+    a : array, shape (n, p)
+    y, sigma : arrays, shape (n,)
+        Observations and their standard uncertainty.
+    prior_sd : array, shape (p,)
+        Prior standard deviation; ``inf`` for none.
+
+    Raises
+    ------
+    ValueError
+        Shapes disagree, a value is not finite, or a sigma is not positive.
+    """
+    if a.shape != (y.size, len(names)) or sigma.shape != y.shape or prior_sd.shape != (len(names),):
+        raise ValueError(f"least squares: design {a.shape}, observations {y.shape}, names {len(names)} do not fit together")
+    if not (np.isfinite(a).all() and np.isfinite(y).all() and (sigma > 0).all()):
+        raise ValueError("least squares: design and observations must be finite and every sigma positive")
+    w = 1.0 / sigma
+    scale = np.where(np.isfinite(prior_sd), prior_sd, _column_scale(a))
+    b = a * scale * w[:, None]
+    z = y * w
+    ridge = np.where(np.isfinite(prior_sd), 1.0, 0.0)
+    stacked = np.concatenate([b, np.diag(ridge)])
+    q, r, pivot = linalg.qr(stacked, mode="economic", pivoting=True)
+    keep = np.abs(np.diag(r)) > 1e-12 * abs(r[0, 0])
+    if not keep.all():
+        raise ValueError(f"least squares: no prior and no data for a combination with {names[int(pivot[np.flatnonzero(~keep)[0]])]}")
+    rhs = q.T @ np.concatenate([z, np.zeros(len(names))])
+    x = np.empty(len(names))
+    x[pivot] = linalg.solve_triangular(r, rhs)
+    r_inv = np.empty((len(names), len(names)))
+    r_inv[pivot] = linalg.solve_triangular(r, np.eye(len(names)))
+    cov = r_inv @ r_inv.T
+    residual = y - a @ (x * scale)
+    share = np.where(np.isfinite(prior_sd), 1.0 - np.diag(cov), 1.0)
+    effective = float(len(names) - (np.diag(cov) * ridge).sum())
+    chi2 = float(((residual * w) ** 2).sum())
+    dof = max(float(y.size) - effective, 1.0)
+    factor = max(1.0, chi2 / dof)
+    return Estimate(names, x * scale, cov * np.outer(scale, scale) * factor, residual, chi2, dof, factor, np.clip(share, 0.0, 1.0))
+
+
+def _column_scale(a: F2) -> F1:
+    norm = np.linalg.norm(a, axis=0)
+    return np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 1.0)

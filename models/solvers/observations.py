@@ -1,0 +1,96 @@
+"""Observations of one run as arrays: the only form in which measurements enter a solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from models.arrays import F1, F2
+
+Kind = Literal["bar", "laser"]
+
+
+@dataclass(frozen=True)
+class RunData:
+    """One run, valid readings only.
+
+    Attributes
+    ----------
+    label, setup : str
+        Run name; set-up name (runs with the same set-up share its unknowns).
+    kind : "bar" | "laser"
+    axes_mm : array, shape (n, 3)
+        Commanded coordinates.
+    deviation_mm : array, shape (n,)
+        Bar length minus radius, or displacement since the first record minus nominal.
+    sign : array, shape (n, 3)
+        Direction in which each axis last moved (`models.geometry.chain.travel_sign`).
+    t_s : array, shape (n,)
+        Campaign clock.
+    weight_n : array, shape (n,)
+        How many raw readings each value is the mean of.
+    centre_mm, radius_mm : bar set-up. beam : laser set-up, nominal unit vector.
+    """
+
+    label: str
+    setup: str
+    kind: Kind
+    axes_mm: F2
+    deviation_mm: F1
+    sign: F2
+    t_s: F1
+    weight_n: F1
+    centre_mm: F1 | None = None
+    radius_mm: float | None = None
+    beam: F1 | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what no solver could use, naming the run."""
+        n = self.deviation_mm.size
+        shapes = {"axes_mm": (n, 3), "sign": (n, 3), "t_s": (n,), "weight_n": (n,)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"run {self.label}: {name} has shape {getattr(self, name).shape}, expected {shape}")
+        if n == 0 or not (np.isfinite(self.axes_mm).all() and np.isfinite(self.deviation_mm).all()):
+            raise ValueError(f"run {self.label}: no finite readings")
+        if self.kind == "bar" and (self.centre_mm is None or self.radius_mm is None):
+            raise ValueError(f"run {self.label}: a ball-bar run needs centre_mm and radius_mm")
+        if self.kind == "laser" and self.beam is None:
+            raise ValueError(f"run {self.label}: a laser run needs its nominal beam")
+
+
+def block_average(run: RunData, blocks: int) -> RunData:
+    """The run with at most ``blocks`` values, each the mean of consecutive readings moving in one direction.
+
+    Averaging commanded coordinates with the readings keeps the pair consistent to second order in the block's extent; blocks never span a
+    reversal, because lost motion would be averaged away there.
+    """
+    n = run.deviation_mm.size
+    size = max(1, int(np.ceil(n / blocks)))
+    if size == 1:
+        return run
+    turn = np.concatenate([[0], (np.diff(run.sign, axis=0) != 0).any(axis=1).cumsum()])
+    key = np.concatenate([[0], ((np.diff(turn) != 0) | (np.arange(1, n) % size == 0)).cumsum()])
+    weight: F1 = np.bincount(key, run.weight_n).astype(np.float64)
+
+    def mean(v: F1) -> F1:
+        return np.asarray(np.bincount(key, v * run.weight_n) / weight)
+
+    def columns(m: F2) -> F2:
+        return np.column_stack([mean(m[:, k]) for k in range(m.shape[1])])
+
+    return RunData(
+        run.label,
+        run.setup,
+        run.kind,
+        columns(run.axes_mm),
+        mean(run.deviation_mm),
+        np.sign(columns(run.sign)),
+        mean(run.t_s),
+        weight,
+        run.centre_mm,
+        run.radius_mm,
+        run.beam,
+    )

@@ -1,0 +1,89 @@
+"""The independent vectors of the papers (shared/vectors), through the public functions."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.paths.helix import helix_points
+from models.solvers.helix import fit_helix, helix_design
+from models.solvers.identifiability import analyse
+from models.solvers.step_diagonal import closure_mm, increments, squareness_contrast, wang_eq7, wang_four
+
+
+def load(shared: Path, name: str) -> dict:
+    return json.loads((shared / "vectors" / name).read_text())
+
+
+NAMES = ("dxx", "dyy", "dzz", "Sxy", "Sxz", "Syz")
+
+
+def test_yang_helix_six_parameters_come_back_to_002_urad(shared):
+    v = load(shared, "yang_helix.json")
+    truth = np.array([v["truth"][k] for k in NAMES])
+    origin = np.array(v["origin"])
+    for s in v["sets"]:
+        points = np.array(s["points"])  # z is read as a workpiece coordinate here ("paper" reading)
+        assert s["z_reading"] == "paper"
+        signs = np.array([1, 1, 1, 1, -1, 1])  # B0Z = -theta_xz
+        fit = fit_helix(points, np.array(s["dR_nonlinear"]), origin, s["R"], sigma_mm=1e-6, unknowns="six")
+        assert np.abs(fit.estimate.theta * signs - truth).max() < 0.02e-6
+
+
+def test_conditioning_of_the_six_parameter_fit(shared):
+    v = load(shared, "yang_conditioning.json")
+    for law in ("angle", "area"):
+        for turns in (1, 2, 3, 5, 8, 10):
+            p = helix_points(np.zeros(3), 175.0, turns=turns, n=63, law=law)
+            a = helix_design(p, np.zeros(3), "six")
+            ref = v[f"six_{law}_{turns}"]
+            unit = a / np.linalg.norm(a, axis=0)
+            s = np.linalg.svd(unit, compute_uv=False)
+            assert s[0] / s[-1] == pytest.approx(ref["cond"], rel=1e-9)
+            sigma = np.sqrt(np.diag(np.linalg.inv(a.T @ a))) * 1e-3
+            assert sigma == pytest.approx(ref["sigma_factor_per_um"], rel=1e-9)
+
+
+def test_ten_unknowns_of_one_helix_have_rank_nine_and_the_scale_is_named():
+    p = helix_points(np.zeros(3), 175.0, turns=5, n=63)
+    names = ("EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z", "offset_x", "offset_y", "offset_z", "bar_length")
+    found = analyse(names, helix_design(p, np.zeros(3), "ten"))
+    assert found.rank == 9
+    assert len(found.hidden) == 1
+    assert {n for n, _ in found.hidden[0].weights} == {"EXX.1", "EYY.1", "EZZ.1", "bar_length"}
+
+
+def test_ten_micrometres_of_mounting_fake_a_hundred_microradians_in_the_papers_fit_only():
+    p = helix_points(np.zeros(3), 175.0, turns=5, n=63)
+    offset = np.array([0.010, 0.0, 0.0])
+    reading = np.linalg.norm(p - offset, axis=1) - 175.0
+    paper = fit_helix(p, reading, np.zeros(3), 175.0, sigma_mm=5e-4, unknowns="six").estimate
+    ours = fit_helix(p, reading, np.zeros(3), 175.0, sigma_mm=5e-4, unknowns="ten").estimate
+    assert abs(paper.value("C0Y")) == pytest.approx(97e-6, rel=0.05)
+    assert abs(ours.value("C0Y")) < 2 * ours.u("C0Y")
+    assert ours.value("offset_x") == pytest.approx(0.010, abs=2 * ours.u("offset_x"))
+
+
+@pytest.mark.parametrize("case", ["translational|none", "translational|tilt_0.5mrad", "with_angles|none", "pure_yaw_X_50urad_linear|none"])
+def test_wang_step_diagonal(shared, case):
+    v = load(shared, "wang_step_diagonal.json")
+    c = v["cases"][case]
+    inc = np.array(v["inc"])
+    q = increments({k: np.array(r) for k, r in c["readings"].items()})
+    for name, ref in c["q"].items():
+        assert q[name] == pytest.approx(np.array(ref), abs=1e-11)
+    for formula, key in ((wang_eq7, "wang_eq7"), (wang_four, "wang_lsq4")):
+        found = formula(q, inc)
+        for name, ref in c[key].items():  # "YX" = direction Y, axis X
+            i, a = "XYZ".index(name[0]), "XYZ".index(name[1])
+            assert found[i, a] == pytest.approx(ref, abs=1e-11)
+    assert np.abs(closure_mm(q)).max() == pytest.approx(c["closure_max"], abs=1e-11)
+
+
+def test_squareness_contrasts_are_free_of_scale_errors(shared):
+    s = load(shared, "wang_step_diagonal.json")["squareness"]
+    found = squareness_contrast(s["dR_total"], np.array(s["L"]), 1e-4)
+    assert found.theta_xy == pytest.approx(s["theta_obtuse"]["txy"], abs=1e-12)
+    assert found.theta_xz == pytest.approx(s["theta_obtuse"]["txz"], abs=1e-12)
+    assert found.theta_yz == pytest.approx(s["theta_obtuse"]["tyz"], abs=1e-12)
