@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
-from itertools import islice
+from itertools import islice, pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -65,16 +65,14 @@ def test_seconds_field() -> None:
 
 @pytest.mark.parametrize("zone", ZONES)
 @pytest.mark.parametrize("cron", CRONS)
-def test_two_years_are_the_same_from_every_starting_point(cron: str, zone: str) -> None:
+def test_a_year_is_the_same_from_every_starting_point(cron: str, zone: str) -> None:
     """Every slot once, in order; and what is next does not depend on when one asks."""
     schedule = plan(cron, zone)
-    slots = list(slots_between(schedule, utc(2025, 1, 1), utc(2027, 1, 1)))
+    slots = list(slots_between(schedule, utc(2026, 1, 1), utc(2027, 1, 1)))
     assert slots == sorted(set(slots))
-    around_changes = [s for s in slots if s.month in {3, 4, 10, 11}]
-    for slot in around_changes[::7]:
-        index = slots.index(slot)
+    for slot, following in list(pairwise(slots))[:: max(len(slots) // 300, 1)]:
         assert next_slot(schedule, slot - timedelta(seconds=1)) == slot
-        assert next_slot(schedule, slot) == (slots[index + 1] if index + 1 < len(slots) else next_slot(schedule, slot))
+        assert next_slot(schedule, slot) == following
 
 
 @settings(max_examples=200, deadline=None)

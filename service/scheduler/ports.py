@@ -1,0 +1,138 @@
+"""What the scheduler needs from the rest of the service, as small Protocols. Tests stand in for each with a few lines."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from datetime import datetime
+from typing import Any, Literal, Protocol
+
+from service.scheduler.slots import Schedule
+
+Verdict = Literal["pass", "fail", "cannot tell"]
+Doc = dict[str, Any]
+
+
+class Progress(Protocol):
+    """How far a running check is."""
+
+    @property
+    def stage(self) -> str:
+        """What is being done now."""
+        ...
+
+    @property
+    def done(self) -> int:
+        """Steps finished."""
+        ...
+
+    @property
+    def total(self) -> int:
+        """Steps in all."""
+        ...
+
+    @property
+    def eta_s(self) -> float | None:
+        """Seconds to go, or None while nobody can tell."""
+        ...
+
+    @property
+    def message(self) -> str:
+        """One line for people."""
+        ...
+
+
+class CheckResult(Protocol):
+    """What a check found."""
+
+    @property
+    def verdict(self) -> str:
+        """pass, fail or cannot tell."""
+        ...
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Figures by name, the unit at the end of the name."""
+        ...
+
+    @property
+    def uncertainties(self) -> Mapping[str, float]:
+        """Expanded uncertainty (k = 2) of each figure."""
+        ...
+
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """What each figure was judged against."""
+        ...
+
+    @property
+    def run_labels(self) -> Sequence[str]:
+        """Labels of the stored runs."""
+        ...
+
+    @property
+    def campaign(self) -> str:
+        """Name of the campaign the runs belong to."""
+        ...
+
+    @property
+    def started_utc(self) -> datetime:
+        """When the first device was opened."""
+        ...
+
+    @property
+    def duration_s(self) -> float:
+        """How long it took."""
+        ...
+
+    @property
+    def text(self) -> str:
+        """The verdict as one sentence."""
+        ...
+
+
+Check = Callable[[str, Callable[[Progress], None]], Awaitable[CheckResult]]
+"""``check(recipe, progress)``: opens the devices, measures, closes them. Cancelling it must leave the machine held."""
+
+
+class Ledger(Protocol):
+    """Remembers which slots were dealt with, across restarts and across processes."""
+
+    async def claim(self, schedule: str, slot_utc: datetime) -> bool:
+        """Return True to exactly one caller, ever, for each (schedule, slot)."""
+        ...
+
+    async def finish(self, schedule: str, slot_utc: datetime, state: str) -> None:
+        """Write down what became of a claimed slot."""
+        ...
+
+    async def last_claimed(self, schedule: str) -> datetime | None:
+        """Return the latest slot ever claimed for this schedule, or None if it is new."""
+        ...
+
+
+class Shelf(Protocol):
+    """Keeps results, and with each result the message that tells the world about it."""
+
+    async def keep(self, doc: Doc) -> int:
+        """Store a verification and queue its message, together; return its number."""
+        ...
+
+    async def alarm(self, doc: Doc) -> None:
+        """Queue an alarm."""
+        ...
+
+
+class JobWatcher(Protocol):
+    """Is told, synchronously, what the one running job does."""
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        """A check begins."""
+        ...
+
+    def job_progress(self, progress: Progress) -> None:
+        """The check got further."""
+        ...
+
+    def job_ended(self, doc: Doc | None) -> None:
+        """The check ended with this document, or was stopped (None)."""
+        ...

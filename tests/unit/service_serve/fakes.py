@@ -1,0 +1,93 @@
+"""Stand-ins with state: a clock one can turn, a ledger, a shelf."""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+from datetime import UTC, datetime, timedelta
+from itertools import count
+from typing import Any
+
+
+class FakeClock:
+    """Time passes only in ``pass_time``; a wall clock jump is ``utc_now += ...``."""
+
+    def __init__(self, start: datetime) -> None:
+        self.utc_now = start
+        self.now_s = 0.0
+        self._sleepers: list[tuple[float, int, asyncio.Future[None]]] = []
+        self._order = count()
+        self.wakes = 0
+
+    def monotonic_s(self) -> float:
+        return self.now_s
+
+    def utc(self) -> datetime:
+        return self.utc_now
+
+    async def sleep(self, s: float) -> None:
+        woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._sleepers, (self.now_s + s, next(self._order), woken))
+        await woken
+
+    def _to(self, now_s: float) -> None:
+        self.utc_now += timedelta(seconds=now_s - self.now_s)
+        self.now_s = now_s
+
+    async def pass_time(self, seconds: float) -> None:
+        """Let time pass, waking sleepers in order, and let everything they start come to rest before going on."""
+        end = self.now_s + seconds
+        await settle()
+        while self._sleepers and self._sleepers[0][0] <= end:
+            at, _, woken = heapq.heappop(self._sleepers)
+            self._to(max(at, self.now_s))
+            if not woken.done():
+                woken.set_result(None)
+                self.wakes += 1
+                await settle()
+        self._to(end)
+
+
+async def settle() -> None:
+    """Run everything that is ready, and what that makes ready. In-memory fakes need no more than a few turns of the loop."""
+    for _ in range(8):
+        await asyncio.sleep(0)
+
+
+class FakeLedger:
+    def __init__(self) -> None:
+        self.states: dict[tuple[str, datetime], str] = {}
+        self.claims = 0
+
+    async def claim(self, schedule: str, slot_utc: datetime) -> bool:
+        if (schedule, slot_utc) in self.states:
+            return False
+        self.states[schedule, slot_utc] = "CLAIMED"
+        return True
+
+    async def finish(self, schedule: str, slot_utc: datetime, state: str) -> None:
+        assert self.states[schedule, slot_utc] == "CLAIMED", "finished twice"
+        self.states[schedule, slot_utc] = state
+
+    async def last_claimed(self, schedule: str) -> datetime | None:
+        return max((slot for name, slot in self.states if name == schedule), default=None)
+
+    def of(self, start: str) -> list[datetime]:
+        return sorted(slot for (_, slot), state in self.states.items() if state.startswith(start))
+
+
+class FakeShelf:
+    def __init__(self) -> None:
+        self.docs: list[dict[str, Any]] = []
+        self.alarms: list[dict[str, Any]] = []
+
+    async def keep(self, doc: dict[str, Any]) -> int:
+        self.docs.append(doc)
+        return len(self.docs)
+
+    async def alarm(self, doc: dict[str, Any]) -> None:
+        self.alarms.append(doc)
+
+
+def utc(*parts: int) -> datetime:
+    return datetime(*parts, tzinfo=UTC)  # type: ignore[arg-type,misc]
