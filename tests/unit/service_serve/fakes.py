@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from typing import Any
+
+from service.scheduler.slots import Schedule
 
 
 class FakeClock:
@@ -91,3 +94,43 @@ class FakeShelf:
 
 def utc(*parts: int) -> datetime:
     return datetime(*parts, tzinfo=UTC)  # type: ignore[arg-type,misc]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A CheckResult."""
+
+    verdict: str = "pass"
+    values: dict[str, float] = field(default_factory=lambda: {"body_diagonal_um": 11.8, "helix_rms_um": 1.4})
+    uncertainties: dict[str, float] = field(default_factory=lambda: {"body_diagonal_um": 1.1, "helix_rms_um": 0.2})
+    limits: dict[str, float] = field(default_factory=lambda: {"body_diagonal_um": 20.0, "helix_rms_um": 3.0})
+    run_labels: list[str] = field(default_factory=lambda: ["helix-1", "diagonal-1"])
+    campaign: str = "check-1"
+    started_utc: datetime = datetime(2026, 6, 1, 4, tzinfo=UTC)
+    duration_s: float = 61.0
+    text: str = "Every figure lies inside its limit."
+
+
+@dataclass(frozen=True)
+class Step:
+    """A Progress."""
+
+    stage: str = "helix"
+    done: int = 3
+    total: int = 10
+    eta_s: float | None = 42.0
+    message: str = "revolution 3 of 10"
+
+
+class FakeWatcher:
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        self.heard.append(f"started {schedule.name}")
+
+    def job_progress(self, progress: Any) -> None:
+        self.heard.append(f"progress {progress.done}/{progress.total}")
+
+    def job_ended(self, doc: dict[str, Any] | None) -> None:
+        self.heard.append(f"ended {doc['verdict'] if doc else None}")

@@ -1,0 +1,115 @@
+"""One check as a document: the same for the store, for MQTT, for the status page and for JSON clients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+
+from drivers.errors import DriverError
+from service.errors import AbbeError
+from service.scheduler.ports import CheckResult, Doc
+from service.scheduler.slots import Schedule
+
+SCHEMA = 1
+"""Version of the documents. Raised when a key changes its meaning or goes; new keys do not raise it."""
+
+VERDICTS = ("pass", "fail", "cannot tell")
+
+
+@dataclass(frozen=True, slots=True)
+class Occasion:
+    """Which check of which machine this is."""
+
+    machine: str
+    schedule: Schedule
+    slot_utc: datetime
+
+
+def found(occasion: Occasion, result: CheckResult) -> Doc:
+    """Return the document of a check that came to an end."""
+    return {
+        **_head(occasion, result.started_utc),
+        "duration_s": round(result.duration_s, 3),
+        # A verdict we do not know must not look like a pass.
+        "verdict": result.verdict if result.verdict in VERDICTS else "cannot tell",
+        "values": _figures(result.values),
+        "uncertainties": _figures(result.uncertainties),
+        "limits": _figures(result.limits),
+        "campaign": result.campaign,
+        "runs": list(result.run_labels),
+        "text": result.text,
+        "cause": None,
+    }
+
+
+def failed(occasion: Occasion, cause: Exception, started_utc: datetime, duration_s: float) -> Doc:
+    """Return the document of a check that could not be completed: nothing is claimed, the cause is named."""
+    reason = cause_of(cause)
+    return {
+        **_head(occasion, started_utc),
+        "duration_s": round(duration_s, 3),
+        "verdict": "cannot tell",
+        "values": {},
+        "uncertainties": {},
+        "limits": {},
+        "campaign": "",
+        "runs": [],
+        "text": f"The check could not be completed: {reason['what']}",
+        "cause": reason,
+    }
+
+
+def alarm(doc: Doc) -> Doc:
+    """Return the alarm that goes with the document of a failed check."""
+    cause = doc["cause"]
+    return {
+        "code": cause["code"],
+        "what": cause["what"],
+        "remedy": cause["remedy"],
+        "device": cause["device"],
+        "at_utc": doc["started_utc"],
+    }
+
+
+def cause_of(cause: Exception) -> Doc:
+    """Return code, one line of cause, remedy and device of an error.
+
+    A group of errors is answered for by its first known member: with several devices going down together the first is the news.
+    """
+    known = _first(cause)
+    if isinstance(known, DriverError):
+        return {"code": known.code, "what": _line(f"{known.operation}: {known.detail}"), "remedy": known.remedy, "device": known.device}
+    if isinstance(known, AbbeError):
+        return {"code": known.code, "what": _line(known.detail), "remedy": known.remedy, "device": ""}
+    name = type(known).__name__
+    return {"code": "ABB-001", "what": _line(f"{name}: {known}"), "remedy": "see the service's log for details", "device": ""}
+
+
+def _first(cause: Exception) -> Exception:
+    if not isinstance(cause, ExceptionGroup):
+        return cause
+    leaves = [_first(member) for member in cause.exceptions]
+    return next((leaf for leaf in leaves if isinstance(leaf, DriverError | AbbeError)), leaves[0])
+
+
+def _head(occasion: Occasion, started_utc: datetime) -> Doc:
+    return {
+        "schema": SCHEMA,
+        "machine": occasion.machine,
+        "schedule": occasion.schedule.name,
+        "recipe": occasion.schedule.recipe,
+        "slot_utc": occasion.slot_utc.isoformat(),
+        "started_utc": started_utc.isoformat(),
+    }
+
+
+def _figures(figures: Mapping[str, float]) -> dict[str, float | None]:
+    """JSON knows neither NaN nor infinity; a figure that is none becomes null."""
+    return {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def _line(text: str) -> str:
+    """Return ``text`` as one line of sane length: device strings end up in logs and pages."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:500]
