@@ -69,7 +69,7 @@ def fit_helix(
     Parameters
     ----------
     points_mm : array, shape (n, 3)
-        Commanded workpiece coordinates (not slide coordinates: see math.md 4.2 and `slide_to_workpiece`).
+        Commanded workpiece coordinates (Yang's machine reads Z of its cross slide: z = -z(slide), math.md 4.1).
     deviation_mm : array, shape (n,)
         Bar length minus radius.
     centre_mm, radius_mm : array (3,), float
@@ -98,7 +98,7 @@ def fit_helix(
     theta = np.zeros(count)
     d = points_mm - centre_mm
     estimate: Estimate | None = None
-    for _ in range(4):
+    for _ in range(1 if unknowns == "six" else 4):  # the paper's fit is linear; a cup offset bends the sphere
         y = deviation_mm - _exact(d, radius_mm, theta) + a @ theta
         estimate = solve_map(names, a, y, sigma, prior)
         theta = estimate.theta
@@ -112,8 +112,3 @@ def _exact(d: F2, radius_mm: float, theta: F1) -> F1:
     length = theta[9] if theta.size > 9 else 0.0
     tip = d + linear_field(d) @ theta[:6] - offset
     return np.asarray(np.linalg.norm(tip, axis=1) - radius_mm + length)
-
-
-def slide_to_workpiece(points_mm: F2) -> F2:
-    """Yang's machine reads Z of its cross slide: workpiece z = -z(slide) (math.md 4.1). Returns workpiece coordinates."""
-    return np.asarray(points_mm * np.array([1.0, 1.0, -1.0]))

@@ -16,7 +16,7 @@ from models.geometry.chain import design
 from models.machine import Machine
 from models.solvers.identifiability import Identifiability, analyse, project_out
 from models.solvers.least_squares import Estimate, solve_map
-from models.solvers.observations import RunData
+from models.solvers.observations import RunData, nominal_reading
 from models.solvers.priors import Priors, term_prior_sd
 
 
@@ -144,14 +144,6 @@ def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setu
     rest = theta[n_terms + 3 :]
     tip = tip - np.array([rest[at[f"cup_{run.setup}_{a}"]] for a in "xyz"])
     return np.asarray(np.linalg.norm(tip, axis=1) - run.radius_mm + rest[at[f"bar_length_{run.radius_mm:g}"]])
-
-
-def nominal_reading(run: RunData) -> F1:
-    """Reading of a perfect machine with a perfect set-up: the sagitta of a polyline path for the ball-bar, zero for the laser."""
-    if run.kind == "laser":
-        return np.zeros(run.deviation_mm.size)
-    assert run.radius_mm is not None
-    return np.asarray(np.linalg.norm(run.axes_mm - run.centre_mm, axis=1) - run.radius_mm)
 
 
 def solve_joint(

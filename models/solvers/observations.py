@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -64,8 +64,8 @@ class RunData:
 def block_average(run: RunData, blocks: int) -> RunData:
     """The run with at most ``blocks`` values, each the mean of consecutive readings moving in one direction.
 
-    Averaging commanded coordinates with the readings keeps the pair consistent to second order in the block's extent; blocks never span a
-    reversal, because lost motion would be averaged away there.
+    What is averaged is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies
+    inside it; blocks never span a reversal, because lost motion would be averaged away there.
     """
     n = run.deviation_mm.size
     size = max(1, int(np.ceil(n / blocks)))
@@ -81,16 +81,20 @@ def block_average(run: RunData, blocks: int) -> RunData:
     def columns(m: F2) -> F2:
         return np.column_stack([mean(m[:, k]) for k in range(m.shape[1])])
 
-    return RunData(
-        run.label,
-        run.setup,
-        run.kind,
-        columns(run.axes_mm),
-        mean(run.deviation_mm),
-        np.sign(columns(run.sign)),
-        mean(run.t_s),
-        weight,
-        run.centre_mm,
-        run.radius_mm,
-        run.beam,
+    axes = columns(run.axes_mm)
+    shorter = replace(
+        run,
+        axes_mm=axes,
+        deviation_mm=mean(run.deviation_mm - nominal_reading(run)),
+        sign=np.sign(columns(run.sign)),
+        t_s=mean(run.t_s),
+        weight_n=weight,
     )
+    return replace(shorter, deviation_mm=shorter.deviation_mm + nominal_reading(shorter))
+
+
+def nominal_reading(run: RunData) -> F1:
+    """Reading of a perfect machine with a perfect set-up: the sagitta of a polyline path for the ball-bar, zero for the laser."""
+    if run.centre_mm is None or run.radius_mm is None:
+        return np.zeros(run.deviation_mm.size)
+    return np.asarray(np.linalg.norm(run.axes_mm - run.centre_mm, axis=1) - run.radius_mm)

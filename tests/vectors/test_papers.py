@@ -26,9 +26,10 @@ def test_yang_helix_six_parameters_come_back_to_002_urad(shared):
     for s in v["sets"]:
         points = np.array(s["points"])  # z is read as a workpiece coordinate here ("paper" reading)
         assert s["z_reading"] == "paper"
-        signs = np.array([1, 1, 1, 1, -1, 1])  # B0Z = -theta_xz
+        signs = np.array([1, 1, -1, 1, -1, 1])  # the slide's dzz is -EZZ, Sxz is -B0Z (math.md 1)
         fit = fit_helix(points, np.array(s["dR_nonlinear"]), origin, s["R"], sigma_mm=1e-6, unknowns="six")
         assert np.abs(fit.estimate.theta * signs - truth).max() < 0.02e-6
+        assert fit.estimate.theta * signs == pytest.approx([s["lsq_own_reading"][k] for k in NAMES], abs=1e-12)
 
 
 def test_conditioning_of_the_six_parameter_fit(shared):
