@@ -1,0 +1,87 @@
+"""Dry run: what a plan will do, how long it takes, and whether it stays inside the machine - before anything moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from models.machine import AXES, Machine
+from service.errors import StrokeError
+from service.sequences.steps import CampaignPlan, MountBar, MountLaser, MoveTo, Point, ReadLaser, RecordPath, Step, TestPlan, ZeroLaser
+
+MOUNT_S = 0.0
+"""A person's mounting time is not machine time; it is not counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class DryRun:
+    """One test as it would run: machine seconds, path length, extent, number of readings."""
+
+    label: str
+    test: str
+    duration_s: float
+    path_mm: float
+    lowest_mm: Point
+    highest_mm: Point
+    readings: int
+
+
+def positions(steps: tuple[Step, ...]) -> Iterator[Point]:
+    """Every commanded position of a plan, in order."""
+    for step in steps:
+        if isinstance(step, MoveTo):
+            yield step.target_mm
+        elif isinstance(step, RecordPath):
+            yield from step.points_mm
+
+
+def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
+    """Machine seconds of a step from a position, and the position after it."""
+    match step:
+        case MoveTo(target, feed):
+            return (0.0 if here is None else math.dist(here, target) / feed * 60.0), target
+        case RecordPath(points, feed, _, _):
+            length = sum(math.dist(a, b) for a, b in zip(points, points[1:], strict=False))
+            return length / feed * 60.0, points[-1]
+        case ReadLaser(_, settle):
+            return settle + 0.1, here
+        case MountBar() | MountLaser() | ZeroLaser():
+            return MOUNT_S, here
+
+
+def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> DryRun:
+    """Check a test against the strokes and say how long it takes.
+
+    Raises
+    ------
+    StrokeError
+        A commanded position leaves the strokes: which test, which axis, by how much.
+    """
+    lo, hi = [math.inf] * 3, [-math.inf] * 3
+    for p in positions(plan.steps):
+        for a in range(3):
+            low, high = machine.stroke_mm[a]
+            if not low - 1e-9 <= p[a] <= high + 1e-9:
+                over = low - p[a] if p[a] < low else p[a] - high
+                raise StrokeError(
+                    f"test {plan.label}: {AXES[a]} would go to {p[a]:.3f} mm, {over:.3f} mm beyond its stroke {low:g}..{high:g}",
+                    "move the centre, shorten the radius or correct stroke_mm in the machine file; nothing has moved",
+                )
+            lo[a], hi[a] = min(lo[a], p[a]), max(hi[a], p[a])
+    seconds, length, readings, here = 0.0, 0.0, 0, start_mm
+    for step in plan.steps:
+        dt, after = step_seconds(step, here)
+        if isinstance(step, RecordPath):
+            length += dt * step.feed_mm_min / 60.0
+            readings += int(dt * step.rate_hz)
+        elif isinstance(step, MoveTo) and here is not None:
+            length += math.dist(here, step.target_mm)
+        readings += isinstance(step, ReadLaser)
+        seconds, here = seconds + dt, after
+    return DryRun(plan.label, plan.test, seconds, length, (lo[0], lo[1], lo[2]), (hi[0], hi[1], hi[2]), readings)
+
+
+def dry_run_campaign(machine: Machine, plan: CampaignPlan) -> tuple[DryRun, ...]:
+    """Check all tests of a campaign; the first that leaves the strokes raises."""
+    return tuple(dry_run(machine, test) for test in plan.tests)

@@ -1,0 +1,141 @@
+"""Recipes: a few numbers that say which test; `plan` turns each into steps.
+
+Every sequence approaches its first position in the direction of its first motion, so that lost motion is in a known state at the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.machine import Machine
+from models.paths.helix import Law, helix_points
+from models.paths.lines import diagonal_ends, step_diagonal, straight_line
+from service.sequences.steps import MountBar, MountLaser, MoveTo, Point, ReadLaser, RecordPath, Step, TestPlan, ZeroLaser
+
+Array = NDArray[np.float64]
+RAPID_MM_MIN = 6000.0
+APPROACH_MM = 1.0
+CLEARANCE_MM = 10.0
+"""Laser lines keep this distance from the ends of the strokes, so that the approach stays inside them."""
+
+
+def as_point(v: Array) -> Point:
+    """Three floats on the controller's 10 nm grid."""
+    x, y, z = (round(float(c), 5) for c in v)
+    return (x, y, z)
+
+
+@dataclass(frozen=True, slots=True)
+class Helix:
+    """Hemispherical helix of the ball-bar test (math.md 4.3): continuous, constant feed, pole to equator or (direction -1) back."""
+
+    label: str
+    setup_id: str
+    role: str
+    centre_mm: Point
+    radius_mm: float
+    turns: float = 5.0
+    law: Law = "area"
+    axis: int = 2
+    feed_mm_min: float = 2000.0
+    direction: Literal[1, -1] = 1
+    rate_hz: int = 100
+    chord_mm: float = 1.0
+    mount: bool = True
+
+    def plan(self, machine: Machine) -> TestPlan:
+        """Steps: to the centre, mount, out to the path's start, record the path."""
+        length = 2 * np.pi * self.radius_mm * self.turns
+        n = max(64, int(length / self.chord_mm))
+        points = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=n, law=self.law, axis=self.axis)
+        path = tuple(as_point(p) for p in (points if self.direction > 0 else points[::-1]))
+        steps: list[Step] = []
+        if self.mount:
+            steps += [MoveTo(self.centre_mm, RAPID_MM_MIN), MountBar(self.radius_mm)]
+        steps += [MoveTo(path[0], RAPID_MM_MIN), RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction)]
+        setup = {
+            "setup_id": self.setup_id,
+            "centre_mm": list(self.centre_mm),
+            "radius_mm": self.radius_mm,
+            "turns": self.turns,
+            "length_calibrated": True,
+            "u_length_mm": 0.002,
+            "tool_mm": [float(v) for v in machine.tool_mm],
+        }
+        return TestPlan(self.label, "ballbar_helix", self.role, setup, tuple(steps))
+
+
+@dataclass(frozen=True, slots=True)
+class Diagonal:
+    """Body diagonal by laser: sequential single-axis ``steps`` (Wang), or plain positions when ``order`` is empty; out and back."""
+
+    label: str
+    setup_id: str
+    role: str
+    diagonal: str
+    steps: int = 12
+    order: str = "XYZ"
+    feed_mm_min: float = RAPID_MM_MIN
+    settle_s: float = 0.3
+
+    def plan(self, machine: Machine) -> TestPlan:
+        """Steps: approach, mount, zero, and one reading after every move."""
+        box = machine.stroke_mm + np.array([CLEARANCE_MM, -CLEARANCE_MM])
+        start, end = diagonal_ends(box, self.diagonal)
+        if self.order:
+            points = step_diagonal(start, end, self.steps, self.order)
+        else:
+            points = straight_line(start, end, self.steps + 1)
+        setup: dict[str, Any] = {
+            "setup_id": self.setup_id,
+            "diagonal": self.diagonal,
+            "increment_mm": [float(v) for v in (end - start) / self.steps],
+            "steps": self.steps,
+        }
+        if self.order:
+            setup["order"] = self.order
+        return _laser_plan(self, "laser_diagonal", setup, points, start, end)
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """Single-axis positioning by laser (ISO 230-2 line), ``n`` positions out and back, at relative place ``at`` of the other strokes."""
+
+    label: str
+    setup_id: str
+    role: str
+    axis: int
+    n: int = 21
+    at: float = 0.15
+    feed_mm_min: float = RAPID_MM_MIN
+    settle_s: float = 0.3
+
+    def plan(self, machine: Machine) -> TestPlan:
+        """Steps: approach, mount, zero, and one reading after every move."""
+        start = machine.stroke_mm[:, 0] + self.at * machine.length_mm
+        end = start.copy()
+        start[self.axis], end[self.axis] = machine.stroke_mm[self.axis] + np.array([CLEARANCE_MM, -CLEARANCE_MM])
+        setup = {"setup_id": self.setup_id, "axis": "XYZ"[self.axis]}
+        return _laser_plan(self, "laser_linear", setup, straight_line(start, end, self.n), start, end)
+
+
+Recipe = Helix | Diagonal | Linear
+
+
+def _laser_plan(recipe: Diagonal | Linear, test: str, setup: dict[str, Any], points: Array, start: Array, end: Array) -> TestPlan:
+    path = [as_point(p) for p in points]
+    beam = (end - start) / np.linalg.norm(end - start)
+    approach = start - APPROACH_MM * np.sign(end - start)
+    half = len(path) // 2
+    steps: list[Step] = [MoveTo(as_point(approach), RAPID_MM_MIN), MoveTo(path[0], recipe.feed_mm_min)]
+    steps += [MountLaser((float(beam[0]), float(beam[1]), float(beam[2]))), ZeroLaser(), ReadLaser(1, recipe.settle_s)]
+    for k, p in enumerate(path[1:], start=1):
+        if p != path[k - 1]:
+            steps.append(MoveTo(p, recipe.feed_mm_min))
+        steps.append(ReadLaser(1 if k < half else -1, recipe.settle_s))
+    setup |= {"start_mm": list(path[0]), "end_mm": list(as_point(end)), "nominal_beam": [float(v) for v in beam]}
+    return TestPlan(recipe.label, test, recipe.role, setup, tuple(steps))

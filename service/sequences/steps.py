@@ -1,0 +1,77 @@
+"""The step vocabulary. A plan is a tuple of these; one runner interprets them, one dry run checks them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class MoveTo:
+    """Straight move to commanded coordinates."""
+
+    target_mm: Point
+    feed_mm_min: float
+
+
+@dataclass(frozen=True, slots=True)
+class MountBar:
+    """The machine stands at the sphere's centre: cup and bar are mounted."""
+
+    radius_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class MountLaser:
+    """The machine stands at the start of the line: laser and mirror are set up along ``beam``."""
+
+    beam: Point
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroLaser:
+    """The laser's displacement is zeroed here."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadLaser:
+    """Wait ``settle_s`` of controller time after the move, then record one fresh reading. ``direction`` +1 out, -1 back."""
+
+    direction: int
+    settle_s: float = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class RecordPath:
+    """Run a polyline at constant feed while the ball-bar streams. The machine stands at its first point."""
+
+    points_mm: tuple[Point, ...]
+    feed_mm_min: float
+    rate_hz: int
+    direction: int
+
+
+Step = MoveTo | MountBar | MountLaser | ZeroLaser | ReadLaser | RecordPath
+
+
+@dataclass(frozen=True, slots=True)
+class TestPlan:
+    """One run: what it is, how it is set up (run-format.md 3), and its steps."""
+
+    __test__ = False  # not a pytest class
+
+    label: str
+    test: str
+    role: str
+    setup: dict[str, Any] = field(hash=False)
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignPlan:
+    """Runs in the order in which they are measured."""
+
+    name: str
+    tests: tuple[TestPlan, ...]
