@@ -1,0 +1,1 @@
+"""Telemetry out by MQTT. Nothing comes in: no message can move a machine or push a table."""

@@ -1,0 +1,182 @@
+"""Keeps one connection to the broker and empties the outbox through it. Without a broker everything waits, and nothing else notices.
+
+A message leaves the outbox only after the broker's acknowledgement (QoS 1). aiomqtt does not reconnect: every connection here is a new
+client, and the back-off is ours.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime
+from typing import Any
+
+import aiomqtt
+import structlog
+
+from service.clock import Clock
+from service.errors import StoreError
+from service.mqtt.broker import Broker
+from service.mqtt.outbox import Outbox, encode, with_id
+from service.mqtt.topics import Topics, client_id
+
+log = structlog.get_logger("abbe.mqtt")
+
+KEEPALIVE_S = 15
+REPLY_S = 10.0
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
+STEADY_S = 5.0
+"""A connection that lived this long was a good one: the next pause is short again. A broker that accepts and closes is not."""
+LOOK_S = 30.0
+"""How often to look into the outbox without being woken: other processes write into it too."""
+FAREWELL_S = 1.0
+
+_TROUBLE = (aiomqtt.MqttError, StoreError, OSError)
+
+
+class Publisher:
+    """Publishes the state of one machine, and the outbox.
+
+    Parameters
+    ----------
+    broker : Broker
+        Where to connect to.
+    topics : Topics
+        Names the machine and its topics.
+    outbox : Outbox
+        What to send.
+    clock : Clock
+        Pauses, and the time in the state message.
+    on_change : callable, optional
+        Told True when connected and False when not.
+    """
+
+    def __init__(
+        self, broker: Broker, topics: Topics, outbox: Outbox, clock: Clock, on_change: Callable[[bool], None] = lambda connected: None
+    ) -> None:
+        self._broker = broker
+        self._topics = topics
+        self._outbox = outbox
+        self._clock = clock
+        self._on_change = on_change
+        self._state: dict[str, Any] = {"state": "online"}
+        self._wake = asyncio.Event()
+        self._stopping = asyncio.Event()
+        self._pause_s = FIRST_PAUSE_S
+        self._warned = False
+
+    def wake(self) -> None:
+        """Say that there is something in the outbox."""
+        self._wake.set()
+
+    def set_state(self, state: str, since_utc: datetime, **more: str) -> None:
+        """Change the retained state message. Only the latest state matters: it is not queued, but sent again at every connection."""
+        self._state = {"state": state, "since_utc": since_utc.isoformat(), **more}
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Say offline, if there is a broker to say it to, and let `run` return."""
+        self._stopping.set()
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Work until `stop`."""
+        while not self._stopping.is_set():
+            started_s = self._clock.monotonic_s()
+            reason = await self._connection()
+            self._on_change(False)
+            if self._stopping.is_set():
+                return
+            if self._clock.monotonic_s() - started_s >= STEADY_S:
+                self._pause_s = FIRST_PAUSE_S
+            if not self._warned:
+                log.warning("broker not reachable; messages wait in the store", broker=str(self._broker), reason=reason)
+                self._warned = True
+            await self._pause()
+
+    async def _connection(self) -> str:
+        """Connect and publish until the connection is lost or we stop; return what ended it."""
+        ended = "stopped"
+        try:
+            await self._knock()
+            async with self._client() as client, asyncio.TaskGroup() as tasks:
+                watch = tasks.create_task(_until_lost(client), name="mqtt watch")
+                await self._publish(client)
+                watch.cancel()
+        except* _TROUBLE as trouble:
+            ended = _first(trouble)
+        return ended
+
+    async def _knock(self) -> None:
+        """Fail early and cancellably if nobody listens: aiomqtt connects in a thread that nothing can interrupt."""
+        async with asyncio.timeout(REPLY_S / 2):
+            _, writer = await asyncio.open_connection(self._broker.host, self._broker.port)
+        writer.close()
+        with suppress(OSError):
+            await writer.wait_closed()
+
+    def _client(self) -> aiomqtt.Client:
+        will = aiomqtt.Will(self._topics.state, self._state_payload({"state": "offline"}), qos=1, retain=True)
+        return aiomqtt.Client(
+            self._broker.host,
+            self._broker.port,
+            username=self._broker.username,
+            password=self._broker.password,
+            tls_context=self._broker.tls_context(),
+            identifier=client_id(self._topics.machine),
+            will=will,
+            keepalive=KEEPALIVE_S,
+            timeout=REPLY_S,
+        )
+
+    async def _publish(self, client: aiomqtt.Client) -> None:
+        told: dict[str, Any] | None = None
+        while not self._stopping.is_set():
+            self._wake.clear()  # before looking: what is put in while we look wakes us again
+            if self._state is not told:
+                told = self._state
+                await client.publish(self._topics.state, self._state_payload(told), qos=1, retain=True)
+                self._connected()
+            rows = await self._outbox.pending()
+            for row in rows:
+                await client.publish(row.topic, with_id(row), qos=1)
+                await self._outbox.done(row.id)
+                if self._stopping.is_set():
+                    break
+            if not rows:
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(LOOK_S):
+                        await self._wake.wait()
+        farewell = {"state": "offline", "since_utc": self._clock.utc().isoformat()}
+        await client.publish(self._topics.state, self._state_payload(farewell), qos=1, retain=True, timeout=FAREWELL_S)
+
+    def _connected(self) -> None:
+        self._on_change(True)
+        if self._warned:
+            log.info("broker reachable again", broker=str(self._broker))
+            self._warned = False
+
+    def _state_payload(self, state: dict[str, Any]) -> bytes:
+        return encode({"schema": 1, "machine": self._topics.machine, **state})
+
+    async def _pause(self) -> None:
+        """Wait before the next attempt; `stop` cuts it short."""
+        pause_s, self._pause_s = self._pause_s, min(self._pause_s * 2, LONGEST_PAUSE_S)
+        async with asyncio.TaskGroup() as tasks:
+            nap = tasks.create_task(self._clock.sleep(pause_s), name="mqtt pause")
+            stop = tasks.create_task(self._stopping.wait(), name="mqtt stop")
+            nap.add_done_callback(lambda _: stop.cancel())
+            stop.add_done_callback(lambda _: nap.cancel())
+
+
+async def _until_lost(client: aiomqtt.Client) -> None:
+    """Raise MqttError when the connection is lost. We subscribe to nothing, so no message ever comes."""
+    async for _ in client.messages:
+        pass
+
+
+def _first(trouble: BaseException) -> str:
+    while isinstance(trouble, BaseExceptionGroup):
+        trouble = trouble.exceptions[0]
+    return f"{type(trouble).__name__}: {trouble}"
