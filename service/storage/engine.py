@@ -1,0 +1,238 @@
+"""How the database is opened: URL, SQLite's safety settings, and database errors in the words of this product."""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, exc
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.pool import StaticPool
+
+from service.errors import StoreError
+
+DEFAULT_URL = "sqlite:///abbe.sqlite3"
+BUSY_TIMEOUT_MS = 5000
+JOURNAL_LIMIT_BYTES = 64 * 2**20
+READ_ONLY_OPTION = "abbe_reads_only"
+_SQLITE_MAGIC = b"SQLite format 3\x00"
+_PASSWORD = re.compile(r"(?<=://)([^:/@\s]*):[^@/\s]+(?=@)")
+
+
+def wal_is_safe(version: str = sqlite3.sqlite_version) -> bool:
+    """Tell whether this SQLite has the fix of the WAL-reset bug, which loses committed data (sqlite.org/wal.html).
+
+    Parameters
+    ----------
+    version : str
+        SQLite version, e.g. ``"3.51.3"``.
+
+    Returns
+    -------
+    bool
+        True for 3.51.3 and later, and for the repaired 3.44.6+ and 3.50.7+.
+    """
+    number = tuple(int(part) for part in version.split("."))
+    return number >= (3, 51, 3) or (number[:2] == (3, 44) and number >= (3, 44, 6)) or (number[:2] == (3, 50) and number >= (3, 50, 7))
+
+
+def mask_secrets(text: str) -> str:
+    """Hide the passwords of URLs in a text that people will see.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+        The text with ``user:***@`` in place of ``user:password@``.
+    """
+    return _PASSWORD.sub(r"\1:***", text)
+
+
+def resolve_url(url: str, base: Path | None = None) -> str:
+    """Make a relative SQLite path relative to a folder (the machine file's) instead of to wherever the command was started.
+
+    Parameters
+    ----------
+    url : str
+        Database URL.
+    base : Path, optional
+        Folder; default: leave the URL as it is.
+
+    Returns
+    -------
+    str
+        The URL, absolute for SQLite files if ``base`` is given.
+    """
+    parsed = parse_url(url)
+    if base is None or not _is_sqlite_file(parsed) or Path(str(parsed.database)).is_absolute():
+        return url
+    return parsed.set(database=str((base / str(parsed.database)).resolve())).render_as_string(hide_password=False)
+
+
+def parse_url(url: str) -> URL:
+    """Understand a database URL, or say what one looks like.
+
+    Parameters
+    ----------
+    url : str
+        As the user wrote it.
+
+    Returns
+    -------
+    URL
+        SQLAlchemy's URL; PostgreSQL always with the psycopg driver.
+
+    Raises
+    ------
+    StoreError
+        If it is not a URL of SQLite or PostgreSQL.
+    """
+    try:
+        parsed = make_url(url)
+    except exc.ArgumentError:
+        raise StoreError(f"database URL {mask_secrets(url)!r} cannot be understood", _URL_HELP) from None
+    if parsed.drivername in {"postgresql", "postgres"}:
+        parsed = parsed.set(drivername="postgresql+psycopg")
+    if parsed.drivername not in {"sqlite", "postgresql+psycopg"}:
+        raise StoreError(f"database {parsed.drivername!r} is not supported", _URL_HELP)
+    return parsed
+
+
+_URL_HELP = "write e.g. sqlite:///abbe.sqlite3 or postgresql://user@host/name"
+
+
+def make_engine(url: str) -> Engine:
+    """Create the engine with this product's settings. Nothing is opened yet.
+
+    Parameters
+    ----------
+    url : str
+        Database URL.
+
+    Returns
+    -------
+    Engine
+        Transactions of it start with BEGIN IMMEDIATE on SQLite unless the connection has the option ``READ_ONLY_OPTION``.
+
+    Raises
+    ------
+    StoreError
+        If the URL is wrong, the file is not a database, its folder is missing, or the driver is not installed.
+    """
+    parsed = parse_url(url)
+    options: dict[str, Any] = {"json_serializer": _to_json}
+    if parsed.drivername == "sqlite":
+        _check_file(parsed)
+        options["connect_args"] = {"check_same_thread": False}
+        if not _is_sqlite_file(parsed):
+            options["poolclass"] = StaticPool
+    else:
+        options["pool_pre_ping"] = True
+    try:
+        engine = create_engine(parsed, **options)
+    except ModuleNotFoundError as err:
+        raise StoreError(f"PostgreSQL needs the package {err.name!r}", "pip install 'abbe[postgres]'") from None
+    if parsed.drivername == "sqlite":
+        event.listen(engine, "connect", _set_pragmas)
+        event.listen(engine, "begin", _begin)
+    return engine
+
+
+@contextmanager
+def translated(url: str) -> Iterator[None]:
+    """Turn database errors into one StoreError that names the database and hides its password.
+
+    Parameters
+    ----------
+    url : str
+        Database URL.
+
+    Raises
+    ------
+    StoreError
+        In place of any SQLAlchemy error.
+    """
+    where = mask_secrets(url)
+    try:
+        yield
+    except exc.OperationalError as err:
+        raise StoreError(f"database {where}: {_first_line(err)}", _remedy(str(err.orig))) from err
+    except exc.SQLAlchemyError as err:
+        raise StoreError(f"database {where}: {_first_line(err)}") from err
+
+
+def _to_json(value: Any) -> str:
+    try:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    except ValueError as err:
+        raise StoreError(f"a document with NaN or Infinity is not stored ({err})", "give null where there is no value") from None
+
+
+def _first_line(err: exc.SQLAlchemyError) -> str:
+    inner = getattr(err, "orig", None) or err
+    return mask_secrets(str(inner).strip().splitlines()[0] if str(inner).strip() else type(inner).__name__)
+
+
+def _remedy(text: str) -> str:
+    if "locked" in text:
+        return "another process is writing: stop it or try again"
+    if "full" in text:
+        return "free disk space"
+    if "readonly" in text or "unable to open" in text:
+        return "check that the folder exists and may be written"
+    if "password" in text or "authentication" in text:
+        return "check user and password in the URL"
+    if "connection" in text:
+        return "check that the database server runs at this address"
+    return ""
+
+
+def _is_sqlite_file(parsed: URL) -> bool:
+    return parsed.drivername == "sqlite" and parsed.database not in {None, "", ":memory:"}
+
+
+def _check_file(parsed: URL) -> None:
+    if not _is_sqlite_file(parsed):
+        return
+    path = Path(str(parsed.database))
+    if not path.parent.is_dir():
+        raise StoreError(f"database {path}: folder {path.parent} does not exist", "create it or give another --db")
+    if path.is_dir():
+        raise StoreError(f"database {path} is a folder", "give a file name")
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(_SQLITE_MAGIC))
+    except FileNotFoundError:
+        return
+    except OSError as err:
+        raise StoreError(f"database {path} cannot be read: {err.strerror}", "check its access rights") from None
+    if head not in {b"", _SQLITE_MAGIC}:
+        raise StoreError(f"{path} is not a SQLite database", "give the file that `abbe` made, or a new name")
+
+
+def _set_pragmas(connection: sqlite3.Connection, _record: object) -> None:
+    connection.isolation_level = None  # we say BEGIN ourselves: the module's own rule starts transactions too late
+    cursor = connection.cursor()
+    try:
+        cursor.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
+        cursor.execute(f"PRAGMA journal_mode={'WAL' if wal_is_safe() else 'PERSIST'}")
+        cursor.execute("PRAGMA synchronous=FULL")
+        cursor.execute("PRAGMA foreign_keys=ON")
+        cursor.execute("PRAGMA trusted_schema=OFF")
+        cursor.execute(f"PRAGMA journal_size_limit={JOURNAL_LIMIT_BYTES}")
+    finally:
+        cursor.close()
+
+
+def _begin(connection: Connection) -> None:
+    reads_only = connection.get_execution_options().get(READ_ONLY_OPTION, False)
+    connection.exec_driver_sql("BEGIN" if reads_only else "BEGIN IMMEDIATE")

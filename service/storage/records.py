@@ -1,0 +1,151 @@
+"""What the store gives back: plain frozen values, one per table row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from service.storage.owner import Owner
+
+Doc = dict[str, Any]
+"""A JSON object."""
+
+RUNNING = "running"
+INCOMPLETE = "incomplete"
+FINISHED = ("complete", "aborted", "failed")
+
+
+@dataclass(frozen=True, slots=True)
+class MachineRecord:
+    """A machine as it was described at some time; another description is another record."""
+
+    id: int
+    name: str
+    doc: Doc
+    doc_hash: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignRecord:
+    """Runs that belong together: one machine, one clock zero."""
+
+    id: int
+    machine_id: int
+    name: str
+    doc: Doc
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """One measured sequence. ``status`` is what was written, ``visible_status`` what a person should be told."""
+
+    id: int
+    campaign_id: int
+    campaign: str
+    label: str
+    test: str
+    role: str
+    status: str
+    reason: str
+    start_doc: Doc
+    end_doc: Doc | None
+    started_utc: str
+    ended_utc: str | None
+    owner: Owner
+
+    @property
+    def visible_status(self) -> str:
+        """``"incomplete"`` when the run was never finished and its process is gone, else ``status``."""
+        return INCOMPLETE if self.status == RUNNING and self.owner.is_gone() else self.status
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkRecord:
+    """Samples as they arrived, checked against their CRC-32. Never changed after writing."""
+
+    run_id: int
+    channel: str
+    seq: int
+    n: int
+    codec: str
+    crc32: int
+    payload: bytes = field(repr=False)
+    first_host_s: float
+    last_host_s: float
+    first_device_us: int
+    last_device_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class SolutionRecord:
+    """What a solver found from some runs."""
+
+    id: int
+    campaign_id: int
+    kind: str
+    run_ids: list[int]
+    doc: Doc
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class TableRecord:
+    """A compensation table as the controller would hold it."""
+
+    id: int
+    machine_id: int
+    solution_id: int | None
+    image: bytes = field(repr=False)
+    crc: int
+    doc: Doc
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class PushRecord:
+    """Journal of one table's way into the controller."""
+
+    id: int
+    machine_id: int
+    table_id: int
+    state: str
+    doc: Doc
+    created_utc: str
+    updated_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationRecord:
+    """Result of a check of the machine."""
+
+    id: int
+    machine_id: int
+    campaign_id: int | None
+    verdict: str
+    doc: Doc
+    utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class OutboxRecord:
+    """A message that must reach the broker some day."""
+
+    id: int
+    topic: str
+    payload: bytes
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedRun:
+    """A run on its way in from an exchange file, with its channels packed."""
+
+    label: str
+    test: str
+    role: str
+    start_doc: Doc
+    n: int
+    codec: str
+    payload: bytes = field(repr=False)

@@ -1,0 +1,147 @@
+"""The tables, as SQLAlchemy Core sees them. The migrations create exactly these (a test compares the two)."""
+
+from __future__ import annotations
+
+from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, LargeBinary, MetaData, String, Table, Text, UniqueConstraint
+from sqlalchemy.types import JSON
+
+NAMING = {
+    "pk": "pk_%(table_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_name)s",
+    "ix": "ix_%(table_name)s_%(column_0_name)s",
+}
+
+metadata = MetaData(naming_convention=NAMING)
+
+machines = Table(
+    "machines",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("name", String(200), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("doc_hash", String(64), nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    UniqueConstraint("name", "doc_hash"),
+)
+
+campaigns = Table(
+    "campaigns",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine_id", ForeignKey("machines.id"), nullable=False),
+    Column("name", String(200), nullable=False, unique=True),
+    Column("doc", JSON, nullable=False),
+    Column("created_utc", String(32), nullable=False),
+)
+
+runs = Table(
+    "runs",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("campaign_id", ForeignKey("campaigns.id"), nullable=False),
+    Column("label", String(100), nullable=False),
+    Column("test", String(40), nullable=False),
+    Column("role", String(20), nullable=False),
+    Column("status", String(20), nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("start_doc", JSON, nullable=False),
+    Column("end_doc", JSON(none_as_null=True)),
+    Column("started_utc", String(32), nullable=False),
+    Column("ended_utc", String(32)),
+    Column("owner_host", String(255), nullable=False),
+    Column("owner_pid", Integer, nullable=False),
+    Column("owner_start", String(80), nullable=False),
+    UniqueConstraint("campaign_id", "label"),
+)
+
+chunks = Table(
+    "chunks",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("run_id", ForeignKey("runs.id"), nullable=False),
+    Column("channel", String(40), nullable=False),
+    Column("seq", Integer, nullable=False),
+    Column("n", Integer, nullable=False),
+    Column("codec", String(20), nullable=False),
+    Column("crc32", BigInteger, nullable=False),
+    Column("payload", LargeBinary, nullable=False),
+    Column("first_host_s", Float, nullable=False),
+    Column("last_host_s", Float, nullable=False),
+    Column("first_device_us", BigInteger, nullable=False),
+    Column("last_device_us", BigInteger, nullable=False),
+    UniqueConstraint("run_id", "channel", "seq"),
+)
+
+solutions = Table(
+    "solutions",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("campaign_id", ForeignKey("campaigns.id"), nullable=False),
+    Column("kind", String(40), nullable=False),
+    Column("run_ids", JSON, nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    Index(None, "campaign_id"),
+)
+
+comp_tables = Table(
+    "tables",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine_id", ForeignKey("machines.id"), nullable=False),
+    Column("solution_id", ForeignKey("solutions.id")),
+    Column("image", LargeBinary, nullable=False),
+    Column("crc", BigInteger, nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    Index(None, "machine_id"),
+)
+
+pushes = Table(
+    "pushes",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine_id", ForeignKey("machines.id"), nullable=False),
+    Column("table_id", ForeignKey("tables.id"), nullable=False),
+    Column("state", String(30), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    Column("updated_utc", String(32), nullable=False),
+    Index(None, "machine_id"),
+)
+
+verifications = Table(
+    "verifications",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine_id", ForeignKey("machines.id"), nullable=False),
+    Column("campaign_id", ForeignKey("campaigns.id")),
+    Column("verdict", String(30), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("utc", String(32), nullable=False),
+    Index(None, "machine_id"),
+)
+
+slots = Table(
+    "slots",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("schedule", String(200), nullable=False),
+    Column("slot_utc", String(32), nullable=False),
+    Column("state", String(30), nullable=False),
+    Column("claimed_utc", String(32), nullable=False),
+    Column("finished_utc", String(32)),
+    UniqueConstraint("schedule", "slot_utc"),
+)
+
+outbox = Table(
+    "outbox",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("topic", String(500), nullable=False),
+    Column("payload", LargeBinary, nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    Column("sent_utc", String(32)),
+    Index(None, "sent_utc"),
+)

@@ -1,0 +1,84 @@
+"""Migrations give exactly the tables the program uses, up and down, on both databases."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import Engine, inspect
+
+from service.errors import StoreError
+from service.storage.engine import make_engine
+from service.storage.migrate import current_revision, downgrade, head_revision, upgrade
+from service.storage.store import Store
+from service.storage.tables import metadata
+
+SERVER = "postgresql://postgres@127.0.0.1:5432/"
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
+    if request.param == "sqlite":
+        engine = make_engine(f"sqlite:///{tmp_path / 'abbe.sqlite3'}")
+        yield engine
+        engine.dispose()
+        return
+    psycopg = pytest.importorskip("psycopg")
+    try:
+        server = psycopg.connect(SERVER, autocommit=True, connect_timeout=3)
+    except psycopg.OperationalError:
+        pytest.skip(f"no PostgreSQL at {SERVER}")
+    name = f"abbe_test_{uuid.uuid4().hex}"
+    server.execute(f"CREATE DATABASE {name}")
+    engine = make_engine(SERVER + name)
+    yield engine
+    engine.dispose()
+    server.execute(f"DROP DATABASE {name} WITH (FORCE)")
+    server.close()
+
+
+def test_up_gives_the_tables_of_the_program(engine: Engine) -> None:
+    upgrade(engine)
+    assert current_revision(engine) == head_revision()
+    with engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), metadata) == []
+
+
+def test_down_and_up_again(engine: Engine) -> None:
+    upgrade(engine)
+    downgrade(engine)
+    assert set(inspect(engine).get_table_names()) == {"alembic_version"}
+    assert current_revision(engine) is None
+    upgrade(engine)
+    assert set(inspect(engine).get_table_names()) == set(metadata.tables) | {"alembic_version"}
+
+
+def test_upgrade_of_an_up_to_date_database_changes_nothing(engine: Engine) -> None:
+    upgrade(engine)
+    upgrade(engine)
+    assert current_revision(engine) == head_revision()
+
+
+def test_database_of_a_newer_version_is_refused(engine: Engine) -> None:
+    upgrade(engine)
+    with engine.begin() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+    with pytest.raises(StoreError, match="schema 9999, which this version of Abbe does not know"):
+        upgrade(engine)
+
+
+def test_old_sqlite_file_is_copied_before_an_upgrade(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "abbe.sqlite3"
+    Store.open(f"sqlite:///{path}").close()
+    engine = make_engine(f"sqlite:///{path}")
+    monkeypatch.setattr("alembic.script.ScriptDirectory.get_current_head", lambda _self: "0002")
+    upgrade(engine)
+    engine.dispose()
+    copy = tmp_path / "abbe.sqlite3.before-0001"
+    assert copy.exists()
+    with Store.open(f"sqlite:///{copy}") as store:
+        assert store.runs() == []
