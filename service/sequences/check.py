@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 from models.machine import AXES, Machine
 from service.errors import StrokeError
@@ -42,7 +43,7 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
         case MoveTo(target, feed):
             return (0.0 if here is None else math.dist(here, target) / feed * 60.0), target
         case RecordPath(points, feed, _, _):
-            length = sum(math.dist(a, b) for a, b in zip(points, points[1:], strict=False))
+            length = sum(math.dist(a, b) for a, b in pairwise(points))
             return length / feed * 60.0, points[-1]
         case ReadLaser(_, settle):
             return settle + 0.1, here

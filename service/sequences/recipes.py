@@ -86,17 +86,15 @@ class Diagonal:
         """Steps: approach, mount, zero, and one reading after every move."""
         box = machine.stroke_mm + np.array([CLEARANCE_MM, -CLEARANCE_MM])
         start, end = diagonal_ends(box, self.diagonal)
-        if self.order:
-            points = step_diagonal(start, end, self.steps, self.order)
-        else:
-            points = straight_line(start, end, self.steps + 1)
+        sequential = bool(self.order)
+        points = step_diagonal(start, end, self.steps, self.order) if sequential else straight_line(start, end, self.steps + 1)
         setup: dict[str, Any] = {
             "setup_id": self.setup_id,
             "diagonal": self.diagonal,
             "increment_mm": [float(v) for v in (end - start) / self.steps],
             "steps": self.steps,
         }
-        if self.order:
+        if sequential:
             setup["order"] = self.order
         return _laser_plan(self, "laser_diagonal", setup, points, start, end)
 

@@ -1,0 +1,1 @@
+"""Devices of one machine, opened and closed together."""

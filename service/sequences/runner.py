@@ -1,0 +1,194 @@
+"""Interprets the steps of one test on real devices. Motion never outlives the block that commanded it."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from drivers.api import BarBatch, Controller, ControllerStatus, Point
+from drivers.errors import DriverError
+from drivers.links.shielded import run_to_end
+from service.devices.session import Session
+from service.errors import MeasurementFault, UnsafeToMove
+from service.runs.recorder import Recorder
+from service.sequences.check import step_seconds
+from service.sequences.steps import MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, Step, TestPlan, ZeroLaser
+
+ESTOP, DOOR, ALARM, REMOTE, REFERENCED, DRIVES, HOLD, PATH, PROGRAM = 0, 1, 2, 3, 4, 5, 8, 9, 11
+FORBIDDEN = (
+    (ESTOP, "e-stop is pressed"),
+    (DOOR, "the door is open"),
+    (ALARM, "the controller has an alarm"),
+    (PROGRAM, "an NC program runs"),
+)
+NEEDED = ((REMOTE, "the controller is not in remote mode"), (REFERENCED, "the axes are not referenced"), (DRIVES, "the drives are off"))
+POLL_S = 0.01
+STALL_S = 10.0
+BAD_IN_A_ROW = 25
+SYNC, BAD_BITS = 0b1000, 0b10101
+
+Tick = Callable[[float], None]
+
+
+def check_interlocks(status: ControllerStatus) -> None:
+    """Refuse to move (or to go on) unless the controller says that it is safe.
+
+    Raises
+    ------
+    UnsafeToMove
+        Which condition, and that nothing moves until it is cleared.
+    """
+    for bit, text in FORBIDDEN:
+        if status.bits >> bit & 1:
+            raise UnsafeToMove(text, "clear it at the machine, then start again; the run so far is kept as incomplete")
+    for bit, text in NEEDED:
+        if not status.bits >> bit & 1:
+            raise UnsafeToMove(text, "make the machine ready, then start again")
+
+
+@asynccontextmanager
+async def motion_guard(controller: Controller) -> AsyncIterator[None]:
+    """Whatever ends this block early also stops the axes: abort is sent although the task is being cancelled."""
+    try:
+        yield
+    except BaseException:
+        await run_to_end(_stop(controller))
+        raise
+
+
+async def _stop(controller: Controller) -> None:
+    try:
+        async with asyncio.timeout(2.0):
+            await controller.abort()
+            await controller.resume()  # the abort level is taken back; nothing is queued any more
+    except (DriverError, TimeoutError):
+        return  # the link is gone: the controller's own watchdog is all that is left, and the first error is what the person must read
+
+
+class Runner:
+    """Runs tests on one session. ``tick(seconds)`` is called after each step with the planned machine seconds done so far in the test."""
+
+    def __init__(self, session: Session) -> None:
+        self._s = session
+
+    async def run(self, plan: TestPlan, recorder: Recorder, tick: Tick) -> dict[str, int]:
+        """Execute a test; returns what the end document needs (path start and end in controller time, for ball-bar runs).
+
+        Raises
+        ------
+        UnsafeToMove, MeasurementFault, DriverError
+            The axes are stopped before the error leaves.
+        """
+        result: dict[str, int] = {}
+        here: Point | None = None
+        done = 0.0
+        async with motion_guard(self._s.controller):
+            check_interlocks(await self._s.controller.status())
+            for step in plan.steps:
+                if isinstance(step, MoveTo) and here == step.target_mm:
+                    continue
+                seconds, after = step_seconds(step, here)
+                result |= await self._step(step, here, recorder)
+                done, here = done + seconds, after
+                tick(done)
+        return result
+
+    async def _step(self, step: Step, here: Point | None, recorder: Recorder) -> dict[str, int]:
+        match step:
+            case MoveTo(target, feed):
+                await self._move(target, feed, here)
+            case MountBar(radius):
+                await self._s.need_fixture().mount_ballbar(radius)
+            case MountLaser(beam):
+                await self._s.need_fixture().mount_laser(beam)
+            case ZeroLaser():
+                laser = self._s.need_laser()
+                await laser.clear_beam()
+                await laser.zero()
+            case ReadLaser(direction, settle_s):
+                await self._read_laser(direction, settle_s, recorder, here)
+            case RecordPath():
+                return await self._record_path(step, recorder)
+        return {}
+
+    async def _move(self, target: Point, feed_mm_min: float, here: Point | None) -> None:
+        seconds = 60.0 if here is None else math.dist(here, target) / feed_mm_min * 60.0
+        status = await self._s.controller.move(target, feed_mm_min=feed_mm_min, timeout_s=30.0 + 3.0 * seconds)
+        check_interlocks(status)
+
+    async def _read_laser(self, direction: int, settle_s: float, recorder: Recorder, here: Point | None) -> None:
+        status = await self._s.controller.status()
+        while status.ctrl_us < status.in_position_us + settle_s * 1e6:
+            await asyncio.sleep(0.001)
+            status = await self._s.controller.status()
+        check_interlocks(status)
+        laser = self._s.need_laser()
+        before = await laser.read()
+        reading = await laser.read(after_count=before.sample_count)  # a sample that began after the axes had settled
+        recorder.add_record(
+            {
+                "host_s": reading.host_s,
+                "ctrl_us": status.ctrl_us,
+                "target_mm": list(here if here is not None else status.position_mm),
+                "direction": direction,
+                "displacement_tenth_nm": reading.displacement_tenth_nm,
+                "status": reading.status,
+                "signal_permille": reading.signal_permille,
+                "air_temp_c": reading.air_temp_c,
+                "air_pressure_pa": reading.air_pressure_pa,
+                "feed_mm_min": 0.0,
+            }
+        )
+
+    async def _record_path(self, step: RecordPath, recorder: Recorder) -> dict[str, int]:
+        controller = self._s.controller
+        await controller.load_path(step.points_mm)
+        finished = asyncio.Event()
+        try:
+            async with self._s.need_ballbar().stream(step.rate_hz) as batches, asyncio.TaskGroup() as group:
+                group.create_task(_pump(batches, recorder, finished))
+                await controller.start_path(feed_mm_min=step.feed_mm_min)
+                status = await _watch(controller)
+                finished.set()
+        except* (DriverError, UnsafeToMove, MeasurementFault) as errors:
+            raise errors.exceptions[0] from None
+        return {"path_start_us": status.path_start_us, "path_end_us": status.path_end_us}
+
+
+async def _watch(controller: Controller) -> ControllerStatus:
+    """Poll until the path has ended; an interlock, a feed hold or a stall ends the run."""
+    loop = asyncio.get_running_loop()
+    points, since = -1, loop.time()
+    while True:
+        status = await controller.status()
+        check_interlocks(status)
+        if status.bits >> HOLD & 1:
+            raise MeasurementFault(
+                "feed hold was pressed while the ball-bar recorded", "start the test again: readings must be at constant feed"
+            )
+        if not status.bits >> PATH & 1 and status.path_end_us > status.path_start_us:
+            return status
+        if status.path_points_done != points:
+            points, since = status.path_points_done, loop.time()
+        elif loop.time() - since > STALL_S:
+            raise MeasurementFault(f"the path has not advanced for {STALL_S:g} s", "look at the machine: is the feed override at zero?")
+        await asyncio.sleep(POLL_S)
+
+
+async def _pump(batches: AsyncIterator[BarBatch], recorder: Recorder, finished: asyncio.Event) -> None:
+    """Record until the path has ended and one sample without the sync level has been seen."""
+    bad = 0
+    async for batch in batches:
+        recorder.add_bar(batch)
+        for sample in batch.samples:
+            on_path = bool(sample.status & SYNC)
+            bad = bad + 1 if on_path and sample.status & BAD_BITS else 0
+            if bad >= BAD_IN_A_ROW:
+                raise MeasurementFault(
+                    f"the ball-bar is out of range or not mounted (status {sample.status:#06x})",
+                    "check centre, radius and that the bar sits in both cups, then start the test again",
+                )
+        if finished.is_set() and batch.samples and not batch.samples[-1].status & SYNC:
+            return

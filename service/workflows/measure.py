@@ -1,0 +1,150 @@
+"""Measure a campaign: every test becomes a run in the store, complete or visibly not."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+from drivers.errors import DriverError
+from service.clock import Clock, SystemClock
+from service.devices.session import Session
+from service.errors import AbbeError
+from service.events import Progress, ProgressSink, ignore_progress
+from service.runs.recorder import recording
+from service.sequences.check import dry_run_campaign
+from service.sequences.runner import Runner
+from service.sequences.steps import CampaignPlan, RecordPath, TestPlan
+from service.site import Site
+from service.storage.store import Store
+
+
+@dataclass
+class Meter:
+    """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA."""
+
+    stage: str
+    total_s: float
+    sink: ProgressSink
+    clock: Clock
+    done_s: float = 0.0
+    start_s: float = field(default=0.0)
+
+    def __post_init__(self) -> None:
+        """Start the stopwatch."""
+        self.start_s = self.clock.monotonic_s()
+
+    def at(self, done_s: float, message: str) -> None:
+        """Report how far the job is."""
+        elapsed = self.clock.monotonic_s() - self.start_s
+        eta = elapsed / done_s * (self.total_s - done_s) if done_s > 0.02 * self.total_s else None
+        self.sink(Progress(self.stage, done_s, self.total_s, eta, message))
+
+
+async def start_campaign(session: Session, store: Store, site: Site, name: str) -> tuple[int, int]:
+    """A new campaign in the store and its clock zero (controller time, us)."""
+    machine_id = await store.write(store.add_machine, site.name, site.doc)
+    status = await session.controller.status()
+    comp = await session.controller.comp_status()
+    doc = {
+        "ctrl0_us": status.ctrl_us,
+        "active_bank": comp.active_bank,
+        "table_crc": comp.bank_crc[comp.active_bank],
+        "boot_id": comp.boot_id,
+        "current_model": {"includes": ["rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"], "errors": None},
+        "instruments": {"ballbar": {"resolution_mm": 1e-6}, "laser": {"resolution_mm": 1e-7}},
+        "temperature_sensors": False,
+    }
+    return await store.write(store.add_campaign, machine_id, name, doc), status.ctrl_us
+
+
+async def measure(
+    session: Session,
+    store: Store,
+    site: Site,
+    plan: CampaignPlan,
+    *,
+    progress: ProgressSink = ignore_progress,
+    clock: Clock | None = None,
+) -> list[int]:
+    """Run all tests of a plan; returns the run numbers in the store.
+
+    Raises
+    ------
+    StrokeError
+        Before anything moves.
+    UnsafeToMove, MeasurementFault, DriverError
+        The run in hand is closed as failed, with the reason; earlier runs stay.
+    """
+    clock = clock or SystemClock()
+    dry = dry_run_campaign(site.machine, plan)
+    campaign_id, ctrl0_us = await start_campaign(session, store, site, plan.name)
+    meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock)
+    run_ids = []
+    for test, expected in zip(plan.tests, dry, strict=True):
+        base = meter.done_s
+
+        def tick(seconds: float, base: float = base, label: str = test.label) -> None:
+            meter.at(base + seconds, label)
+
+        run_ids.append(await measure_test(session, store, site, (campaign_id, ctrl0_us), test, tick, clock))
+        meter.done_s = base + expected.duration_s
+        meter.at(meter.done_s, test.label)
+    return run_ids
+
+
+async def measure_test(
+    session: Session,
+    store: Store,
+    site: Site,
+    campaign: tuple[int, int],
+    test: TestPlan,
+    tick: Callable[[float], None],
+    clock: Clock,
+) -> int:
+    """One test as one run; whatever ends it early is written into the run before it is raised again."""
+    campaign_id, ctrl0_us = campaign
+    doc = await _start_doc(session, site, ctrl0_us, test, clock)
+    run_id = await store.write(store.start_run, campaign_id, test.label, test.test, test.role, doc)
+    status, reason, end = "aborted", "stopped", dict[str, Any]()
+    gaps: list[dict[str, int]] = []
+    try:
+        async with recording(store, run_id) as recorder:
+            gaps = recorder.gaps
+            end = dict(await Runner(session).run(test, recorder, tick))
+        status, reason = "complete", ""
+    except* (AbbeError, DriverError) as errors:
+        first = _first(errors)
+        status, reason = "failed", f"{first.code}: {first}"
+        raise first from None
+    finally:
+        await store.write(store.finish_run, run_id, status, reason, end | {"gaps": gaps, "ended_utc": clock.utc().isoformat()})
+    return run_id
+
+
+def _first(group: BaseExceptionGroup[Any]) -> AbbeError | DriverError:
+    error: BaseException = group
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    assert isinstance(error, (AbbeError, DriverError))
+    return error
+
+
+async def _start_doc(session: Session, site: Site, ctrl0_us: int, test: TestPlan, clock: Clock) -> dict[str, Any]:
+    status = await session.controller.status()
+    comp = await session.controller.comp_status()
+    doc: dict[str, Any] = {
+        "setup": test.setup | {"t_set_s": (status.ctrl_us - ctrl0_us) * 1e-6},
+        "machine": site.doc,
+        "ctrl0_us": ctrl0_us,
+        "table": {"bank": comp.active_bank, "crc": comp.bank_crc[comp.active_bank], "gen": comp.gen},
+        "clock": {"utc": clock.utc().isoformat(), "host_s": clock.monotonic_s(), "ctrl_us": status.ctrl_us},
+        "versions": {"abbe": version("abbe"), "python": platform.python_version()},
+    }
+    for step in test.steps:
+        if isinstance(step, RecordPath):
+            doc["path"] = {"feed_mm_min": step.feed_mm_min, "direction": step.direction, "points_mm": [list(p) for p in step.points_mm]}
+            doc["rate_hz"] = step.rate_hz
+    return doc
