@@ -10,8 +10,9 @@ import structlog
 from drivers.errors import DriverError
 from service.clock import Clock
 from service.errors import AbbeError
+from service.events import Progress
 from service.scheduler import record
-from service.scheduler.ports import Check, Doc, JobWatcher, Progress, Shelf
+from service.scheduler.ports import Check, Doc, JobWatcher, Shelf
 from service.scheduler.slots import Schedule
 
 log = structlog.get_logger("abbe.check")

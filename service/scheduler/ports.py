@@ -6,39 +6,11 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Literal, Protocol
 
+from service.events import Progress, ProgressSink
 from service.scheduler.slots import Schedule
 
 Verdict = Literal["pass", "fail", "cannot tell"]
 Doc = dict[str, Any]
-
-
-class Progress(Protocol):
-    """How far a running check is."""
-
-    @property
-    def stage(self) -> str:
-        """What is being done now."""
-        ...
-
-    @property
-    def done(self) -> int:
-        """Steps finished."""
-        ...
-
-    @property
-    def total(self) -> int:
-        """Steps in all."""
-        ...
-
-    @property
-    def eta_s(self) -> float | None:
-        """Seconds to go, or None while nobody can tell."""
-        ...
-
-    @property
-    def message(self) -> str:
-        """One line for people."""
-        ...
 
 
 class CheckResult(Protocol):
@@ -90,7 +62,7 @@ class CheckResult(Protocol):
         ...
 
 
-Check = Callable[[str, Callable[[Progress], None]], Awaitable[CheckResult]]
+Check = Callable[[str, ProgressSink], Awaitable[CheckResult]]
 """``check(recipe, progress)``: opens the devices, measures, closes them. Cancelling it must leave the machine held."""
 
 

@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 from itertools import count
 from typing import Any
 
+from service.events import Progress
 from service.scheduler.slots import Schedule
 
 
@@ -111,15 +112,7 @@ class Result:
     text: str = "Every figure lies inside its limit."
 
 
-@dataclass(frozen=True)
-class Step:
-    """A Progress."""
-
-    stage: str = "helix"
-    done: int = 3
-    total: int = 10
-    eta_s: float | None = 42.0
-    message: str = "revolution 3 of 10"
+STEP = Progress("helix", 3, 10, 42.0, "revolution 3 of 10")
 
 
 class FakeWatcher:
@@ -129,7 +122,7 @@ class FakeWatcher:
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
         self.heard.append(f"started {schedule.name}")
 
-    def job_progress(self, progress: Any) -> None:
+    def job_progress(self, progress: Progress) -> None:
         self.heard.append(f"progress {progress.done}/{progress.total}")
 
     def job_ended(self, doc: dict[str, Any] | None) -> None:

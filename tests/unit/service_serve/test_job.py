@@ -14,7 +14,7 @@ from drivers.errors import LinkDown
 from service.errors import MeasurementFault
 from service.scheduler.job import CheckJob
 from service.scheduler.slots import Schedule
-from tests.unit.service_serve.fakes import FakeClock, FakeShelf, FakeWatcher, Result, Step, settle, utc
+from tests.unit.service_serve.fakes import STEP, FakeClock, FakeShelf, FakeWatcher, Result, settle, utc
 
 SCHEDULE = Schedule("weekly", "0 6 * * 1", "Europe/Berlin", "verify")
 SLOT = utc(2026, 6, 1, 4)
@@ -29,7 +29,7 @@ class Bench:
 
     async def check(self, recipe: str, progress: Callable[[Any], None]) -> Result:
         assert recipe == "verify"
-        progress(Step())
+        progress(STEP)
         if isinstance(self.outcome, BaseException):
             raise self.outcome
         return self.outcome

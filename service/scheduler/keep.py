@@ -1,0 +1,109 @@
+"""Ledger and shelf on top of the store, off the event loop, patient with a database that is locked or restarting for a while."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from datetime import datetime
+from typing import ParamSpec, TypeVar
+
+import structlog
+
+from service.clock import Clock
+from service.errors import StoreError
+from service.scheduler import record
+from service.scheduler.ports import Doc
+from service.scheduler.store import ServiceStore
+
+log = structlog.get_logger("abbe.store")
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+PAUSES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+"""A minute altogether. A measurement takes minutes of machine time; it is not thrown away because of a backup run."""
+
+
+class _Patient:
+    def __init__(self, store: ServiceStore, clock: Clock) -> None:
+        self._store = store
+        self._clock = clock
+
+    async def _write(self, fn: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        for pause_s in PAUSES_S:
+            try:
+                return await self._store.write(fn, *args, **kwargs)
+            except StoreError as trouble:
+                log.warning("store does not take this now; trying again", cause=trouble.detail, pause_s=pause_s)
+                await self._clock.sleep(pause_s)
+        return await self._store.write(fn, *args, **kwargs)
+
+
+class StoreLedger(_Patient):
+    """Slots in the store. Each key names the machine: one database may serve several services."""
+
+    def __init__(self, store: ServiceStore, clock: Clock, machine: str) -> None:
+        super().__init__(store, clock)
+        self._machine = machine
+
+    async def claim(self, schedule: str, slot_utc: datetime) -> bool:
+        """Return True to exactly one caller, ever, for each (schedule, slot)."""
+        return await self._write(self._store.claim_slot, self._key(schedule), slot_utc)
+
+    async def finish(self, schedule: str, slot_utc: datetime, state: str) -> None:
+        """Write down what became of a claimed slot."""
+        await self._write(self._store.finish_slot, self._key(schedule), slot_utc, state[:30])
+
+    async def last_claimed(self, schedule: str) -> datetime | None:
+        """Return the latest slot ever claimed for this schedule, or None if it is new."""
+        return await asyncio.to_thread(self._store.last_slot, self._key(schedule))
+
+    def _key(self, schedule: str) -> str:
+        return f"{self._machine}/{schedule}"
+
+
+class StoreShelf(_Patient):
+    """Verifications and messages in the store.
+
+    Parameters
+    ----------
+    store : ServiceStore
+        Where to.
+    clock : Clock
+        Pauses while the store is not available.
+    machine : tuple of str and int
+        Name, and number in the store.
+    topics : tuple of str
+        Where verifications and alarms are published; empty if there is no broker in the machine file.
+    posted : callable
+        Told when there is something new to publish.
+    """
+
+    def __init__(
+        self, store: ServiceStore, clock: Clock, machine: tuple[str, int], topics: tuple[str, str] | None, posted: Callable[[], None]
+    ) -> None:
+        super().__init__(store, clock)
+        self._machine, self._machine_id = machine
+        self._topics = topics
+        self._posted = posted
+
+    async def keep(self, doc: Doc) -> int:
+        """Store a verification and queue its messages, together; return its number."""
+        messages: list[tuple[str, Doc]] = []
+        if self._topics is not None:
+            verification_topic, alarm_topic = self._topics
+            messages.append((verification_topic, doc))
+            if doc["cause"] is not None:
+                messages.append((alarm_topic, self._of_machine(record.alarm(doc))))
+        number = await self._write(self._store.keep_verification, self._machine_id, doc, messages)
+        self._posted()
+        return number
+
+    async def alarm(self, doc: Doc) -> None:
+        """Queue an alarm."""
+        if self._topics is not None:
+            await self._write(self._store.put_message, self._topics[1], self._of_machine(doc))
+            self._posted()
+
+    def _of_machine(self, doc: Doc) -> Doc:
+        return {"schema": record.SCHEMA, "machine": self._machine, **doc}

@@ -1,0 +1,81 @@
+"""The store with what an unattended service adds: a result and its messages in one transaction, and questions by machine name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import datetime
+
+from sqlalchemy import Connection, func, insert, select
+
+from service.storage.records import Doc, VerificationRecord
+from service.storage.store import Store
+from service.storage.store_campaigns import new_id
+from service.storage.tables import campaigns, machines, outbox, slots, verifications
+
+
+class ServiceStore(Store):
+    """A `Store` that is also ledger, shelf and archive of the service. Open it with ``ServiceStore.open``."""
+
+    def keep_verification(self, machine_id: int, doc: Doc, messages: Sequence[tuple[str, Doc]]) -> int:
+        """Store the result of a check together with the messages about it: both or neither survive a power cut.
+
+        Parameters
+        ----------
+        machine_id : int
+            The machine, for checks that failed before they had a campaign.
+        doc : dict
+            As made by `service.scheduler.record`.
+        messages : sequence of (topic, document)
+            What the broker is to be told; each is given the number of the verification.
+
+        Returns
+        -------
+        int
+            Number of the verification.
+        """
+
+        def work(connection: Connection) -> int:
+            found = connection.execute(select(campaigns.c.id, campaigns.c.machine_id).where(campaigns.c.name == doc["campaign"])).first()
+            campaign_id, of_machine = (int(found[0]), int(found[1])) if found is not None else (None, machine_id)
+            values = {"machine_id": of_machine, "campaign_id": campaign_id, "verdict": doc["verdict"], "doc": doc, "utc": self._now()}
+            number = new_id(connection, insert(verifications).values(values))
+            for topic, message in messages:
+                self._put(connection, topic, {"verification": number, **message})
+            return number
+
+        return self._write(work)
+
+    def put_message(self, topic: str, doc: Doc) -> None:
+        """Queue one message for the broker."""
+        self._write(lambda connection: self._put(connection, topic, doc))
+
+    def _put(self, connection: Connection, topic: str, doc: Doc) -> int:
+        payload = json.dumps(doc, ensure_ascii=False, allow_nan=False).encode()
+        return new_id(connection, insert(outbox).values(topic=topic, payload=payload, created_utc=self._now()))
+
+    def last_slot(self, schedule: str) -> datetime | None:
+        """Return the latest slot of a schedule that anybody claimed, or None."""
+        # Slots are written so that text order is time order.
+        query = select(func.max(slots.c.slot_utc)).where(slots.c.schedule == schedule)
+        text = self._read(lambda connection: connection.execute(query).scalar())
+        return None if text is None else datetime.fromisoformat(text)
+
+    def verifications_of(self, machine: str, limit: int = 100) -> list[VerificationRecord]:
+        """Return the latest checks of a machine, newest first, whatever descriptions it has had.
+
+        Parameters
+        ----------
+        machine : str
+            Name of the machine.
+        limit : int
+            At most so many.
+        """
+        query = select(verifications).join(machines, machines.c.id == verifications.c.machine_id).where(machines.c.name == machine)
+        query = query.order_by(verifications.c.id.desc()).limit(limit)
+        return [VerificationRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
+
+    def waiting_messages(self) -> int:
+        """Return how many messages wait for the broker."""
+        query = select(func.count()).select_from(outbox).where(outbox.c.sent_utc.is_(None))
+        return int(self._read(lambda connection: connection.execute(query).scalar_one()))
