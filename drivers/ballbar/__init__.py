@@ -1,0 +1,1 @@
+"""The telescoping ball-bar on a serial line (docs/protocols/ballbar.md)."""

@@ -1,0 +1,162 @@
+"""Ball-bar frames <-> bytes (docs/protocols/ballbar.md). Pure and total: any bytes give frames or counted bad bytes, never an exception."""
+
+from __future__ import annotations
+
+import struct
+from binascii import crc_hqx
+from dataclasses import dataclass
+
+from drivers.api import BarSample
+
+SYNC = b"\xa5\x5a"
+MAX_PAYLOAD = 32
+SAMPLE, INFO, ACK = 0x01, 0x02, 0x03
+IDENTIFY, START, STOP = 0x81, 0x82, 0x83
+
+ACK_TEXT = {0: "ok", 1: "bad argument", 2: "unknown command"}
+
+# One known length per type the box sends: a sync pattern inside noise is mostly unmasked here, before waiting for its payload.
+_LENGTH = {SAMPLE: 18, INFO: 28, ACK: 4}
+_OVERHEAD = 6  # sync, type, length, check sum
+_SAMPLE = struct.Struct("<IQiH")
+_INFO = struct.Struct("<HIIHHH12s")
+_ACK = struct.Struct("<HBB")
+_COMMAND = struct.Struct("<HH")
+
+
+@dataclass(frozen=True, slots=True)
+class Info:
+    """The box says who it is. ``firmware`` is BCD (0x0102 = 1.2), ``rate_hz`` 0 when it is not streaming."""
+
+    tag: int
+    boot_id: int
+    serial_no: int
+    firmware: int
+    max_rate_hz: int
+    rate_hz: int
+    model: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """The box answers the command with this tag; ``result`` 0 is ok (see ``ACK_TEXT``)."""
+
+    tag: int
+    command: int
+    result: int
+
+
+@dataclass(frozen=True, slots=True)
+class Bad:
+    """``n_bytes`` bytes that are no frame; ``reason`` is ``"check sum"`` when something in them looked like one, else ``"garbage"``."""
+
+    reason: str
+    n_bytes: int
+
+
+Frame = BarSample | Info | Ack | Bad
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE: poly 0x1021, init 0xFFFF; ``crc16(b"123456789") == 0x29B1``."""
+    return crc_hqx(data, 0xFFFF)
+
+
+def encode(kind: int, payload: bytes) -> bytes:
+    """Wrap a payload of at most 32 bytes into a frame.
+
+    Raises
+    ------
+    ValueError
+        Payload too long.
+    """
+    if len(payload) > MAX_PAYLOAD:
+        raise ValueError(f"a payload has at most {MAX_PAYLOAD} bytes, not {len(payload)}")
+    body = bytes((kind, len(payload))) + payload
+    return SYNC + body + struct.pack("<H", crc16(body))
+
+
+def identify_command(tag: int) -> bytes:
+    """Ask the box who it is."""
+    return encode(IDENTIFY, struct.pack("<H", tag))
+
+
+def start_command(tag: int, rate_hz: int) -> bytes:
+    """Ask the box for ``rate_hz`` samples per second."""
+    return encode(START, _COMMAND.pack(tag, rate_hz))
+
+
+def stop_command(tag: int) -> bytes:
+    """Ask the box to stop streaming."""
+    return encode(STOP, struct.pack("<H", tag))
+
+
+class FrameDecoder:
+    """Turns a byte stream into frames, whatever the pieces it arrives in.
+
+    After noise no good frame is lost: bytes of a false frame are searched again for a true one.
+    """
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    @property
+    def pending(self) -> int:
+        """Bytes kept because they may be the start of a frame (always less than one frame)."""
+        return len(self._rest)
+
+    def feed(self, chunk: bytes) -> list[Frame]:
+        """Take bytes, return what they complete.
+
+        Parameters
+        ----------
+        chunk : bytes
+            Any number of bytes.
+
+        Returns
+        -------
+        list of BarSample, Info, Ack or Bad
+            In order of arrival. Every byte fed ends in exactly one of them or in ``pending``.
+        """
+        data = self._rest + chunk if self._rest else chunk
+        out: list[Frame] = []
+        size = len(data)
+        at = bad_from = 0
+        reason = "garbage"
+        while True:
+            at = data.find(SYNC, at)
+            if at < 0:
+                at = size - 1 if data.endswith(b"\xa5") else size
+                break
+            if size - at < 4:
+                break
+            kind, length = data[at + 2], data[at + 3]
+            if length > MAX_PAYLOAD or _LENGTH.get(kind, length) != length:
+                at += 2
+                continue
+            end = at + length + _OVERHEAD
+            if end > size:
+                break
+            if crc_hqx(data[at + 2 : end - 2], 0xFFFF) != data[end - 2] | data[end - 1] << 8:
+                at, reason = at + 2, "check sum"
+                continue
+            if at > bad_from:
+                out.append(Bad(reason, at - bad_from))
+                reason = "garbage"
+            out.append(_frame(kind, data, at + 4, end - at))
+            at = bad_from = end
+        if at > bad_from:
+            out.append(Bad(reason, at - bad_from))
+        self._rest = data[at:]
+        return out
+
+
+def _frame(kind: int, data: bytes, payload_at: int, n_bytes: int) -> Frame:
+    if kind == SAMPLE:
+        return BarSample(*_SAMPLE.unpack_from(data, payload_at))
+    if kind == ACK:
+        return Ack(*_ACK.unpack_from(data, payload_at))
+    if kind == INFO:
+        tag, boot_id, serial_no, firmware, max_rate_hz, rate_hz, model = _INFO.unpack_from(data, payload_at)
+        return Info(tag, boot_id, serial_no, firmware, max_rate_hz, rate_hz, model.rstrip(b"\x00").decode("ascii", "replace"))
+    return Bad("unknown type", n_bytes)

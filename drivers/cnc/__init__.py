@@ -1,0 +1,1 @@
+"""The CNC controller on Modbus TCP (docs/protocols/cnc.md)."""

@@ -1,0 +1,132 @@
+"""Compensation banks: lease, write, read, seal, activate; each command is sent once and then decided by what the controller says."""
+
+from __future__ import annotations
+
+import asyncio
+
+from drivers.api import CompStatus
+from drivers.cnc import registers as reg
+from drivers.cnc.session import ControllerSession
+from drivers.errors import BadFrame, DeviceFault, Refused
+from drivers.links.numbered import next_number, run_numbered
+from drivers.links.words import bytes_of, words_of
+
+_WINDOW = 100  # even, and all 32-bit values of an image stand at even words: none is ever split
+_SEQLOCK_TRIES = 4
+_HEADER_WORDS = 24
+_LENGTH_WORD = 3
+_MAGIC = 0xABBE
+
+
+class Banks:
+    """The two compensation banks of one controller.
+
+    Parameters
+    ----------
+    session : ControllerSession
+        The conversation they travel in.
+    """
+
+    def __init__(self, session: ControllerSession) -> None:
+        self._session = session
+        self._name = session.name
+        self._commands = asyncio.Lock()
+
+    async def status(self) -> CompStatus:
+        """See ``ModbusController.comp_status``."""
+        for _ in range(_SEQLOCK_TRIES):
+            before = await self._seqlock()
+            words = await self._session.link.read(reg.COMP_STATUS.base, reg.COMP_STATUS.count)
+            if await self._seqlock() == before:
+                boot_id, gen = before
+                return reg.decode_comp_status(words, boot_id=boot_id, gen=gen)
+        detail = f"the generation changed during each of {_SEQLOCK_TRIES} reads"
+        raise DeviceFault(self._name, "read compensation status", detail, "is another program or the operator editing tables?")
+
+    async def write(self, bank: int, image: bytes) -> None:
+        """See ``ModbusController.write_bank``."""
+        base = self._base(bank, "write bank")
+        if len(image) % 2 or not 0 < len(image) <= 2 * reg.BANK_REGISTERS:
+            raise Refused(self._name, "write bank", f"{len(image)} bytes are not an image of 1..{reg.BANK_REGISTERS} registers")
+        words = words_of(image)
+        for first in range(0, len(words), _WINDOW):
+            await self._session.link.write(base + first, words[first : first + _WINDOW])
+
+    async def read(self, bank: int, n_bytes: int | None) -> bytes:
+        """See ``ModbusController.read_bank``."""
+        base = self._base(bank, "read bank")
+        if n_bytes is None:
+            count = await self._length(bank, base)
+        elif n_bytes % 2 or not 0 < n_bytes <= 2 * reg.BANK_REGISTERS:
+            raise Refused(self._name, "read bank", f"{n_bytes} bytes are not 1..{reg.BANK_REGISTERS} registers")
+        else:
+            count = n_bytes // 2
+        words: list[int] = []
+        for first in range(0, count, _WINDOW):
+            words += await self._session.link.read(base + first, min(_WINDOW, count - first))
+        return bytes_of(words)
+
+    async def lease(self, owner: int, lease_ms: int) -> None:
+        """See ``ModbusController.lease``."""
+        await self._command(reg.LEASE, "take the lease", owner=owner, lease_ms=lease_ms)
+
+    async def release(self, owner: int) -> None:
+        """See ``ModbusController.release``."""
+        await self._command(reg.RELEASE, "release the lease", owner=owner)
+
+    async def seal(self, bank: int, owner: int) -> None:
+        """See ``ModbusController.seal``."""
+        self._base(bank, "seal bank")
+        await self._command(reg.SEAL, f"seal bank {bank}", bank=bank, owner=owner)
+
+    async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None:
+        """See ``ModbusController.activate``."""
+        self._base(bank, "activate bank")
+        operation = f"activate bank {bank}"
+        await self._command(reg.ACTIVATE, operation, bank=bank, expect_crc=expect_crc, expect_gen=expect_gen, owner=owner)
+        active = (await self._comp_counts())["ACTIVE_BANK"]
+        if active != bank:
+            raise DeviceFault(self._name, operation, f"acknowledged, but bank {active} is active", "do not measure; look at the controller")
+
+    async def _command(self, command: int, operation: str, **fields: int) -> None:
+        async with self._commands:
+            await self._session.check_boot()
+            number = next_number((await self._comp_counts())["COMP_ACK_SEQ"])
+            try:
+                words = reg.encode_comp(number, command, **fields)
+            except ValueError as error:
+                raise Refused(self._name, operation, str(error)) from None
+
+            async def write() -> None:
+                await self._session.link.write(reg.COMP_ADDRESS, words)
+
+            result = await run_numbered(self._name, operation, number, write, self._acknowledge)
+        if result:
+            raise Refused(self._name, operation, reg.COMP_RESULT.get(result, f"result {result}"), "read the status again, then decide")
+
+    async def _acknowledge(self) -> tuple[int, int]:
+        connection = self._session.link.connections
+        counts = await self._comp_counts()
+        if connection != self._session.link.connections:
+            await self._session.check_boot()  # after a restart the numbers begin anew and would prove nothing
+        return counts["COMP_ACK_SEQ"], counts["COMP_RESULT"]
+
+    async def _comp_counts(self) -> dict[str, int]:
+        return reg.COMP_STATUS.counts(await self._session.link.read(reg.COMP_STATUS.base, reg.COMP_STATUS.count))
+
+    async def _seqlock(self) -> tuple[int, int]:
+        counts = reg.SEQLOCK.counts(await self._session.link.read(reg.SEQLOCK.base, reg.SEQLOCK.count))
+        return counts["BOOT_ID"], counts["GEN"]
+
+    async def _length(self, bank: int, base: int) -> int:
+        header = await self._session.link.read(base, _HEADER_WORDS)
+        length = header[_LENGTH_WORD]
+        if header[0] != _MAGIC or not _HEADER_WORDS <= length <= reg.BANK_REGISTERS:
+            detail = f"bank {bank} holds no image (magic {header[0]:#06x}, length {length})"
+            raise BadFrame(self._name, "read bank", detail, "empty or half written: give the number of bytes to read it all the same")
+        return length
+
+    def _base(self, bank: int, operation: str) -> int:
+        if bank not in (0, 1):
+            raise Refused(self._name, operation, f"there is no bank {bank}", "use 0 or 1")
+        return reg.BANK_BASE[bank]

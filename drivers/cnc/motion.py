@@ -1,0 +1,193 @@
+"""Moving the axes: single moves, paths, feed hold. A move that does not end as asked leaves the machine in feed hold."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+
+from drivers.api import ControllerStatus, Point
+from drivers.cnc import registers as reg
+from drivers.cnc.registers import Bit
+from drivers.cnc.session import ControllerSession
+from drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
+from drivers.links.numbered import next_number, run_numbered
+from drivers.links.shielded import run_to_end
+
+_POLL_S = 0.003
+_HOLD_S = 5.0
+_STOP_S = 5.0
+
+
+class Motion:
+    """Motion commands, path FIFO and feed hold of one controller.
+
+    Parameters
+    ----------
+    session : ControllerSession
+        The conversation they travel in.
+    """
+
+    def __init__(self, session: ControllerSession) -> None:
+        self._session = session
+        self._name = session.name
+        self._commands = asyncio.Lock()  # held while a command is being numbered and acknowledged, never while the axes move
+
+    async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus:
+        """See ``ModbusController.move``."""
+        target = self._counts(target_mm, "move")
+        try:
+            async with asyncio.timeout(timeout_s), self._hold_on_trouble():
+                number = await self._command(reg.MOVE, "move", target, feed_mm_min)
+                status = await self._done(number)
+        except TimeoutError as error:
+            if isinstance(error, DriverError):
+                raise
+            raise ReplyTimeout(self._name, "move", f"not in position after {timeout_s:g} s, feed hold set", "override at 0?") from None
+        if self._counts(status.position_mm, "move") != target:
+            detail = f"the move ended at {status.position_mm} instead of {tuple(target_mm)}: aborted"
+            raise DeviceFault(self._name, "move", detail, "start again when the reason is known")
+        return status
+
+    async def load_path(self, points_mm: Sequence[Point]) -> None:
+        """See ``ModbusController.load_path``."""
+        points = [self._counts(point, "load path") for point in points_mm]
+        if len(points) > self._session.fifo_size:
+            detail = f"{len(points)} points, the controller holds {self._session.fifo_size}"
+            raise Refused(self._name, "load path", detail, "use fewer points")
+        await self._command(reg.PATH_CLEAR, "clear path")
+        for first in range(0, len(points), reg.MAX_CHUNK):
+            await self._chunk(points[first : first + reg.MAX_CHUNK], f"load path points {first}..")
+        status = await self._session.status()
+        if status.fifo_free != self._session.fifo_size - len(points):
+            detail = f"{self._session.fifo_size - status.fifo_free} points arrived instead of {len(points)}"
+            raise DeviceFault(self._name, "load path", detail, "is another program loading a path? load it again")
+
+    async def start_path(self, *, feed_mm_min: float) -> None:
+        """See ``ModbusController.start_path``."""
+        async with self._hold_on_trouble():
+            await self._command(reg.PATH_START, "start path", feed_mm_min=feed_mm_min)
+
+    async def reset_alarm(self) -> None:
+        """See ``ModbusController.reset_alarm``."""
+        await self._command(reg.RESET_ALARM, "reset alarm")
+
+    async def request_hold(self, level: int) -> None:
+        """Write the level of HOLD_REQUEST. It is a level, not an event: writing it again changes nothing, so it may be repeated."""
+        try:
+            await self._session.link.write(reg.HOLD_ADDRESS, (level,))
+        except DriverError as error:
+            if not error.retryable:
+                raise
+            await self._session.link.write(reg.HOLD_ADDRESS, (level,))
+
+    async def abort(self) -> None:
+        """See ``ModbusController.abort``."""
+        await self.request_hold(reg.ABORT)
+        try:
+            async with asyncio.timeout(_STOP_S):
+                await self._standstill()
+        except TimeoutError as error:
+            if isinstance(error, DriverError):
+                raise
+            raise ReplyTimeout(self._name, "abort", f"the axes still move {_STOP_S:g} s after the abort", "press the e-stop") from None
+        await self.request_hold(reg.RUN)
+
+    async def _standstill(self) -> None:
+        while True:
+            status = await self._session.status()
+            if not status.bits & (Bit.MOVING | Bit.PATH_RUNNING):
+                return
+            await asyncio.sleep(_POLL_S)
+
+    @asynccontextmanager
+    async def _hold_on_trouble(self) -> AsyncIterator[None]:
+        try:
+            yield
+        except (Refused, _Stopped):
+            raise  # nothing moves on our account
+        except BaseException as error:
+            # Cancelled, timed out, link lost, alarm: whatever the reason, the axes must not run on unattended.
+            await self._hold_quietly(error)
+            raise
+
+    async def _hold_quietly(self, reason: BaseException) -> None:
+        async def hold() -> None:
+            try:
+                async with asyncio.timeout(_HOLD_S):
+                    await self.request_hold(reg.HOLD)
+            except (DriverError, TimeoutError) as error:
+                reason.add_note(f"and the feed hold could not be sent: {error}")
+
+        await run_to_end(hold())
+
+    async def _command(self, command: int, operation: str, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> int:
+        async with self._commands:
+            status = await self._session.status()
+            if status.bits & Bit.FEED_HOLD and command in (reg.MOVE, reg.PATH_START):
+                raise Refused(self._name, operation, "feed hold is on", "call resume or abort first, when it is safe")
+            number = next_number(status.motion_ack_seq)
+            try:
+                words = reg.encode_motion(number, command, target, feed_mm_min)
+            except ValueError as error:
+                raise Refused(self._name, operation, str(error)) from None
+
+            async def write() -> None:
+                await self._session.link.write(reg.MOTION_ADDRESS, words)
+
+            async def acknowledge() -> tuple[int, int]:
+                now = await self._session.status()
+                return now.motion_ack_seq, now.motion_result
+
+            result = await run_numbered(self._name, operation, number, write, acknowledge)
+        if result:
+            raise Refused(self._name, operation, reg.MOTION_RESULT.get(result, f"result {result}"), "look at the machine, then try again")
+        return number
+
+    async def _done(self, number: int) -> ControllerStatus:
+        while True:
+            status = await self._session.status()
+            # Trouble first: after an alarm the controller may well count the command as done.
+            self._check(status)
+            if status.motion_done_seq == number:
+                return status
+            if status.bits & Bit.FEED_HOLD:
+                raise _Stopped(self._name, "move", "stopped by feed hold", "resume or abort when it is safe")
+            if status.motion_ack_seq != number:
+                detail = f"command {number} was overtaken by {status.motion_ack_seq}"
+                raise DeviceFault(self._name, "move", detail, "is another program moving this machine?")
+            await asyncio.sleep(_POLL_S)
+
+    def _check(self, status: ControllerStatus) -> None:
+        if status.bits & Bit.ESTOP:
+            raise DeviceFault(self._name, "move", "e-stop pressed", "release it, reset the alarm, reference if asked, start again")
+        if status.bits & Bit.ALARM or status.alarm_code:
+            what = reg.ALARM.get(status.alarm_code, f"code {status.alarm_code}")
+            raise DeviceFault(self._name, "move", f"alarm: {what}", "clear its cause and reset it at the controller")
+        if status.bits & Bit.DOOR_OPEN:
+            raise DeviceFault(self._name, "move", "door opened", "close it and start again")
+
+    async def _chunk(self, points: list[tuple[int, int, int]], operation: str) -> None:
+        async with self._commands:
+            number = next_number((await self._session.status()).fifo_ack_seq)
+
+            async def write() -> None:
+                await self._session.link.write(reg.FIFO_ADDRESS, reg.encode_fifo(number, points))
+
+            async def acknowledge() -> tuple[int, int]:
+                now = await self._session.status()
+                return now.fifo_ack_seq, now.fifo_result
+
+            result = await run_numbered(self._name, operation, number, write, acknowledge)
+        if result:
+            raise Refused(self._name, operation, reg.MOTION_RESULT.get(result, f"result {result}"), "check the path against the strokes")
+
+    def _counts(self, point_mm: Point, operation: str) -> tuple[int, int, int]:
+        try:
+            return reg.position_counts(point_mm)
+        except ValueError as error:
+            raise Refused(self._name, operation, str(error)) from None
+
+
+class _Stopped(DeviceFault):
+    """The controller is in feed hold already: asking for it once more could undo an abort that is under way."""

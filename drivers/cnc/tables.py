@@ -1,0 +1,160 @@
+"""Compensation images <-> bytes (docs/protocols/cnc.md, "Banks"). Pure; what does not fit exactly is refused, never rounded or clipped."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+
+from drivers.api import Point
+
+MAGIC = 0xABBE
+FORMAT = 1
+NO_CORRECTION, NINE_TABLES, GRID_3D = 0, 1, 2
+MAX_WORDS = 4800
+GRID_NM = 10
+_HEADER = struct.Struct(">HHHHIHHHHHHiiiiii")
+_PER_MM = 100_000
+_EXACT = 1e-3  # counts: a grid position may differ from a multiple of 10 nm by float noise only
+
+
+class TableCodecError(ValueError):
+    """The table cannot be stored exactly as it is, or the bytes are not an image."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableImage:
+    """A compensation table as the controller stores it.
+
+    Parameters
+    ----------
+    kind : int
+        0 no correction, 1 nine one-axis tables, 2 3-D grid.
+    table_id : int
+        Chosen by the host, u32.
+    lsb_nm : int
+        Unit of the values in nm.
+    start_mm, step_mm : tuple of three float
+        First grid position and pitch of X, Y, Z in mm, multiples of 10 nm.
+    counts : tuple of three int
+        Grid points of X, Y, Z.
+    values : tuple of int
+        Corrections in LSB, added to the command, in body order (kind 1: input axis, output, index; kind 2: z, y, x, output).
+    """
+
+    kind: int
+    table_id: int
+    lsb_nm: int
+    start_mm: Point
+    step_mm: Point
+    counts: tuple[int, int, int]
+    values: tuple[int, ...]
+
+
+def body_words(kind: int, counts: tuple[int, int, int]) -> int:
+    """Return how many values an image of this kind and grid has.
+
+    Raises
+    ------
+    TableCodecError
+        Unknown kind.
+    """
+    nx, ny, nz = counts
+    if kind == NO_CORRECTION:
+        return 0
+    if kind == NINE_TABLES:
+        return 3 * (nx + ny + nz)
+    if kind == GRID_3D:
+        return 3 * nx * ny * nz
+    raise TableCodecError(f"kind {kind} is none of 0, 1, 2")
+
+
+def encode(image: TableImage) -> bytes:
+    """Turn a table into the bytes of a bank.
+
+    Raises
+    ------
+    TableCodecError
+        A correction beyond 16 bits, a wrong number of values, a position off the 10 nm grid, too many registers...
+    """
+    _check(image)
+    n_words = _HEADER.size // 2 + len(image.values)
+    start = [_counts(value, "start") for value in image.start_mm]
+    step = [_counts(value, "step") for value in image.step_mm]
+    _check_steps(image.kind, step)
+    grid = image.counts
+    try:
+        header = _HEADER.pack(MAGIC, FORMAT, image.kind, n_words, image.table_id, image.lsb_nm, 0, *grid, 0, *start, *step)
+    except struct.error as error:
+        raise TableCodecError(f"header: {error}") from None
+    return header + struct.pack(f">{len(image.values)}h", *image.values)
+
+
+def decode(data: bytes) -> TableImage:
+    """Turn the bytes of a bank into a table.
+
+    Parameters
+    ----------
+    data : bytes
+        Exactly the LENGTH registers of the image.
+
+    Raises
+    ------
+    TableCodecError
+        Not an image, or not the whole of it and nothing else.
+    """
+    if len(data) < _HEADER.size:
+        raise TableCodecError(f"{len(data)} bytes are shorter than an image's header of {_HEADER.size}")
+    magic, fmt, kind, n_words, table_id, lsb_nm, reserved, nx, ny, nz, reserved_too, *grid = _HEADER.unpack_from(data)
+    if magic != MAGIC or fmt != FORMAT:
+        raise TableCodecError(f"magic {magic:#06x} format {fmt} instead of {MAGIC:#06x} format {FORMAT}")
+    if reserved or reserved_too:
+        raise TableCodecError("reserved words are not 0")
+    if len(data) != 2 * n_words:
+        raise TableCodecError(f"header says {n_words} registers, there are {len(data) / 2:g}")
+    if n_words - _HEADER.size // 2 != body_words(kind, (nx, ny, nz)):
+        raise TableCodecError(f"{n_words} registers do not fit kind {kind} with {nx} x {ny} x {nz} points")
+    _check_steps(kind, grid[3:])
+    values = struct.unpack_from(f">{n_words - _HEADER.size // 2}h", data, _HEADER.size)
+    x0, y0, z0, dx, dy, dz = (value / _PER_MM for value in grid)
+    image = TableImage(kind, table_id, lsb_nm, (x0, y0, z0), (dx, dy, dz), (nx, ny, nz), values)
+    _check(image)
+    return image
+
+
+def crc32(data: bytes) -> int:
+    """CRC-32 (IEEE 802.3) of an image's bytes, as the controller computes it when sealing."""
+    return zlib.crc32(data)
+
+
+def _check(image: TableImage) -> None:
+    expected = body_words(image.kind, image.counts)
+    if len(image.values) != expected:
+        raise TableCodecError(f"{len(image.values)} values instead of {expected} for kind {image.kind} with {image.counts} points")
+    if _HEADER.size // 2 + expected > MAX_WORDS:
+        raise TableCodecError(f"{_HEADER.size // 2 + expected} registers do not fit a bank of {MAX_WORDS}")
+    if image.kind == NO_CORRECTION:
+        if any(image.counts):
+            raise TableCodecError(f"no correction has no grid points, not {image.counts}")
+    elif min(image.counts) < 2:
+        raise TableCodecError(f"{image.counts} points: each axis needs 2 or more")
+    if image.lsb_nm <= 0:
+        raise TableCodecError(f"a value's unit of {image.lsb_nm} nm means nothing")
+    for index, value in enumerate(image.values):
+        if not -32768 <= value <= 32767:
+            raise TableCodecError(f"value {index} is {value} LSB: beyond 16 bits ({value * image.lsb_nm / 1000:g} um)")
+
+
+def _check_steps(kind: int, step: list[int]) -> None:
+    if kind != NO_CORRECTION and min(step) <= 0:
+        raise TableCodecError("each axis needs a grid pitch above 0")
+
+
+def _counts(value_mm: float, what: str) -> int:
+    exact = value_mm * _PER_MM if math.isfinite(value_mm) else math.nan
+    if not abs(exact) < 1 << 31:
+        raise TableCodecError(f"grid {what} {value_mm} mm is not a number within +-21 m")
+    if abs(exact - round(exact)) > _EXACT:
+        raise TableCodecError(f"grid {what} {value_mm} mm is no multiple of {GRID_NM} nm; quantise the grid before computing the table")
+    return round(exact)

@@ -1,0 +1,1 @@
+"""The laser displacement meter on Modbus (docs/protocols/laser.md)."""

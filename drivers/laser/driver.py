@@ -1,0 +1,166 @@
+"""Conversation with a laser displacement meter."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+from drivers.api import DeviceInfo, LaserReading
+from drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout
+from drivers.laser import registers as reg
+from drivers.links.identity import check_identity
+from drivers.links.modbus import ModbusLink
+from drivers.links.numbered import next_number, run_numbered
+
+_POLL_S = 0.005
+_READ_S = 5.0
+
+
+class ModbusLaser:
+    """A laser displacement meter on Modbus TCP or RTU (docs/protocols/laser.md).
+
+    Parameters
+    ----------
+    link : ModbusLink
+        Open link to the meter.
+    read_timeout_s : float
+        Longest wait for a new output sample.
+    """
+
+    def __init__(self, link: ModbusLink, *, read_timeout_s: float = _READ_S) -> None:
+        self._link = link
+        self.name = link.name
+        self._read_timeout_s = read_timeout_s
+        self._boot_id: int | None = None
+        self._connection = link.connections
+        self._last_us = -1
+        self._command_lock = asyncio.Lock()
+
+    async def identify(self) -> DeviceInfo:
+        """Ask the meter who it is, and accept its boot id as the one that counts from now on.
+
+        Raises
+        ------
+        WrongDevice
+            Canary registers or map version are not those of docs/protocols/laser.md.
+        LinkDown, ReplyTimeout, BadFrame
+            The wire.
+        """
+        counts = reg.IDENTITY.counts(await self._link.read(reg.IDENTITY.base, reg.IDENTITY.count))
+        check_identity(self.name, counts, reg.MAP_VERSION)
+        self._boot_id = counts["BOOT_ID"]
+        self._connection = self._link.connections
+        self._last_us = -1
+        return DeviceInfo("laser", "LDDM", str(counts["SERIAL_NO"]), counts["BOOT_ID"], f"map {counts['MAP_VER']}")
+
+    async def zero(self) -> None:
+        """Set the displacement to zero where the reflector stands now.
+
+        Raises
+        ------
+        Refused
+            The beam is blocked, or its loss was not cleared.
+        Rebooted, LinkDown, ReplyTimeout, BadFrame
+            The meter restarted, or the wire.
+        """
+        await self._command(reg.ZERO, 0, "zero")
+
+    async def clear_beam(self) -> None:
+        """Clear the latch of a lost beam. A new ``zero`` is needed after it.
+
+        Raises
+        ------
+        Refused
+            The beam is still blocked.
+        Rebooted, LinkDown, ReplyTimeout, BadFrame
+            The meter restarted, or the wire.
+        """
+        await self._command(reg.CLEAR_BEAM, 0, "clear beam-lost latch")
+
+    async def set_environment_compensation(self, on: bool) -> None:
+        """Switch the compensation of the wavelength in air on or off (off, the meter reads some 270 ppm more).
+
+        Raises
+        ------
+        Refused, Rebooted, LinkDown, ReplyTimeout, BadFrame
+            As for ``zero``.
+        """
+        await self._command(reg.ENVIRONMENT, int(on), "switch environmental compensation")
+
+    async def read(self, *, after_count: int | None = None) -> LaserReading:
+        """Read the current output sample, or wait for one that is newer than ``after_count``.
+
+        Parameters
+        ----------
+        after_count : int, optional
+            ``sample_count`` of an earlier reading: the answer is a later sample, never the same one.
+
+        Raises
+        ------
+        DeviceFault
+            The beam is or was lost, or nothing was zeroed since: the displacement must not be used.
+        ReplyTimeout
+            No new sample in time.
+        Rebooted, LinkDown, BadFrame
+            The meter restarted, or the wire.
+        """
+        try:
+            async with asyncio.timeout(self._read_timeout_s):
+                while True:
+                    reading = await self._read_once()
+                    if after_count is None or 0 < (reading.sample_count - after_count) % (1 << 32) < 1 << 31:
+                        break
+                    await asyncio.sleep(_POLL_S)
+        except TimeoutError as error:
+            if isinstance(error, ReplyTimeout):
+                raise
+            detail = f"no sample after number {after_count} within {self._read_timeout_s:g} s"
+            raise ReplyTimeout(self.name, "read", detail, "is the meter measuring?") from None
+        self._check_beam(reading.status)
+        return reading
+
+    async def close(self) -> None:
+        """Close the link. Closing twice does nothing."""
+        await self._link.close()
+
+    async def _read_once(self) -> LaserReading:
+        words = await self._link.read(reg.READING.base, reg.READING.count)
+        reading = reg.decode_reading(words, time.monotonic())
+        if reading.device_us < self._last_us or self._connection != self._link.connections:
+            await self._check_boot()
+        self._last_us = reading.device_us
+        return reading
+
+    async def _check_boot(self) -> None:
+        counts = reg.IDENTITY.counts(await self._link.read(reg.IDENTITY.base, reg.IDENTITY.count))
+        if self._boot_id is None:
+            check_identity(self.name, counts, reg.MAP_VERSION)
+            self._boot_id = counts["BOOT_ID"]
+        if counts["BOOT_ID"] != self._boot_id:
+            detail = f"boot id {counts['BOOT_ID']:#x} instead of {self._boot_id:#x}"
+            raise Rebooted(self.name, "read", detail, "the meter restarted: call identify and zero, then measure this test again")
+        self._connection = self._link.connections
+
+    def _check_beam(self, status: int) -> None:
+        if status & (reg.BEAM_LOST | reg.NO_REFLECTOR):
+            what = "no reflector in the beam" if status & reg.NO_REFLECTOR else "counts are lost"
+            raise DeviceFault(self.name, "read", f"beam lost ({what})", "free the beam, then clear_beam and zero, then repeat this test")
+        if not status & reg.ZEROED:
+            raise DeviceFault(self.name, "read", "not zeroed since it was switched on or lost the beam", "zero it, then repeat this test")
+
+    async def _command(self, command: int, argument: int, operation: str) -> None:
+        async with self._command_lock:
+            await self._check_boot()
+            acknowledged, _ = await self._read_ack()
+            number = next_number(acknowledged)
+
+            async def write() -> None:
+                await self._link.write(reg.COMMAND_ADDRESS, (number, command, argument))
+
+            result = await run_numbered(self.name, operation, number, write, self._read_ack)
+        if result:
+            raise Refused(self.name, operation, reg.RESULT_TEXT.get(result, f"result {result}"), "free the beam, or clear_beam first")
+
+    async def _read_ack(self) -> tuple[int, int]:
+        counts = reg.ACKNOWLEDGE.counts(await self._link.read(reg.ACKNOWLEDGE.base, reg.ACKNOWLEDGE.count))
+        return counts["CMD_ACK_SEQ"], counts["CMD_RESULT"]

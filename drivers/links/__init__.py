@@ -1,0 +1,1 @@
+"""How bytes travel: device URLs, serial lines and sockets, Modbus."""

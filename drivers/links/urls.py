@@ -1,0 +1,221 @@
+"""Device URLs as people write them in the configuration, parsed once into plain values.
+
+======================================================  =======================================================
+``serial:///dev/ttyUSB0?baud=460800``                   a serial line, 8N1
+``socket://10.0.0.5:4001``                              the same bytes over raw TCP (serial device server)
+``modbus+tcp://10.0.0.6:502?unit=1``                    Modbus TCP
+``modbus+rtu:///dev/ttyS0?baud=115200&unit=1``          Modbus RTU, 8N1
+``fixture+tcp://10.0.0.7:9000``                         a remote fixture (docs/protocols/fixture.md)
+``fixture+console:``                                    the operator at the console
+======================================================  =======================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
+
+from drivers.errors import BadUrl
+
+SERIAL_BAUD = 460_800
+RTU_BAUD = 115_200
+_MAX_BAUD = 12_000_000
+_MAX_UNIT = 247
+
+
+@dataclass(frozen=True, slots=True)
+class SerialUrl:
+    """A serial port by its device path; ``baud`` in bit/s, always 8N1."""
+
+    path: str
+    baud: int = SERIAL_BAUD
+
+    def __str__(self) -> str:
+        return f"serial://{quote(self.path)}?baud={self.baud}"
+
+
+@dataclass(frozen=True, slots=True)
+class SocketUrl:
+    """Raw bytes over TCP."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"socket://{_netloc(self.host, self.port)}"
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusTcpUrl:
+    """A Modbus TCP server and the unit behind it."""
+
+    host: str
+    port: int
+    unit: int = 1
+
+    def __str__(self) -> str:
+        return f"modbus+tcp://{_netloc(self.host, self.port)}?unit={self.unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusRtuUrl:
+    """A Modbus RTU line (``baud`` in bit/s, 8N1) and the unit on it."""
+
+    path: str
+    baud: int = RTU_BAUD
+    unit: int = 1
+
+    def __str__(self) -> str:
+        return f"modbus+rtu://{quote(self.path)}?baud={self.baud}&unit={self.unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class FixtureTcpUrl:
+    """A remote fixture's address."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"fixture+tcp://{_netloc(self.host, self.port)}"
+
+
+@dataclass(frozen=True, slots=True)
+class FixtureConsoleUrl:
+    """The operator at the console."""
+
+    def __str__(self) -> str:
+        return "fixture+console:"
+
+
+DeviceUrl = SerialUrl | SocketUrl | ModbusTcpUrl | ModbusRtuUrl | FixtureTcpUrl | FixtureConsoleUrl
+
+
+def parse_url(text: str) -> DeviceUrl:
+    """Understand a device URL.
+
+    Parameters
+    ----------
+    text : str
+        The URL as the user wrote it.
+
+    Returns
+    -------
+    DeviceUrl
+        One of the frozen URL classes of this module; ``str()`` of it gives the URL back in its full form.
+
+    Raises
+    ------
+    BadUrl
+        Unknown scheme, missing host, port or path, a query key that means nothing here, or a number out of range.
+    """
+    if any(character <= " " or character == "\x7f" for character in text):
+        raise _bad(text, "it contains blanks or control characters", "write blanks in a path as %20")
+    try:
+        parts = urlsplit(text)
+    except ValueError as error:
+        raise _bad(text, str(error)) from None
+    builder = _BUILDERS.get(parts.scheme)
+    if builder is None:
+        raise _bad(text, f"unknown scheme {parts.scheme!r}", f"use one of {', '.join(_BUILDERS)}")
+    if parts.fragment or parts.username is not None or parts.password is not None:
+        raise _bad(text, "user names and #fragments mean nothing here")
+    return builder(text, parts)
+
+
+def _serial(text: str, parts: SplitResult) -> SerialUrl:
+    query = _query(text, parts, {"baud"})
+    return SerialUrl(_path(text, parts), _number(text, query, "baud", SERIAL_BAUD, _MAX_BAUD))
+
+
+def _socket(text: str, parts: SplitResult) -> SocketUrl:
+    _query(text, parts, set())
+    return SocketUrl(*_address(text, parts))
+
+
+def _modbus_tcp(text: str, parts: SplitResult) -> ModbusTcpUrl:
+    query = _query(text, parts, {"unit"})
+    host, port = _address(text, parts)
+    return ModbusTcpUrl(host, port, _number(text, query, "unit", 1, _MAX_UNIT))
+
+
+def _modbus_rtu(text: str, parts: SplitResult) -> ModbusRtuUrl:
+    query = _query(text, parts, {"baud", "unit"})
+    baud = _number(text, query, "baud", RTU_BAUD, _MAX_BAUD)
+    return ModbusRtuUrl(_path(text, parts), baud, _number(text, query, "unit", 1, _MAX_UNIT))
+
+
+def _fixture_tcp(text: str, parts: SplitResult) -> FixtureTcpUrl:
+    _query(text, parts, set())
+    return FixtureTcpUrl(*_address(text, parts))
+
+
+def _fixture_console(text: str, parts: SplitResult) -> FixtureConsoleUrl:
+    _query(text, parts, set())
+    if parts.netloc or parts.path:
+        raise _bad(text, "the console has no address", "write just fixture+console:")
+    return FixtureConsoleUrl()
+
+
+_BUILDERS: Mapping[str, Callable[[str, SplitResult], DeviceUrl]] = {
+    "serial": _serial,
+    "socket": _socket,
+    "modbus+tcp": _modbus_tcp,
+    "modbus+rtu": _modbus_rtu,
+    "fixture+tcp": _fixture_tcp,
+    "fixture+console": _fixture_console,
+}
+
+
+def _netloc(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def _bad(text: str, detail: str, remedy: str = "see docs of drivers/links/urls.py for the forms") -> BadUrl:
+    return BadUrl(ascii(text), "read device URL", detail, remedy)
+
+
+def _address(text: str, parts: SplitResult) -> tuple[str, int]:
+    try:
+        port = parts.port
+    except ValueError:
+        raise _bad(text, "the port is not a number from 1 to 65535") from None
+    if not parts.hostname:
+        raise _bad(text, "the host is missing", f"write {parts.scheme}://host:port")
+    if not port:
+        raise _bad(text, "the port is missing", f"write {parts.scheme}://{parts.hostname}:port")
+    if parts.path not in ("", "/"):
+        raise _bad(text, f"a path ({parts.path}) means nothing here")
+    return parts.hostname, port
+
+
+def _path(text: str, parts: SplitResult) -> str:
+    if parts.netloc:
+        raise _bad(text, f"a host ({parts.netloc}) means nothing here", f"write three slashes: {parts.scheme}:///dev/...")
+    path = unquote(parts.path)
+    if not path.startswith("/") or path.endswith("/") or "\x00" in path:
+        raise _bad(text, "the device path is missing or not absolute", f"write {parts.scheme}:///dev/ttyUSB0")
+    return path
+
+
+def _query(text: str, parts: SplitResult, known: set[str]) -> dict[str, str]:
+    try:
+        pairs = parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
+    except ValueError:
+        raise _bad(text, f"the part after ? ({parts.query}) is not key=value") from None
+    query = dict(pairs)
+    if len(query) != len(pairs):
+        raise _bad(text, "a key is given twice")
+    if unknown := sorted(set(query) - known):
+        raise _bad(text, f"unknown key {unknown[0]!a}", f"known here: {', '.join(sorted(known)) or 'none'}")
+    return query
+
+
+def _number(text: str, query: Mapping[str, str], key: str, default: int, largest: int) -> int:
+    value = query.get(key)
+    if value is None:
+        return default
+    if not (value.isascii() and value.isdigit() and len(value) <= len(str(largest)) and 1 <= int(value) <= largest):
+        raise _bad(text, f"{key}={value!a} is not a whole number from 1 to {largest}")
+    return int(value)

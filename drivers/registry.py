@@ -1,0 +1,115 @@
+"""From a device URL to a driver that is connected and has proven that it talks to the right kind of device."""
+
+from __future__ import annotations
+
+from drivers.api import BallBar, Controller, DisplacementMeter, Fixture
+from drivers.ballbar.driver import SerialBallBar
+from drivers.cnc.driver import ModbusController
+from drivers.errors import BadUrl
+from drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
+from drivers.laser.driver import ModbusLaser
+from drivers.links.modbus import ModbusLink
+from drivers.links.serial_link import ByteLink
+from drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
+
+
+async def open_ballbar(url: str) -> BallBar:
+    """Open the ball-bar behind a ``serial://`` or ``socket://`` URL.
+
+    Raises
+    ------
+    BadUrl
+        Not such a URL.
+    LinkDown, ReplyTimeout
+        Nobody there, or no answer.
+    """
+    parsed = parse_url(url)
+    if not isinstance(parsed, SerialUrl | SocketUrl):
+        raise _wrong_scheme(url, "a ball-bar", "serial:// or socket://")
+    ballbar = SerialBallBar(ByteLink(parsed))
+    try:
+        await ballbar.identify()
+    except BaseException:
+        await ballbar.close()
+        raise
+    return ballbar
+
+
+async def open_laser(url: str) -> DisplacementMeter:
+    """Open the laser behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL.
+
+    Raises
+    ------
+    BadUrl
+        Not such a URL.
+    WrongDevice
+        Something else answers there.
+    LinkDown, ReplyTimeout, BadFrame
+        The wire.
+    """
+    laser = ModbusLaser(await _modbus(url, "a laser"))
+    try:
+        await laser.identify()
+    except BaseException:
+        await laser.close()
+        raise
+    return laser
+
+
+async def open_controller(url: str) -> Controller:
+    """Open the controller behind a ``modbus+tcp://`` (or ``modbus+rtu://``) URL.
+
+    Raises
+    ------
+    BadUrl
+        Not such a URL.
+    WrongDevice
+        Something else answers there.
+    LinkDown, ReplyTimeout, BadFrame
+        The wire.
+    """
+    controller = ModbusController(await _modbus(url, "a controller"))
+    try:
+        await controller.identify()
+    except BaseException:
+        await controller.close()
+        raise
+    return controller
+
+
+async def open_fixture(url: str, ask: Ask) -> Fixture:
+    """Open the fixture behind a ``fixture+tcp://`` or ``fixture+console:`` URL.
+
+    Parameters
+    ----------
+    url : str
+        The URL as the user wrote it.
+    ask : callable
+        ``await ask(text)`` asks the operator and returns when confirmed; used by the console only.
+
+    Raises
+    ------
+    BadUrl
+        Not such a URL.
+    LinkDown
+        Nobody there.
+    """
+    parsed = parse_url(url)
+    if isinstance(parsed, FixtureConsoleUrl):
+        return ConsoleFixture(ask)
+    if not isinstance(parsed, FixtureTcpUrl):
+        raise _wrong_scheme(url, "a fixture", "fixture+tcp:// or fixture+console:")
+    fixture = RemoteFixture(parsed)
+    await fixture.open()
+    return fixture
+
+
+async def _modbus(url: str, what: str) -> ModbusLink:
+    parsed = parse_url(url)
+    if not isinstance(parsed, ModbusTcpUrl | ModbusRtuUrl):
+        raise _wrong_scheme(url, what, "modbus+tcp:// or modbus+rtu://")
+    return await ModbusLink.connect(parsed)
+
+
+def _wrong_scheme(url: str, what: str, schemes: str) -> BadUrl:
+    return BadUrl(ascii(url), "read device URL", f"this is not the URL of {what}", f"write {schemes}")
