@@ -1,0 +1,122 @@
+"""Ball-bar samples become columns: every reading gets the commanded position at which it was taken.
+
+The controller's "path running" output is wired into the bar's box, which samples it together with the reading. The first sample that has
+it set was taken within one period after the path began; nothing here depends on when bytes arrived at the computer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.api import BarSample
+from service.errors import MeasurementFault
+from service.storage.records import Doc
+
+Array = npt.NDArray[np.float64]
+
+SYNC_BIT = 1 << 3
+INVALID_BITS = 1 << 0 | 1 << 2 | 1 << 4
+"""Out of range, samples lost just before, no bar: the box itself says that the reading is not one."""
+DURATION_TOLERANCE = 0.01
+
+
+def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, complete: bool = True) -> Doc:
+    """Turn the samples of one path into columns.
+
+    Parameters
+    ----------
+    samples : sequence of BarSample
+        All samples of the run, also those before and after the path.
+    start : dict
+        Start document (service.runs.columns).
+    end : dict or None
+        End document; None for an interrupted run, which gives the columns it has.
+    complete : bool
+        Whether the path ran to its end, i.e. whether durations can be checked.
+
+    Returns
+    -------
+    dict
+        Columns of ``abbe-run/1`` and ``device_seq``, ``device_us``, ``status``.
+
+    Raises
+    ------
+    MeasurementFault
+        If no sample lies on the path, or feed, path and duration contradict each other.
+    """
+    path, rate_hz = start["path"], float(start["rate_hz"])
+    feed_mm_s = path["feed_mm_min"] / 60.0
+    points = np.asarray(path["points_mm"], dtype=np.float64).reshape(-1, 3)
+    on_path = [sample for sample in samples if sample.status & SYNC_BIT]
+    device_us = np.array([sample.device_us for sample in on_path], dtype=np.int64)
+    if complete and end is not None and "path_end_us" in end:
+        _check_durations(device_us, end, _length_mm(points) / feed_mm_s, rate_hz)
+    along_s = _time_along_path(samples, on_path, device_us, end if complete else None, rate_hz)
+    position = _position(points, feed_mm_s * along_s)
+    times = {"t_s": (_start_s(start, end) + along_s).tolist()}
+    places = {f"{axis}_mm": position[:, index].tolist() for index, axis in enumerate("xyz")}
+    count = len(on_path)
+    constant = {"feed_mm_min": [float(path["feed_mm_min"])] * count, "direction": [int(path["direction"])] * count}
+    readings = {
+        "deviation_mm": [sample.reading_nm * 1e-6 for sample in on_path],
+        "valid": [0 if sample.status & INVALID_BITS else 1 for sample in on_path],
+        "device_seq": [sample.seq for sample in on_path],
+        "device_us": device_us.tolist(),
+        "status": [sample.status for sample in on_path],
+    }
+    return times | places | constant | readings
+
+
+def _start_s(start: Doc, end: Doc | None) -> float:
+    for document, key in ((end, "path_start_us"), (start, "path_start_us"), (start, "ctrl_us")):
+        if document and document.get(key) is not None:
+            return float(document[key] - start["ctrl0_us"]) * 1e-6
+    return float(start["setup"].get("t_set_s", 0.0))
+
+
+def _time_along_path(
+    samples: Sequence[BarSample], on_path: Sequence[BarSample], device_us: npt.NDArray[np.int64], end: Doc | None, rate_hz: float
+) -> Array:
+    if not on_path:
+        return np.zeros(0)
+    half_period_s = 0.5 / rate_hz
+    since_first_s = (device_us - device_us[0]) * 1e-6
+    first = samples.index(on_path[0])
+    start_was_lost = on_path[0].seq != (samples[first - 1].seq + 1) % 2**32 if first else on_path[0].seq != 0
+    if start_was_lost and end is not None and end.get("path_end_us"):
+        # The edge fell into a gap of the stream: the path's other edge tells the time as well.
+        duration_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6
+        return np.asarray(duration_s - half_period_s - since_first_s[-1] + since_first_s)
+    return np.asarray(since_first_s + half_period_s)
+
+
+def _check_durations(device_us: npt.NDArray[np.int64], end: Doc, planned_s: float, rate_hz: float) -> None:
+    controller_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6
+    if device_us.size == 0:
+        raise MeasurementFault("no ball-bar sample has the sync input set", "check the cable from the controller's path output to the bar")
+    device_s = float(device_us[-1] - device_us[0]) * 1e-6 + 1.0 / rate_hz
+    tolerance_s = DURATION_TOLERANCE * controller_s + 2.0 / rate_hz
+    if abs(device_s - controller_s) > tolerance_s:
+        raise MeasurementFault(
+            f"feed changed during the run, or its ends were lost: the bar saw {device_s:.3f} s of path, the controller {controller_s:.3f} s",
+            "measure the run again with a steady connection and the feed override at 100 %",
+        )
+    if abs(device_s - planned_s) > tolerance_s:
+        raise MeasurementFault(
+            f"feed changed during the run: the path takes {planned_s:.3f} s at the commanded feed, but took {device_s:.3f} s",
+            "set the feed override to 100 %, avoid feed hold, and measure the run again",
+        )
+
+
+def _length_mm(points: Array) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _position(points: Array, arc_mm: Array) -> Array:
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    corners = points[np.concatenate(([True], steps > 0.0))]  # points given twice would make the arc length ambiguous
+    arc = np.concatenate(([0.0], np.cumsum(steps[steps > 0.0])))
+    return np.stack([np.interp(arc_mm, arc, corners[:, axis]) for axis in range(3)], axis=1)

@@ -1,0 +1,136 @@
+"""A stored run becomes an ``abbe-run/1`` document: the one place where raw samples turn into columns.
+
+Start document: ``setup`` and ``machine`` of the exchange format, ``ctrl0_us`` (zero of the campaign clock in controller time), and for
+ball-bar runs ``path`` {``feed_mm_min``, ``direction``, ``points_mm``} and ``rate_hz``. ``points_mm`` begins where the machine stands when
+the path starts. End document of a ball-bar run: ``path_start_us``, ``path_end_us`` (controller time). For a run without end document the
+path's start is taken from the start document: ``path_start_us``, else ``ctrl_us``, else the setup's ``t_set_s``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from service.errors import StoreError
+from service.runs.bar_columns import bar_columns
+from service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
+from service.runs.laser_columns import laser_columns
+from service.storage.records import ChunkRecord, Doc, RunRecord
+from service.storage.store import Store
+
+FORMAT = "abbe-run/1"
+BAR_CHANNEL = "bar"
+LASER_CHANNEL = "laser"
+IMPORTED_CHANNEL = "columns"
+
+
+def load_run(store: Store, id_or_label: int | str) -> Doc:
+    """Read a run from the store as an ``abbe-run/1`` document.
+
+    Parameters
+    ----------
+    store : Store
+        Open store.
+    id_or_label : int or str
+        As ``Store.run`` takes it.
+
+    Returns
+    -------
+    dict
+        The document.
+
+    Raises
+    ------
+    StoreError
+        If the run is not there, damaged, or not complete enough to be understood.
+    MeasurementFault
+        If its samples contradict its path.
+    """
+    record = store.run(id_or_label)
+    return run_document(record, store.chunks(record.id))
+
+
+def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
+    """Turn a run and its chunks into an ``abbe-run/1`` document.
+
+    Parameters
+    ----------
+    record : RunRecord
+        The run.
+    chunks : sequence of ChunkRecord
+        All its chunks, in order of seq within a channel.
+
+    Returns
+    -------
+    dict
+        With plain lists of Python numbers; an imported run comes back exactly as it was, unknown keys included.
+
+    Raises
+    ------
+    StoreError
+        If start document or chunks cannot be understood.
+    MeasurementFault
+        If its samples contradict its path.
+    """
+    imported = record.start_doc.get("imported")
+    if imported is not None:
+        return dict(imported) | {"columns": unpack_columns(chunks)}  # the key stands in "imported" too, so its place is kept
+    document = {"format": FORMAT, "campaign": record.campaign, "run_id": record.label, "test": record.test, "role": record.role}
+    try:
+        columns = _measured(record, chunks)
+        return document | {"machine": record.start_doc["machine"], "setup": record.start_doc["setup"], "columns": columns}
+    except (KeyError, TypeError) as err:
+        raise StoreError(
+            f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
+        ) from None
+
+
+def pack_columns(columns: Doc) -> list[dict[str, Any]]:
+    """Lay out imported columns as records for ``json/1``.
+
+    Parameters
+    ----------
+    columns : dict
+        Name to list (or None).
+
+    Returns
+    -------
+    list of dict
+        One record a column, in order.
+    """
+    return [{"name": name, "values": values} for name, values in columns.items()]
+
+
+def unpack_columns(chunks: Sequence[ChunkRecord]) -> Doc:
+    """Read imported columns back.
+
+    Parameters
+    ----------
+    chunks : sequence of ChunkRecord
+        Chunks of the run.
+
+    Returns
+    -------
+    dict
+        Name to list (or None), in the order of the file.
+    """
+    records = [record for chunk in _of(chunks, IMPORTED_CHANNEL, JSON_CODEC) for record in decode_json(chunk.payload)]
+    return {record["name"]: record["values"] for record in records}
+
+
+def _measured(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
+    if record.test.startswith("ballbar"):
+        samples = [sample for chunk in _of(chunks, BAR_CHANNEL, BAR_CODEC) for sample in decode_bar(chunk.payload)]
+        return bar_columns(samples, record.start_doc, record.end_doc, complete=record.status == "complete")
+    records = [one for chunk in _of(chunks, LASER_CHANNEL, JSON_CODEC) for one in decode_json(chunk.payload)]
+    return laser_columns(records, record.start_doc)
+
+
+def _of(chunks: Sequence[ChunkRecord], channel: str, codec: str) -> list[ChunkRecord]:
+    found = [chunk for chunk in chunks if chunk.channel == channel]
+    for chunk in found:
+        if chunk.codec != codec:
+            raise StoreError(
+                f"run {chunk.run_id}, chunk {chunk.seq} of channel {channel!r}: unknown codec {chunk.codec!r}", "use a newer Abbe"
+            )
+    return found

@@ -1,0 +1,51 @@
+"""Laser records become columns: displacement along the beam minus what the commanded positions make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from service.storage.records import Doc
+
+BEAM_LOST = 1 << 0
+NO_REFLECTOR = 1 << 4
+MM_PER_COUNT = 1e-7
+"""The displacement counts tenths of a nanometre."""
+
+
+def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
+    """Turn laser records into columns.
+
+    Parameters
+    ----------
+    records : sequence of dict
+        ``host_s``, ``ctrl_us``, ``target_mm`` [x, y, z], ``direction``, ``displacement_tenth_nm``, ``status``, ``signal_permille``,
+        ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order.
+    start : dict
+        Start document (service.runs.columns).
+
+    Returns
+    -------
+    dict
+        Columns of ``abbe-run/1`` and ``status``, ``signal_permille``. The deviation is 0 at the first record, as there is no earlier one to
+        measure from.
+    """
+    first = records[0] if records else {}
+    beam = start["setup"]["nominal_beam"]
+    return {
+        "t_s": [(one["ctrl_us"] - start["ctrl0_us"]) * 1e-6 for one in records],
+        **{f"{axis}_mm": [float(one["target_mm"][index]) for one in records] for index, axis in enumerate("xyz")},
+        "feed_mm_min": [float(one["feed_mm_min"]) for one in records],
+        "direction": [int(one["direction"]) for one in records],
+        "deviation_mm": [_deviation_mm(one, first, beam) for one in records],
+        "temp_air_C": [float(one["air_temp_c"]) for one in records],
+        "pressure_air_Pa": [float(one["air_pressure_pa"]) for one in records],
+        "valid": [0 if one["status"] & (BEAM_LOST | NO_REFLECTOR) else 1 for one in records],
+        "status": [int(one["status"]) for one in records],
+        "signal_permille": [int(one["signal_permille"]) for one in records],
+    }
+
+
+def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[float]) -> float:
+    nominal_mm = sum(b * (now - then) for b, now, then in zip(beam, one["target_mm"], first["target_mm"], strict=True))
+    return float((one["displacement_tenth_nm"] - first["displacement_tenth_nm"]) * MM_PER_COUNT - nominal_mm)
