@@ -9,6 +9,7 @@ from importlib.metadata import version
 from typing import Any
 
 from drivers.errors import DriverError
+from drivers.links.shielded import run_to_end
 from service.clock import Clock, SystemClock
 from service.devices.session import Session
 from service.errors import AbbeError
@@ -115,21 +116,13 @@ async def measure_test(
             gaps = recorder.gaps
             end = dict(await Runner(session).run(test, recorder, tick))
         status, reason = "complete", ""
-    except* (AbbeError, DriverError) as errors:
-        first = _first(errors)
-        status, reason = "failed", f"{first.code}: {first}"
-        raise first from None
+    except (AbbeError, DriverError) as error:
+        status, reason = "failed", f"{error.code}: {error}"
+        raise
     finally:
-        await store.write(store.finish_run, run_id, status, reason, end | {"gaps": gaps, "ended_utc": clock.utc().isoformat()})
+        end |= {"gaps": gaps, "ended_utc": clock.utc().isoformat()}
+        await run_to_end(store.write(store.finish_run, run_id, status, reason, end))
     return run_id
-
-
-def _first(group: BaseExceptionGroup[Any]) -> AbbeError | DriverError:
-    error: BaseException = group
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    assert isinstance(error, (AbbeError, DriverError))
-    return error
 
 
 async def _start_doc(session: Session, site: Site, ctrl0_us: int, test: TestPlan, clock: Clock) -> dict[str, Any]:

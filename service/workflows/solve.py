@@ -1,0 +1,130 @@
+"""Solve a campaign: runs to error parameters with uncertainty, and to what these runs cannot tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from models.solvers.helix import HelixSolution, fit_helix
+from models.solvers.joint import JointSolution, bar_normals, solve_joint
+from models.solvers.observations import nominal_reading
+from models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, wang_four
+from service.errors import NotObservable
+from service.runs.observations import bar_noise_mm, run_data
+from service.site import Site
+
+LEGENDRE_ORDER = 9
+LASER_SIGMA_MM = 3e-4
+FLOOR_MM = 3e-4
+"""What smooth functions of this order do not follow: neither instrument is trusted below it."""
+SIGMA_GROWTH_NAMED = 0.2
+"""A parameter whose data explain less than this share of its prior variance is listed as not seen."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Joint solution plus the papers' own solutions of the same runs, for comparison."""
+
+    joint: JointSolution
+    helices: dict[str, HelixSolution]
+    step_totals: dict[str, dict[str, float]]
+    noise_bar_mm: float
+
+
+def solve_runs(site: Site, runs: list[dict[str, Any]]) -> Solved:
+    """Solve ``abbe-run/1`` objects together (role ``identify`` only).
+
+    Raises
+    ------
+    NotObservable
+        There is no run to identify from, or only one kind of evidence for too many unknowns.
+    """
+    used = [r for r in runs if r["role"] == "identify"]
+    if not used:
+        raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
+    bars = [r for r in used if r["test"].startswith("ballbar")]
+    noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
+    data = tuple(run_data(r) for r in used)
+    joint = solve_joint(
+        site.machine,
+        data,
+        order=LEGENDRE_ORDER,
+        sigma_mm={"bar": max(noise, 1e-4), "laser": LASER_SIGMA_MM},
+        floor_mm={"bar": FLOOR_MM, "laser": FLOOR_MM},
+    )
+    helices = {}
+    for run in data:
+        if run.kind == "bar" and run.centre_mm is not None and run.radius_mm is not None:
+            helices[run.label] = fit_helix(run.axes_mm, run.deviation_mm, run.centre_mm, run.radius_mm, sigma_mm=max(noise, 1e-4))
+    return Solved(joint, helices, step_diagonals(used), noise)
+
+
+def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """The papers' step-diagonal figures per step order: end errors of the nine curves (um), closure (um), squareness contrasts (urad)."""
+    out: dict[str, dict[str, float]] = {}
+    for order in ("XYZ", "ZYX"):
+        found = {r["setup"]["diagonal"]: r for r in runs if r["test"] == "laser_diagonal" and r["setup"].get("order", "") == order}
+        if set(found) != set(ORDER):
+            continue
+        n = int(found["ppp"]["setup"]["steps"])
+        out_only = {k: np.asarray(r["columns"]["deviation_mm"][: 3 * n + 1]) for k, r in found.items()}
+        inc = np.abs(np.asarray(found["ppp"]["setup"]["increment_mm"]))
+        q = increments(out_only, order)
+        curves = wang_four(q, inc)
+        contrast = squareness_contrast({k: float(v[-1]) for k, v in out_only.items()}, inc * n, LASER_SIGMA_MM * np.sqrt(2.0))
+        figures = {f"E{'XYZ'[i]}{'XYZ'[a]}_end_um": float(curves[i, a, -1]) * 1e3 for a in range(3) for i in range(3)}
+        figures["closure_max_um"] = float(np.abs(closure_mm(q)).max()) * 1e3
+        figures |= {
+            "theta_xy_urad": contrast.theta_xy * 1e6,
+            "theta_xz_urad": contrast.theta_xz * 1e6,
+            "theta_yz_urad": contrast.theta_yz * 1e6,
+        }
+        figures |= {"u_theta_xy_urad": contrast.u_xy * 1e6, "u_theta_xz_urad": contrast.u_xz * 1e6, "u_theta_yz_urad": contrast.u_yz * 1e6}
+        out[order] = figures
+    return out
+
+
+def not_observable(joint: JointSolution) -> list[str]:
+    """In words: combinations that leave no trace, then how many parameters rest on their prior."""
+    rank = joint.identifiability
+    texts = [c.text for c in rank.hidden]
+    names = [t.name for t, s in zip(joint.terms, joint.estimate.data_share, strict=False) if s < SIGMA_GROWTH_NAMED]
+    if names:
+        texts.append(f"{len(names)} coefficients rest on their prior, the data hardly speak of them: {', '.join(names)}")
+    return texts
+
+
+def solution_doc(solved: Solved) -> dict[str, Any]:
+    """The solution as it is stored: parameters with uncertainty in SI-like units, set-up, ranks, per-run residuals, versions."""
+    joint = solved.joint
+    e = joint.estimate
+    return {
+        "model": f"rigid21/legendre{LEGENDRE_ORDER}",
+        "abbe": version("abbe"),
+        "parameters": {n: {"value": e.value(n), "u": e.u(n), "data_share": float(s)} for n, s in zip(e.names, e.data_share, strict=True)},
+        "rank": {"rank": joint.identifiability.rank, "of": joint.identifiability.n_parameters},
+        "not_observable": not_observable(joint),
+        "variance_factor": e.variance_factor,
+        "chi2": e.chi2,
+        "dof": e.dof,
+        "runs": {r.label: {"rms_um": r.rms_mm * 1e3} for r in joint.runs},
+        "noise_bar_mm": solved.noise_bar_mm,
+        "ten_parameter_helix": {
+            label: {n: {"value": h.estimate.value(n), "u": h.estimate.u(n)} for n in h.estimate.names}
+            for label, h in solved.helices.items()
+        },
+        "step_diagonals": solved.step_totals,
+    }
+
+
+def helix_misfit(solved: Solved, run: dict[str, Any]) -> float:
+    """Rms of a held-out ball-bar run that the solution does not explain (cup and length refitted), mm."""
+    data = run_data(run)
+    n = bar_normals(data)
+    lost = -0.5 * data.sign * np.array([v for v, _ in solved.joint.backlash_mm().values()])
+    y = data.deviation_mm - nominal_reading(data) - np.einsum("ni,ni->n", n, solved.joint.deviation_mm(data.axes_mm) + lost)
+    a = np.concatenate([n, np.ones((len(n), 1))], axis=1)
+    return float(np.sqrt(np.mean((y - a @ np.linalg.lstsq(a, y, rcond=None)[0]) ** 2)))
