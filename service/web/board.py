@@ -1,0 +1,67 @@
+"""What the page knows of the moment: the running check, the devices, the broker. Kept in memory; results live in the store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+
+from service.clock import Clock
+from service.events import Progress
+from service.scheduler.ports import Doc
+from service.scheduler.slots import Schedule
+from service.web.schemas import Device, Job
+
+
+class Board:
+    """Listens to the job and to the publisher.
+
+    Parameters
+    ----------
+    devices : mapping of str to str
+        Role and URL of each device of the machine file.
+    clock : Clock
+        When something was heard.
+    """
+
+    def __init__(self, devices: Mapping[str, str], clock: Clock) -> None:
+        self._clock = clock
+        self._before: list[Device] = []
+        self.devices = [Device(role=role, url=url, state="not used yet") for role, url in devices.items()]
+        self.job: Job | None = None
+        self.mqtt_connected = False
+        self.changes = 0
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        """Note that a check begins."""
+        self.changes += 1
+        self.job = Job(schedule=schedule.name, recipe=schedule.recipe, since_utc=at_utc)
+        self._before = self.devices
+        self.devices = [device.model_copy(update={"state": "in use", "at_utc": at_utc, "text": ""}) for device in self.devices]
+
+    def job_progress(self, progress: Progress) -> None:
+        """Note how far it is."""
+        if self.job is not None:
+            now = {name: getattr(progress, name) for name in ("stage", "message", "done", "total", "eta_s")}
+            self.job = self.job.model_copy(update=now)
+
+    def job_ended(self, doc: Doc | None) -> None:
+        """Note how it ended. A check that was stopped or failed says nothing about the devices it does not name."""
+        self.changes += 1
+        self.job = None
+        cause = doc["cause"] if doc is not None else None
+        if doc is None or cause is not None:
+            self.devices = [self._blamed(device, cause) for device in self._before]
+        else:
+            now = self._clock.utc()
+            self.devices = [device.model_copy(update={"state": "answered", "at_utc": now, "text": ""}) for device in self.devices]
+
+    def _blamed(self, device: Device, cause: Doc | None) -> Device:
+        if cause is None or cause["device"] not in {device.role, device.url}:
+            return device
+        return device.model_copy(update={"state": "fault", "at_utc": self._clock.utc(), "text": cause["what"]})
+
+    def broker(self, connected: bool) -> None:
+        """Note whether the broker is there."""
+        if connected != self.mqtt_connected:
+            self.changes += 1
+            self.mqtt_connected = connected

@@ -1,0 +1,66 @@
+"""The page: status and past checks into HTML, on the server. The script only refreshes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, tzinfo
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from service.web import words
+from service.web.schemas import Status, Verification
+from service.web.trend import Point, trend_svg
+
+HERE = Path(__file__).parent
+MARKS = {"pass": "✔", "fail": "✖", "cannot tell": "◐"}
+SHOWN_FIGURES = 4
+
+
+def environment() -> Environment:
+    """Return the template environment. Everything is escaped: names and fault texts come from devices and files."""
+    env = Environment(
+        loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    env.filters["number"] = words.number
+    env.filters["span"] = words.span
+    return env
+
+
+def render(env: Environment, status: Status, past: Sequence[Verification]) -> str:
+    """Return the page."""
+    zone: tzinfo = ZoneInfo(status.next_due[0].timezone) if status.next_due else UTC
+    return env.get_template("page.html").render(
+        status=status,
+        past=past,
+        latest=past[0] if past else None,
+        figures=figures(past),
+        trends=trends(past, zone),
+        marks=MARKS,
+        zone=zone,
+        name=words.figure_name,
+        stamp=lambda moment: words.stamp(moment, zone),
+        ago=lambda moment: words.ago(moment, status.now_utc),
+    )
+
+
+def figures(past: Sequence[Verification]) -> list[str]:
+    """Return the figures worth a column, in the order in which checks name them."""
+    return list(dict.fromkeys(key for check in past for key in check.values))[:SHOWN_FIGURES]
+
+
+def trends(past: Sequence[Verification], zone: tzinfo) -> list[Markup]:
+    """Return a plot for each figure."""
+    plots = []
+    for key in figures(past):
+        name, unit = words.figure_name(key)
+        points = [
+            Point(check.started_utc, value, check.uncertainties.get(key) or 0.0, check.limits.get(key), check.verdict)
+            for check in past
+            if (value := check.values.get(key)) is not None
+        ]
+        if points:
+            plots.append(Markup(trend_svg(name, unit, points, zone)))  # noqa: S704 - our own writer, which escapes
+    return plots

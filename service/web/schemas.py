@@ -1,0 +1,120 @@
+"""What the JSON interface answers, declared: the OpenAPI document and the page are both made from these."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class Cause(_Answer):
+    """Why a check could not be completed."""
+
+    code: str
+    what: str
+    remedy: str = ""
+    device: str = ""
+
+
+class Verification(_Answer):
+    """One check. Figures end in their unit; uncertainties are expanded, k = 2."""
+
+    id: int
+    machine: str
+    schedule: str
+    recipe: str
+    slot_utc: datetime
+    started_utc: datetime
+    duration_s: float
+    verdict: Literal["pass", "fail", "cannot tell"]
+    values: dict[str, float | None]
+    uncertainties: dict[str, float | None]
+    limits: dict[str, float | None]
+    campaign: str = ""
+    runs: Annotated[list[str], Field(default_factory=list)]
+    text: str
+    cause: Cause | None = None
+
+
+class Device(_Answer):
+    """A device of the machine file, and when we last heard of it. It is not polled between checks."""
+
+    role: str
+    url: str
+    state: Literal["not used yet", "in use", "answered", "fault"]
+    at_utc: datetime | None = None
+    text: str = ""
+
+
+class Job(_Answer):
+    """The check that runs now."""
+
+    schedule: str
+    recipe: str
+    since_utc: datetime
+    stage: str = ""
+    message: str = ""
+    done: float = 0.0
+    total: float = 0.0
+    eta_s: float | None = None
+
+
+class Due(_Answer):
+    """What comes next of one schedule."""
+
+    schedule: str
+    recipe: str
+    due_utc: datetime
+    timezone: str
+    cron_words: str
+    words: str
+
+
+class Mqtt(_Answer):
+    """The way to the broker."""
+
+    configured: bool
+    broker: str = ""
+    connected: bool = False
+    waiting: int = 0
+
+
+class Status(_Answer):
+    """Everything the page shows. ``revision`` changes when more than the progress of a running check has changed."""
+
+    machine: str
+    version: str
+    now_utc: datetime
+    revision: str
+    job: Job | None
+    devices: list[Device]
+    next_due: list[Due]
+    mqtt: Mqtt
+    last: list[Verification]
+
+
+class Verifications(_Answer):
+    """Checks, newest first."""
+
+    verifications: list[Verification]
+
+
+class Health(_Answer):
+    """The process answers, or is ready to work."""
+
+    status: Literal["ok"] = "ok"
+
+
+class Problem(_Answer):
+    """RFC 9457 problem details."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str = ""
+    code: str = ""

@@ -1,0 +1,142 @@
+"""One figure over time as SVG: points with their uncertainty, the limit, axes with units. No script, no inline style (CSP)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, tzinfo
+from html import escape
+
+from service.web.words import number
+
+WIDTH, HEIGHT = 560, 230
+LEFT, RIGHT, TOP, BOTTOM = 58, 14, 16, 40
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One check's figure."""
+
+    at: datetime
+    value: float
+    uncertainty: float
+    limit: float | None
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """Maps [low, high] to pixels."""
+
+    low: float
+    high: float
+    first_px: float
+    last_px: float
+
+    def __call__(self, value: float) -> float:
+        return self.first_px + (value - self.low) / (self.high - self.low) * (self.last_px - self.first_px)
+
+
+def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo) -> str:
+    """Return the plot as an SVG element.
+
+    Parameters
+    ----------
+    name, unit : str
+        Label of the vertical axis.
+    points : sequence of Point
+        In any order; must not be empty.
+    zone : tzinfo
+        Of the dates on the horizontal axis.
+    """
+    points = sorted(points, key=lambda point: point.at)
+    x, y = _time_scale(points), _value_scale(points)
+    label = f"{name} [{unit}]" if unit else name
+    body = [*_grid(y), *_dates(points, x, zone), *_limit(points, x, y)]
+    for point in points:
+        body += _mark(point, x(point.at.timestamp()), y, unit)
+    body.append(f'<text class="axis" x="{LEFT}" y="11">{escape(label)}</text>')
+    newest = points[-1]
+    title = f"{name}: {len(points)} checks, latest {number(newest.value)} {unit}"
+    return (
+        f'<svg class="trend" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}" xmlns="http://www.w3.org/2000/svg">'
+        + "".join(body)
+        + "</svg>"
+    )
+
+
+def _time_scale(points: Sequence[Point]) -> _Scale:
+    first, last = points[0].at.timestamp(), points[-1].at.timestamp()
+    # A single check, or several within a minute, still get an axis with a length.
+    margin = max((last - first) * 0.04, 30.0)
+    return _Scale(first - margin, last + margin, LEFT, WIDTH - RIGHT)
+
+
+def _value_scale(points: Sequence[Point]) -> _Scale:
+    highs = [point.value + point.uncertainty for point in points] + [point.limit for point in points if point.limit is not None]
+    lows = [point.value - point.uncertainty for point in points]
+    step = _step(max(highs) - min(0.0, *lows))
+    low = math.floor(min(0.0, *lows) / step) * step
+    high = math.ceil(max(highs) * 1.04 / step) * step
+    return _Scale(low, max(high, low + step), HEIGHT - BOTTOM, TOP + 4)
+
+
+def _step(length: float) -> float:
+    """Return a round step of which four to eight make up ``length``."""
+    rough = max(length, 1e-9) / 5
+    power = 10.0 ** math.floor(math.log10(rough))
+    return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough)
+
+
+def _grid(y: _Scale) -> list[str]:
+    step = _step(y.high - y.low)
+    lines = []
+    for index in range(round((y.high - y.low) / step) + 1):
+        value = y.low + index * step
+        lines.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y(value):.1f}" y2="{y(value):.1f}"/>')
+        lines.append(f'<text class="tick" x="{LEFT - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value:g}</text>')
+    return lines
+
+
+def _dates(points: Sequence[Point], x: _Scale, zone: tzinfo) -> list[str]:
+    first, last = points[0].at, points[-1].at
+    form = "%H:%M:%S" if last - first < timedelta(minutes=10) else "%H:%M" if last - first < timedelta(hours=36) else "%d %b"
+    shown = [first + (last - first) * part for part in ((0, 1 / 3, 2 / 3, 1) if last > first else (0,))]
+    texts = []
+    for index, moment in enumerate(shown):
+        anchor = "middle" if len(shown) == 1 else ("start", "middle", "middle", "end")[index]
+        text = moment.astimezone(zone).strftime(form)
+        texts.append(f'<text class="tick" x="{x(moment.timestamp()):.1f}" y="{HEIGHT - BOTTOM + 17}" text-anchor="{anchor}">{text}</text>')
+    day = last.astimezone(zone).strftime("%Y-%m-%d")
+    texts.append(
+        f'<text class="axis" x="{WIDTH - RIGHT}" y="{HEIGHT - 5}" text-anchor="end">time ({escape(str(zone))}), up to {day}</text>'
+    )
+    return texts
+
+
+def _limit(points: Sequence[Point], x: _Scale, y: _Scale) -> list[str]:
+    """Draw the limit as a line with steps: a limit changed in the machine file did not hold before."""
+    known = [(x(point.at.timestamp()), y(point.limit)) for point in points if point.limit is not None]
+    if not known:
+        return []
+    path = f"M{LEFT} {known[0][1]:.1f}" + "".join(f"H{px:.1f}V{py:.1f}" for px, py in known) + f"H{WIDTH - RIGHT}"
+    last_y = known[-1][1]
+    return [
+        f'<path class="limit" d="{path}"/>',
+        f'<text class="limit-text" x="{WIDTH - RIGHT}" y="{last_y - 5:.1f}" text-anchor="end">limit</text>',
+    ]
+
+
+def _mark(point: Point, px: float, y: _Scale, unit: str) -> list[str]:
+    """Draw bar and mark. The verdict is a shape as well as a colour."""
+    top, bottom, middle = y(point.value + point.uncertainty), y(point.value - point.uncertainty), y(point.value)
+    bar = f'<path class="bar" d="M{px:.1f} {top:.1f}V{bottom:.1f}M{px - 4:.1f} {top:.1f}h8M{px - 4:.1f} {bottom:.1f}h8"/>'
+    hover = f"<title>{escape(f'{number(point.value)} ± {number(point.uncertainty)} {unit}, {point.verdict}')}</title>"
+    if point.verdict == "pass":
+        mark = f'<circle class="pass" cx="{px:.1f}" cy="{middle:.1f}" r="4">{hover}</circle>'
+    elif point.verdict == "fail":
+        mark = f'<path class="fail" d="M{px - 5:.1f} {middle - 5:.1f}l10 10m0 -10l-10 10">{hover}</path>'
+    else:
+        mark = f'<path class="unclear" d="M{px:.1f} {middle - 5:.1f}l5 5l-5 5l-5 -5z">{hover}</path>'
+    return [bar, mark]
