@@ -1,0 +1,88 @@
+"""Numbers as a metrologist writes them: the uncertainty decides how many digits the value may have."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TypeGuard
+
+NOT_AVAILABLE = "n/a"
+COVERAGE = 2.0
+"""Coverage factor k of every expanded uncertainty in a report."""
+
+# XML 1.0 has no way to write these at all, not even escaped.
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
+
+
+def finite(value: float | None) -> TypeGuard[float]:
+    """Whether there is a number at all."""
+    return value is not None and math.isfinite(value)
+
+
+def plain(value: float | None, digits: int = 3) -> str:
+    """Value to ``digits`` significant digits, never in exponent notation within 1e-6 .. 1e7; ``n/a`` when there is none."""
+    if not finite(value):
+        return NOT_AVAILABLE
+    if value == 0.0:
+        return "0"
+    if not 1e-6 <= abs(value) < 1e7:
+        return _signed(f"{value:.{digits - 1}e}")
+    return fixed(value, _decimals(value, digits))
+
+
+def tidy(value: float | None) -> str:
+    """A set value (stroke, scale, coverage factor) with no more digits than it was given: 600, not 600.0."""
+    if not finite(value):
+        return NOT_AVAILABLE
+    text = plain(value, 6)
+    return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Value with so many decimals; negative ``decimals`` round to tens, hundreds and so on."""
+    if decimals < 0:
+        return _signed(f"{round(value, decimals):.0f}")
+    return _signed(f"{value:.{decimals}f}")
+
+
+def with_uncertainty(value: float | None, u: float | None) -> tuple[str, str]:
+    """Value and expanded uncertainty U = k u (k = 2), rounded together: two significant digits of U.
+
+    Parameters
+    ----------
+    value : float or None
+        The value.
+    u : float or None
+        Its standard uncertainty, in the same unit.
+
+    Returns
+    -------
+    tuple of str
+        The value and U; U is ``n/a`` when there is none, and the value then keeps three significant digits.
+    """
+    if not finite(value):
+        return NOT_AVAILABLE, NOT_AVAILABLE
+    if not finite(u) or u <= 0.0:
+        return plain(value), NOT_AVAILABLE
+    expanded = COVERAGE * u
+    decimals = max(_decimals(expanded, 2), -6)
+    if decimals > 9:
+        return plain(value), plain(expanded, 2)
+    return fixed(value, decimals), fixed(expanded, decimals)
+
+
+def printable(text: object) -> str:
+    """Text without the control characters that XML and HTML cannot hold. Escaping is the writer's business."""
+    return _UNPRINTABLE.sub("\ufffd", str(text))
+
+
+def _decimals(value: float, digits: int) -> int:
+    # Rounding first: 0.0996 to two digits is 0.10, not 0.100.
+    rounded = float(f"{value:.{digits - 1}e}")
+    return digits - 1 - math.floor(math.log10(abs(rounded)))
+
+
+def _signed(text: str) -> str:
+    body = text.lstrip("-")
+    is_zero = not any(c in "123456789" for c in body.split("e")[0])
+    return f"−{body}" if text.startswith("-") and not is_zero else body
