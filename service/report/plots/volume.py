@@ -163,7 +163,7 @@ def _draw_key(svg: Svg, paper: _Paper, scale: ArrowScale) -> None:
         svg.text((x + i * cell, y + 23.0), tidy(i * step), "t-small", anchor="middle")
     svg.text((x + SEQUENCE * cell, y + 23.0), f"{tidy(scale.top_um)} µm", "t-small", anchor="middle")
     # Arrows lie askew in space; the key is a length in the plane of the paper, as every arrow parallel to it is drawn.
-    bar = nice_step(scale.top_um, 4)
+    bar = nice_step(scale.top_um, 3)
     length = bar * 1e-3 * scale.exaggeration * paper.zoom
     right = WIDTH - 24.0
     svg.line((right - length, y + 5.0), (right, y + 5.0), "key")

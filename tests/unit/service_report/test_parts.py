@@ -130,7 +130,7 @@ def test_no_spike_is_lost_in_a_dense_run() -> None:
 
 
 def test_table_levels_show_only_when_they_can_be_told_apart() -> None:
-    fine, coarse = ([TableCurve("X", "X", [0.0, 10.0], [0.0, top])] for top in (40.0, 0.5))
+    fine, coarse = ([TableCurve("X", "X", [0.0, 10.0], [0.0, top])] for top in (40.0, 0.8))
     assert "dots" not in table_plot(fine, lsb_um=0.1)
     assert "dots" in table_plot(coarse, lsb_um=0.1)
 
