@@ -1,0 +1,148 @@
+"""`abbe demo`: the whole job on a simulated machine, with a live display, a table, and a report."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.console import Console
+
+    from service.events import Progress, ProgressSink
+    from service.workflows.demo import DemoResult
+
+DEFAULT_FOLDER = "abbe-demo"
+
+
+def demo(
+    seed: Annotated[int, typer.Option(help="Which simulated machine.")] = 1,
+    speed: Annotated[float, typer.Option(min=1.0, max=200.0, help="Machine seconds per wall second.")] = 60.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")] = False,
+    keep: Annotated[Path | None, typer.Option(help="Folder for database, machine file, tables and report.")] = None,
+) -> None:
+    """Measure a simulated machine tool over real wires, correct it, and prove that it became better."""
+    from rich.console import Console
+
+    from service.report.html import render_report
+    from service.workflows.demo_report import demo_json, demo_report
+
+    folder = keep or Path(DEFAULT_FOLDER)
+    folder.mkdir(parents=True, exist_ok=True)
+    log = Console(stderr=True)
+    with display(log) as sink, work_folder(folder, keep) as work:
+        result = run_until_signal(seed, speed, work, sink)
+    report = folder / "report.html"
+    report.write_text(render_report(demo_report(result)), encoding="utf-8")
+    if as_json:
+        sys.stdout.write(json.dumps(demo_json(result), indent=2) + "\n")
+    else:
+        print_result(Console(), result)
+    log.print(f"report: {report}")
+
+
+@contextmanager
+def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
+    """Where database and links live: the kept folder, which must not hold another demonstration, or a temporary one."""
+    if keep is None:
+        with tempfile.TemporaryDirectory(prefix="abbe-") as name:
+            yield Path(name)
+        return
+    from service.errors import AbbeError
+
+    if (folder / "abbe.sqlite3").exists():
+        raise AbbeError(f"{folder} already holds a demonstration", "name another folder with --keep, or delete it")
+    yield folder.resolve()
+
+
+def run_until_signal(seed: int, speed: float, folder: Path, sink: ProgressSink) -> DemoResult:
+    """Run the demonstration; SIGTERM cancels it like Ctrl-C does, so that the machine stops and the simulators end."""
+    from service.workflows.demo import run_demo
+
+    async def main() -> DemoResult:
+        loop = asyncio.get_running_loop()
+        task = asyncio.current_task()
+        assert task is not None
+        terminated = False
+
+        def stop() -> None:
+            nonlocal terminated
+            terminated = True
+            task.cancel()
+
+        loop.add_signal_handler(signal.SIGTERM, stop)
+        try:
+            return await run_demo(seed, speed, folder, sink)
+        except asyncio.CancelledError:
+            if terminated:
+                raise SystemExit(143) from None
+            raise
+
+    return asyncio.run(main())
+
+
+@contextmanager
+def display(log: Console) -> Iterator[ProgressSink]:
+    """A progress bar with ETA on a terminal; one line per stage elsewhere."""
+    if not log.is_terminal:
+        last = [""]
+
+        def plain(p: Progress) -> None:
+            if p.stage != last[0]:
+                last[0] = p.stage
+                log.print(f"{p.stage}: {p.message}", highlight=False)
+
+        yield plain
+        return
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns: tuple[Any, ...] = (
+        TextColumn("{task.fields[stage]:<14}"),
+        BarColumn(),
+        TextColumn("{task.fields[eta]:>9}"),
+        TimeElapsedColumn(),
+    )
+    with Bars(*columns, TextColumn("{task.description}"), console=log) as bars:
+        tasks: dict[str, Any] = {}
+
+        def live(p: Progress) -> None:
+            if p.stage not in tasks:
+                tasks[p.stage] = bars.add_task(p.message, stage=p.stage, eta="", total=p.total)
+            eta = "" if p.eta_s is None else f"{p.eta_s:.0f} s left"
+            bars.update(tasks[p.stage], completed=p.done, description=p.message, eta=eta)
+
+        yield live
+
+
+def print_result(out: Console, result: DemoResult) -> None:
+    """Before and after as a table, then the verdict."""
+    from rich.table import Table
+
+    from service.workflows.demo_report import demo_json, summary_rows
+
+    table = Table(title=f"Simulated machine {result.seed}: before and after")
+    for name in ("figure", "before", "after", "factor", "source"):
+        table.add_column(name, justify="left" if name in ("figure", "source") else "right")
+    for row in summary_rows(result):
+        u0 = f" ± {2 * row.u_before:.1f}" if row.u_before is not None else ""
+        u1 = f" ± {2 * row.u_after:.1f}" if row.u_after is not None else ""
+        table.add_row(
+            row.name, f"{row.before:.1f}{u0} {row.unit}", f"{row.after:.1f}{u1} {row.unit}", f"{row.factor or 0:.1f}x", row.source
+        )
+    out.print(table)
+    found = demo_json(result)
+    share = found["volumetric_factor"]["share"]
+    out.print(
+        f"nine perfect one-axis tables would leave {found['best_nine_tables_rms_um']:.1f} um rms; reached {100 * share:.0f} % of that factor"
+    )
+    out.print(("kept: " if found.get("kept") else "rolled back: ") + str(found.get("verdict", "")))

@@ -1,0 +1,183 @@
+"""The demonstration's result as the report's data and as JSON. Sealed-truth figures are always marked as such."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Any, Literal
+
+import numpy as np
+
+from models.solvers.joint import JointSolution
+from service.report.model import (
+    ArrowField,
+    Contribution,
+    DemoReport,
+    ParameterRow,
+    ResidualSeries,
+    RunRow,
+    SummaryRow,
+    TableCurve,
+)
+from service.workflows.demo import LSB_NM, DemoResult
+from service.workflows.solve import not_observable
+from service.workflows.verify import Figures, figure_rows
+
+TRUTH = "sealed truth of the simulator"
+TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
+
+
+def demo_json(result: DemoResult) -> dict[str, Any]:
+    """What `abbe demo --json` prints: sealed-truth figures before and after, the bound of nine tables, measured figures with uncertainty."""
+    before, after = result.truth_before, result.truth_after
+    out: dict[str, Any] = {"format": "abbe-demo/1", "seed": result.seed, "speed": result.speed}
+    out |= {key: {"before": before[key], "after": after[key]} for key in TRUTH_KEYS}
+    best = before["best_nine_tables_rms_um"]
+    rms0, rms1 = before["volumetric_rms_um"], after["volumetric_rms_um"]
+    out["best_nine_tables_rms_um"] = best
+    out["volumetric_factor"] = {"reached": rms0 / rms1, "bound": rms0 / best, "share": best / rms1}
+    out["volumetric_reduction_share"] = (rms0 - rms1) / (rms0 - best)
+    out["source_of_the_above"] = TRUTH + ", rigid motion removed"
+    out["measured"] = {
+        name: {"before": v, "u_before": u, "after": a, "u_after": ua} for name, (v, u), (a, ua) in _measured(result.before, result.after)
+    }
+    if result.predicted is not None:
+        p = result.predicted
+        out["predicted_rms_um"] = {"before": p.before_mm * 1e3, "after": p.after_mm * 1e3, "u_model": p.u_model_mm * 1e3}
+    if result.decision is not None:
+        out["kept"], out["verdict"] = result.decision.keep, result.decision.text
+    out["holdout_misfit_um"] = result.holdout_misfit_um
+    out["duration_s"] = round(result.duration_s, 1)
+    return out
+
+
+def _measured(before: Figures | None, after: Figures | None) -> list[tuple[str, tuple[float, float], tuple[float, float]]]:
+    if before is None or after is None:
+        return []
+    old, new = figure_rows(before), figure_rows(after)
+    return [(k, old[k], new[k]) for k in old if k in new]
+
+
+def summary_rows(result: DemoResult) -> list[SummaryRow]:
+    """Before and after, measured figures first, then the sealed truth."""
+    rows = []
+    for name, (v, u), (a, ua) in _measured(result.before, result.after):
+        title = _title(name)
+        rows.append(SummaryRow(title, "µm", v, a, v / a if a > 0 else None, u, ua, "measured"))
+    for key, title in zip(TRUTH_KEYS, ("Largest body diagonal", "Volumetric error, rms", "Volumetric error, maximum"), strict=True):
+        v, a = result.truth_before.get(key), result.truth_after.get(key)
+        if v is not None and a is not None:
+            source: Literal["measured", "sealed truth of the simulator"] = "sealed truth of the simulator"
+            rows.append(SummaryRow(title, "µm", v, a, v / a if a else None, source=source))
+    return rows
+
+
+def _title(name: str) -> str:
+    if name == "helix_rms_um":
+        return "Helix, rms (other centre and radius)"
+    if name == "body_diagonal_um":
+        return "Largest body diagonal"
+    return f"Body diagonal {name.removeprefix('diagonal_').removesuffix('_um')}"
+
+
+def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
+    """The parameters people ask for, with standard uncertainty: scales, squareness, lost motion, then the cups, bars and mirrors."""
+    e, length = joint.estimate, joint.machine.length_mm
+    rows = []
+    for a, axis in enumerate("XYZ"):
+        name, per = f"E{axis}{axis}.1", 2.0 / length[a] * 1e6
+        rows.append(ParameterRow(f"E{axis}{axis} slope", e.value(name) * per, e.u(name) * per, "µm/m", "scale error"))
+    rows += [ParameterRow(n, e.value(n) * 1e6, e.u(n) * 1e6, "µrad", "squareness") for n in ("C0Y", "B0Z", "A0Z")]
+    rows += [
+        ParameterRow(f"backlash {a}", v * 1e3, u * 1e3, "µm", "lost motion, not compensated") for a, (v, u) in joint.backlash_mm().items()
+    ]
+    for n in e.names:
+        if n.startswith(("cup_", "bar_length_")):
+            rows.append(ParameterRow(n.replace("_", " "), e.value(n) * 1e3, e.u(n) * 1e3, "µm", "set-up"))
+        elif n.startswith("tilt_"):
+            rows.append(ParameterRow(n.replace("_", " "), e.value(n) * 1e6, e.u(n) * 1e6, "µrad", "set-up"))
+    return rows
+
+
+def contributions(joint: JointSolution) -> list[Contribution]:
+    """Rms over its stroke of every translation and squareness, largest first (angles act through levers and are left to the map)."""
+    e, length = joint.estimate, joint.machine.length_mm
+    found: dict[str, float] = {}
+    for k, term in enumerate(joint.terms):
+        value = float(joint.coefficients[k])
+        if term.order == 0:
+            found[term.motion] = abs(value) * float(length[term.axis]) / np.sqrt(12.0) * 1e3
+        elif term.component < 3:
+            found[term.motion] = float(np.hypot(found.get(term.motion, 0.0), value / np.sqrt(2 * term.order + 1) * 1e3))
+    found |= {f"backlash {a}": abs(e.value(f"backlash_{a}")) / 2 * 1e3 for a in "XYZ"}
+    return [Contribution(n, v) for n, v in sorted(found.items(), key=lambda item: -item[1])]
+
+
+def _arrows(truth: dict[str, Any]) -> ArrowField | None:
+    if "grid_mm" not in truth:
+        return None
+    return ArrowField(np.asarray(truth["grid_mm"], dtype=np.float64), np.asarray(truth["deviation_um"], dtype=np.float64))
+
+
+def _curves(found: Figures | None) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
+    if found is None:
+        return {}
+    return {k: (f.position_mm.tolist(), (f.deviation_mm * 1e3).tolist()) for k, f in found.diagonals.items()}
+
+
+def _tables(result: DemoResult) -> list[TableCurve]:
+    if result.tables is None:
+        return []
+    t = result.tables
+    return [
+        TableCurve("XYZ"[a], "XYZ"[i], t.position_mm[a].tolist(), (t.correction_mm[a][:, i] * 1e3).tolist())
+        for a in range(3)
+        for i in range(3)
+    ]
+
+
+def demo_report(result: DemoResult) -> DemoReport:
+    """Everything the report shows, from what the demonstration found."""
+    solved, decision = result.solved, result.decision
+    joint = solved.joint if solved is not None else None
+    noise = result.noise_bar_um
+    runs = (
+        [RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, noise if r.kind == "bar" else None) for r in joint.runs]
+        if joint
+        else []
+    )
+    residuals = [
+        ResidualSeries(r.label, "reading", list(range(r.residual_mm.size)), (r.residual_mm * 1e3).tolist())
+        for r in (joint.runs if joint else ())
+    ]
+    warnings = [
+        "Figures marked 'sealed truth' exist only because the machine is simulated; on a real machine the measured rows are all there is."
+    ]
+    if joint is not None and joint.estimate.variance_factor > 1.5:
+        warnings.append(
+            f"The residuals are larger than the stated noise (variance factor {joint.estimate.variance_factor:.1f}); uncertainties were widened."
+        )
+    kept = decision is not None and decision.keep
+    return DemoReport(
+        title=f"Abbe: measure, correct, verify - {result.site.name}",
+        machine={"chain": result.site.machine.chain, "stroke_mm": result.site.doc["stroke_mm"], "tool_mm": result.site.doc["tool_mm"]},
+        created_utc=result.started_utc,
+        seed=result.seed,
+        versions={"abbe": version("abbe")},
+        verdict=("Table kept: " if kept else "Table rolled back: ") + (decision.text if decision else "no decision"),
+        accepted=kept if decision is not None else None,
+        summary=summary_rows(result),
+        parameters=parameter_rows(joint) if joint else [],
+        not_observable=not_observable(joint) if joint else [],
+        runs=runs,
+        residuals=residuals,
+        tables=_tables(result),
+        table_lsb_um=LSB_NM * 1e-3,
+        arrows_before=_arrows(result.truth_before),
+        arrows_after=_arrows(result.truth_after),
+        diagonals_before=_curves(result.before),
+        diagonals_after=_curves(result.after),
+        contributions=contributions(joint) if joint else [],
+        push_log=list(result.pushed.log) if result.pushed else [],
+        warnings=warnings,
+    )

@@ -1,0 +1,123 @@
+"""The simulated outside world as a child process: started, watched, and gone when we are gone.
+
+The product never imports the simulators: it starts `python -m simulators`, reads one line of JSON that says where the devices are, and
+talks to them over the wire like to any other device.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.links.shielded import run_to_end
+from service.errors import AbbeError
+
+READY_S = 30.0
+STOP_S = 3.0
+
+
+class WorldError(AbbeError):
+    """The simulator process could not be started or answered nonsense."""
+
+    code = "SIM-001"
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A running simulated machine: what its ready line said."""
+
+    ready: dict[str, Any]
+    pid: int
+
+
+@asynccontextmanager
+async def running_world(args: list[str]) -> AsyncIterator[World]:
+    """Start the simulators with these arguments; end them with the block, whatever ends it.
+
+    The child also ends by itself when its standard input closes, so that not even SIGKILL of this process leaves one behind.
+
+    Raises
+    ------
+    WorldError
+        It did not start; the child's own line says why.
+    """
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "simulators",
+        *args,
+        "--watch-stdin",
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C at the terminal is for us: we stop the machine first, then the world
+    )
+    try:
+        yield World(await _ready(process), process.pid)
+    finally:
+        await run_to_end(_end(process))
+
+
+async def _ready(process: asyncio.subprocess.Process) -> dict[str, Any]:
+    assert process.stdout is not None
+    assert process.stderr is not None
+    try:
+        async with asyncio.timeout(READY_S):
+            line = await process.stdout.readline()
+    except TimeoutError:
+        raise WorldError(f"the simulators were not ready within {READY_S:g} s", "is the machine overloaded?") from None
+    try:
+        ready: dict[str, Any] = json.loads(line)
+    except ValueError:
+        said = (await process.stderr.read(2000)).decode(errors="replace").strip().splitlines()
+        raise WorldError(f"the simulators did not start: {said[-1] if said else 'no reason given'}", "check the scenario") from None
+    return ready
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    if process.stdin is not None:
+        process.stdin.close()
+    if process.returncode is None:
+        process.terminate()
+        try:
+            async with asyncio.timeout(STOP_S):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+    # closes the pipes' transports here and now instead of when the garbage collector finds them
+    transport = getattr(process, "_transport", None)
+    if transport is not None:
+        transport.close()
+
+
+async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
+    """Ask the simulators' own evaluation what the machine really does, without and with a table. For demonstrations only.
+
+    Raises
+    ------
+    WorldError
+        It failed; the child's own line says why.
+    """
+    words = ["-m", "simulators", "truth", *args, "--arrows"]
+    if bank is not None:
+        words += ["--bank", str(bank)]
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, start_new_session=True
+    )
+    try:
+        out, err = await process.communicate()
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await run_to_end(process.wait())
+    if process.returncode != 0:
+        raise WorldError(f"the simulators' truth command failed: {err.decode(errors='replace').strip()}")
+    truth: dict[str, Any] = json.loads(out)
+    return truth
