@@ -1,0 +1,206 @@
+"""What every test gets: the shared material, a way to demand a tool, and guards against what a test must not leave behind or reach.
+
+``ABBE_TEST_REQUIRE`` is a comma list of things that have to be there (``chromium,mosquitto,socat,mbpoll,postgresql,shared``). A test that
+misses one of them fails; without the variable it is skipped and says why.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import inspect
+import ipaddress
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+RUN_MARK = f"ABBE_TEST_RUN={os.getpid()}"
+Require = Callable[[str, bool, str], None]
+
+
+def _require(name: str, present: bool, reason: str) -> None:
+    if present:
+        return
+    if name in {word.strip() for word in os.environ.get("ABBE_TEST_REQUIRE", "").split(",")}:
+        pytest.fail(f"{name} is required here (ABBE_TEST_REQUIRE): {reason}", pytrace=False)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def require() -> Require:
+    """``require("socat", shutil.which("socat") is not None, "socat is not installed")``: go on, skip, or fail where it is demanded."""
+    return _require
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with specifications, vectors and data beside the repository."""
+    path = ROOT.parent / "shared"
+    _require("shared", path.is_dir(), "the folder ../shared (vectors, data, examples) is not beside the repository")
+    return path
+
+
+# --- asyncio tasks -------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def no_task_left(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail an async test after which a task still runs. Looked at after all other fixtures are down, before the loop is closed."""
+    function = inspect.unwrap(getattr(request.node, "obj", lambda: None))
+    marker = request.node.get_closest_marker("asyncio")
+    own_loop = (marker is None or marker.kwargs.get("loop_scope") in (None, "function")) and inspect.iscoroutinefunction(function)
+    if not own_loop:
+        yield
+        return
+    runner: asyncio.Runner = request.getfixturevalue("_function_scoped_runner")
+    yield
+    left = runner.run(_unfinished())
+    if left:
+        pytest.fail("tasks left running: " + "; ".join(left), pytrace=False)
+
+
+async def _unfinished() -> list[str]:
+    me = asyncio.current_task()
+    tasks: list[asyncio.Task[Any]] = []
+    for _ in range(5):  # whoever was cancelled in the last line of a test needs a turn to end
+        tasks = [t for t in asyncio.all_tasks() if t is not me and not t.done()]
+        if not tasks:
+            return []
+        await asyncio.sleep(0)
+    names = [f"{t.get_name()} ({getattr(t.get_coro(), '__qualname__', t.get_coro())})" for t in tasks]
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    return names
+
+
+# --- network -------------------------------------------------------------------------------------------------------------------------
+
+_strays: list[str] = []
+# Set aside for documentation (RFC 5737, RFC 3849): tests may name them to see an unreachable peer; no packet is sent.
+_NOWHERE = [ipaddress.ip_network(n) for n in ("192.0.2.0/24", "198.51.100.0/24", "203.0.113.0/24", "2001:db8::/32")]
+
+
+def _forbidden(host: object) -> OSError | None:
+    """What a socket call to ``host`` ends with; None for this computer."""
+    name = host.decode() if isinstance(host, bytes) else str(host or "localhost")
+    try:
+        address = ipaddress.ip_address(name.partition("%")[0])
+    except ValueError:
+        if name == "localhost" or name.endswith(".localhost") or name == socket.gethostname():
+            return None
+        if not name.endswith((".invalid", ".test", ".example")):
+            _strays.append(name)
+        return socket.gaierror(socket.EAI_NONAME, f"tests may not look up {name}")
+    if address.is_loopback or address.is_unspecified:
+        return None
+    if not any(address in net for net in _NOWHERE):
+        _strays.append(name)
+    return OSError(errno.ENETUNREACH, f"tests may not reach {name}")
+
+
+def _guarded(original: Callable[..., Any], address_at: int) -> Callable[..., Any]:
+    def call(self: socket.socket, *args: Any) -> Any:
+        if self.family in (socket.AF_INET, socket.AF_INET6) and (error := _forbidden(args[address_at][0])):
+            raise error
+        return original(self, *args)
+
+    return call
+
+
+def _guarded_lookup(original: Callable[..., Any]) -> Callable[..., Any]:
+    def call(host: Any, *args: Any, **options: Any) -> Any:
+        if error := _forbidden(host):
+            raise error
+        return original(host, *args, **options)
+
+    return call
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _only_this_computer() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, address_at in (("connect", 0), ("connect_ex", 0), ("sendto", -1)):
+            patch.setattr(socket.socket, name, _guarded(getattr(socket.socket, name), address_at))
+        patch.setattr(socket, "getaddrinfo", _guarded_lookup(socket.getaddrinfo))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def no_stray_connection() -> Iterator[None]:
+    """Fail a test that tried to reach another computer, even when the code under test swallowed the refusal."""
+    _strays.clear()
+    yield
+    if _strays:
+        pytest.fail("tried to reach another computer: " + ", ".join(sorted(set(_strays))), pytrace=False)
+
+
+# --- child processes -----------------------------------------------------------------------------------------------------------------
+
+
+def _command(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def _descendants(pid: int) -> set[int]:
+    found: set[int] = set()
+    for listing in Path(f"/proc/{pid}/task").glob("*/children"):
+        try:
+            children = {int(word) for word in listing.read_text().split()}
+        except OSError:
+            continue
+        found |= children.union(*(_descendants(child) for child in children))
+    return found
+
+
+def _simulators(pids: set[int]) -> dict[int, str]:
+    # An ended child that nobody waited for has an empty command line: it is not running.
+    return {pid: command for pid in sorted(pids) if "simulators" in (command := _command(pid))}
+
+
+def _orphans() -> set[int]:
+    """Processes of this test session that have lost their parent: they carry its mark in their environment."""
+    found = set()
+    for entry in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if RUN_MARK.encode() in entry.read_bytes().split(b"\0"):
+                found.add(int(entry.parent.name))
+        except OSError:
+            continue
+    return found - {os.getpid()}
+
+
+def _end(left: dict[int, str]) -> str:
+    for pid in left:
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            continue
+    return "simulators left running: " + "; ".join(f"{pid} {command}" for pid, command in left.items())
+
+
+@pytest.fixture(autouse=True)
+def no_simulator_left() -> Iterator[None]:
+    """Fail a test after which a simulator that it started still runs, and end that simulator."""
+    before = _descendants(os.getpid())
+    yield
+    if left := _simulators(_descendants(os.getpid()) - before):
+        pytest.fail(_end(left), pytrace=False)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_orphan_left() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(*RUN_MARK.split("="))
+        yield
+    if left := _simulators(_orphans()):
+        pytest.fail("after all tests, " + _end(left), pytrace=False)
