@@ -133,7 +133,9 @@ class ModbusLink:
                 task.cancel()  # nothing was sent yet: then nothing shall be
             raise
 
-    def _finished(self, _task: asyncio.Task[tuple[int, ...]]) -> None:
+    def _finished(self, task: asyncio.Task[tuple[int, ...]]) -> None:
+        if not task.cancelled():
+            task.exception()  # marks it as seen: a cancelled caller is no longer there to see it
         self._task = None
         self._lock.release()
 
@@ -158,11 +160,12 @@ class ModbusLink:
                     return await client.read_holding_registers(request.address, count=request.count, device_id=unit)
                 return await client.write_registers(request.address, list(request.values), device_id=unit)
         except TimeoutError:
+            error = self._why(request)
             self._drop()
-            raise self._why(request) from None
-        except ModbusException as error:
+            raise error from None
+        except ModbusException as trouble:
             self._drop()
-            raise LinkDown(self.name, str(request), str(error), "device and network on?") from error
+            raise LinkDown(self.name, str(request), str(trouble), "device and network on?") from trouble
         finally:
             self._deadline = None
 
