@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from models.machine import AXES, Machine
+from service.config_schema import MachineFile
 from service.devices.session import DeviceUrls
 
 
@@ -29,6 +30,7 @@ class Site:
     doc: dict[str, Any]
     urls: DeviceUrls
     limits: TableLimits = field(default_factory=TableLimits)
+    max_feed_mm_min: float = 6000.0
 
 
 def machine_from_doc(doc: dict[str, Any]) -> Machine:
@@ -62,3 +64,20 @@ def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[s
         "pivots_mm": {a: [float(v) for v in machine.pivots_mm[k]] for k, a in enumerate(AXES)},
         "tool_mm": [float(v) for v in machine.tool_mm],
     }
+
+
+def site_of(config: MachineFile) -> Site:
+    """What the machine file says, in the units and types of the workflows."""
+    pivots = {a: list(getattr(config.pivots_mm, a)) for a in AXES}
+    strokes = {a: list(getattr(config.stroke_mm, a)) for a in AXES}
+    doc = {"name": config.name, "chain": config.chain, "vertical_axis": config.vertical_axis, "stroke_mm": strokes, "pivots_mm": pivots}
+    doc["tool_mm"] = list(config.tool_mm)
+    devices, limits = config.devices, config.limits
+    return Site(
+        config.name,
+        machine_from_doc(doc),
+        doc,
+        DeviceUrls(devices.cnc, devices.ballbar, devices.laser, devices.fixture),
+        TableLimits(limits.table_value_um * 1e-3, limits.table_change_um * 1e-3, limits.table_step_um * 1e-3),
+        limits.feed_mm_min,
+    )

@@ -83,6 +83,19 @@ def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> 
     return DryRun(plan.label, plan.test, seconds, length, (lo[0], lo[1], lo[2]), (hi[0], hi[1], hi[2]), readings)
 
 
-def dry_run_campaign(machine: Machine, plan: CampaignPlan) -> tuple[DryRun, ...]:
-    """Check all tests of a campaign; the first that leaves the strokes raises."""
+def dry_run_campaign(machine: Machine, plan: CampaignPlan, max_feed_mm_min: float = math.inf) -> tuple[DryRun, ...]:
+    """Check all tests of a campaign; the first that leaves the strokes or is faster than the machine file allows raises.
+
+    Raises
+    ------
+    StrokeError
+        Which test, what it would do, what is allowed. Nothing has moved.
+    """
+    for test in plan.tests:
+        feed = max((s.feed_mm_min for s in test.steps if isinstance(s, MoveTo | RecordPath)), default=0.0)
+        if feed > max_feed_mm_min:
+            raise StrokeError(
+                f"test {test.label}: would move at {feed:g} mm/min, allowed are {max_feed_mm_min:g}",
+                "lower the recipe's feed or raise feed_mm_min under [limits]; nothing has moved",
+            )
     return tuple(dry_run(machine, test) for test in plan.tests)

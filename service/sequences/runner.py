@@ -127,7 +127,7 @@ class Runner:
         laser = self._s.need_laser()
         before = await laser.read()
         reading = await laser.read(after_count=before.sample_count)  # a sample that began after the axes had settled
-        recorder.add_record(
+        await recorder.add_record(
             {
                 "host_s": reading.host_s,
                 "ctrl_us": status.ctrl_us,
@@ -146,15 +146,22 @@ class Runner:
         controller = self._s.controller
         await controller.load_path(step.points_mm)
         finished = asyncio.Event()
-        try:
-            async with self._s.need_ballbar().stream(step.rate_hz) as batches, asyncio.TaskGroup() as group:
-                group.create_task(_pump(batches, recorder, finished))
-                await controller.start_path(feed_mm_min=step.feed_mm_min)
-                status = await _watch(controller)
-                finished.set()
-        except* (DriverError, UnsafeToMove, MeasurementFault) as errors:
-            raise errors.exceptions[0] from None
+        async with self._s.need_ballbar().stream(step.rate_hz) as batches:
+            try:
+                async with asyncio.TaskGroup() as group:
+                    group.create_task(_pump(batches, recorder, finished))
+                    await controller.start_path(feed_mm_min=step.feed_mm_min)
+                    status = await _watch(controller)
+                    finished.set()
+            except BaseExceptionGroup as errors:
+                raise _first(errors) from None  # one cause for one person; the others follow from it
         return {"path_start_us": status.path_start_us, "path_end_us": status.path_end_us}
+
+
+def _first(error: BaseException) -> BaseException:
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error
 
 
 async def _watch(controller: Controller) -> ControllerStatus:
@@ -181,7 +188,7 @@ async def _pump(batches: AsyncIterator[BarBatch], recorder: Recorder, finished: 
     """Record until the path has ended and one sample without the sync level has been seen."""
     bad = 0
     async for batch in batches:
-        recorder.add_bar(batch)
+        await recorder.add_bar(batch)
         for sample in batch.samples:
             on_path = bool(sample.status & SYNC)
             bad = bad + 1 if on_path and sample.status & BAD_BITS else 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
 
 
 def demo_json(result: DemoResult) -> dict[str, Any]:
-    """What `abbe demo --json` prints: sealed-truth figures before and after, the bound of nine tables, measured figures with uncertainty."""
+    """What `abbe demo --json` prints: sealed-truth figures, the bound of nine tables, measured figures with uncertainty."""
     before, after = result.truth_before, result.truth_after
     out: dict[str, Any] = {"format": "abbe-demo/1", "seed": result.seed, "speed": result.speed}
     out |= {key: {"before": before[key], "after": after[key]} for key in TRUTH_KEYS}
@@ -65,10 +65,9 @@ def summary_rows(result: DemoResult) -> list[SummaryRow]:
         title = _title(name)
         rows.append(SummaryRow(title, "µm", v, a, v / a if a > 0 else None, u, ua, "measured"))
     for key, title in zip(TRUTH_KEYS, ("Largest body diagonal", "Volumetric error, rms", "Volumetric error, maximum"), strict=True):
-        v, a = result.truth_before.get(key), result.truth_after.get(key)
-        if v is not None and a is not None:
-            source: Literal["measured", "sealed truth of the simulator"] = "sealed truth of the simulator"
-            rows.append(SummaryRow(title, "µm", v, a, v / a if a else None, source=source))
+        if key in result.truth_before and key in result.truth_after:
+            old, new = float(result.truth_before[key]), float(result.truth_after[key])
+            rows.append(SummaryRow(title, "µm", old, new, old / new if new else None, source="sealed truth of the simulator"))
     return rows
 
 
@@ -155,7 +154,7 @@ def demo_report(result: DemoResult) -> DemoReport:
     ]
     if joint is not None and joint.estimate.variance_factor > 1.5:
         warnings.append(
-            f"The residuals are larger than the stated noise (variance factor {joint.estimate.variance_factor:.1f}); uncertainties were widened."
+            f"Residuals exceed the stated noise (variance factor {joint.estimate.variance_factor:.1f}); uncertainties were widened."
         )
     kept = decision is not None and decision.keep
     return DemoReport(

@@ -80,7 +80,7 @@ async def measure(
         The run in hand is closed as failed, with the reason; earlier runs stay.
     """
     clock = clock or SystemClock()
-    dry = dry_run_campaign(site.machine, plan)
+    dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     campaign_id, ctrl0_us = await start_campaign(session, store, site, plan.name)
     meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock)
     run_ids = []

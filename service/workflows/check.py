@@ -1,0 +1,104 @@
+"""The unattended check: measure a recipe, judge its figures against the machine file's limits with their uncertainty."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from models.machine import Machine
+from service.clock import Clock, SystemClock
+from service.config_schema import MachineFile
+from service.devices.session import open_session
+from service.errors import ConfigError
+from service.events import ProgressSink
+from service.runs.columns import load_run
+from service.sequences.campaigns import quick_check, verification
+from service.sequences.steps import CampaignPlan
+from service.site import site_of
+from service.storage.store import Store
+from service.workflows.measure import measure
+from service.workflows.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
+
+RECIPES: dict[str, Callable[[Machine], CampaignPlan]] = {"quick-check": quick_check, "verification": verification}
+MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """What a check found. ``uncertainties`` are expanded (k = 2); figures in um by name."""
+
+    verdict: Verdict
+    values: dict[str, float]
+    uncertainties: dict[str, float]
+    limits: dict[str, float]
+    run_labels: list[str]
+    campaign: str
+    started_utc: datetime
+    duration_s: float
+    text: str
+
+
+def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
+    """The plan of a shipped recipe.
+
+    Raises
+    ------
+    ConfigError
+        There is no such recipe; the message lists those there are.
+    """
+    if name not in RECIPES:
+        raise ConfigError(f"there is no recipe {name!r}", f"use one of: {', '.join(sorted(RECIPES))}")
+    return RECIPES[name](machine)
+
+
+async def run_check(config: MachineFile, store: Store, recipe: str, progress: ProgressSink, clock: Clock | None = None) -> CheckResult:
+    """Open the devices, measure the recipe, close them, judge.
+
+    Raises
+    ------
+    AbbeError, DriverError
+        One cause, one remedy; the run in hand is closed as failed and the axes are stopped.
+    """
+    clock = clock or SystemClock()
+    started, start_s = clock.utc(), clock.monotonic_s()
+    site = site_of(config)
+    plan = recipe_plan(recipe, site.machine)
+    plan = CampaignPlan(f"{plan.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
+    async with open_session(site.urls) as session:
+        run_ids = await measure(session, store, site, plan, progress=progress, clock=clock)
+    runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
+    rows = figure_rows(figures(runs))
+    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
+    verdict = overall([judge(*rows[k], limits[k]) for k in limits if k in rows])
+    text = f"{MARK[verdict]}: " + ", ".join(f"{_name(k)} {rows[k][0]:.1f} um (limit {limits[k]:g})" for k in limits if k in rows)
+    outside = _outside(runs, config.limits.temperature_c)
+    if outside is not None:
+        verdict = "cannot tell"
+        low, high = config.limits.temperature_c
+        text = f"air temperature {outside:.1f} C is outside of {low:g}..{high:g} C, so the figures cannot be judged; {text}"
+    return CheckResult(
+        verdict,
+        {k: v for k, (v, _) in rows.items()},
+        {k: COVERAGE * u for k, (_, u) in rows.items()},
+        {k: v for k, v in limits.items() if k in rows},
+        [r["run_id"] for r in runs],
+        plan.name,
+        started,
+        clock.monotonic_s() - start_s,
+        text,
+    )
+
+
+def _name(key: str) -> str:
+    return {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}[key]
+
+
+def _outside(runs: list[dict[str, Any]], window: tuple[float, float]) -> float | None:
+    """The air temperature farthest outside of the window, None if all are inside or none was measured."""
+    low, high = window
+    seen = [float(t) for r in runs for t in r["columns"].get("temp_air_C", [])]
+    worst = max(seen, key=lambda t: max(low - t, t - high), default=None)
+    return worst if worst is not None and not low <= worst <= high else None
