@@ -71,7 +71,7 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
 
 
 def _start_s(start: Doc, end: Doc | None) -> float:
-    for document, key in ((end, "path_start_us"), (start, "path_start_us"), (start, "ctrl_us")):
+    for document, key in ((end, "path_start_us"), (start, "path_start_us"), (start.get("clock"), "ctrl_us")):
         if document and document.get(key) is not None:
             return float(document[key] - start["ctrl0_us"]) * 1e-6
     return float(start["setup"].get("t_set_s", 0.0))
@@ -101,7 +101,7 @@ def _check_durations(device_us: npt.NDArray[np.int64], end: Doc, planned_s: floa
     tolerance_s = DURATION_TOLERANCE * controller_s + 2.0 / rate_hz
     if abs(device_s - controller_s) > tolerance_s:
         raise MeasurementFault(
-            f"feed changed during the run, or its ends were lost: the bar saw {device_s:.3f} s of path, the controller {controller_s:.3f} s",
+            f"feed changed during the run, or its ends were lost: the bar saw {device_s:.3f} s of it, the controller {controller_s:.3f} s",
             "measure the run again with a steady connection and the feed override at 100 %",
         )
     if abs(device_s - planned_s) > tolerance_s:

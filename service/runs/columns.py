@@ -3,7 +3,7 @@
 Start document: ``setup`` and ``machine`` of the exchange format, ``ctrl0_us`` (zero of the campaign clock in controller time), and for
 ball-bar runs ``path`` {``feed_mm_min``, ``direction``, ``points_mm``} and ``rate_hz``. ``points_mm`` begins where the machine stands when
 the path starts. End document of a ball-bar run: ``path_start_us``, ``path_end_us`` (controller time). For a run without end document the
-path's start is taken from the start document: ``path_start_us``, else ``ctrl_us``, else the setup's ``t_set_s``.
+path's start is taken from the start document: ``path_start_us``, else ``clock.ctrl_us``, else the setup's ``t_set_s``.
 """
 
 from __future__ import annotations

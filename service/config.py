@@ -1,0 +1,174 @@
+"""The machine file: read, checked, overridden by the environment; every mistake is one line that names the key.
+
+Order of precedence: environment (``ABBE_WEB__PORT=9000`` is ``port`` in ``[web]``), then the file, then the defaults.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict
+from pydantic_settings.exceptions import SettingsError
+
+from service.config_schema import MachineFile
+from service.errors import ConfigError
+from service.explain import expected, nearest, where
+from service.storage.engine import mask_secrets, resolve_url
+
+PREFIX = "ABBE_"
+Origin = Literal["default", "file", "environment"]
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """A machine file with everything that decides its values.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    machine : MachineFile
+        Effective values; the database URL of a SQLite file is absolute.
+    origins : dict
+        Dotted key to where its value comes from.
+    """
+
+    path: Path
+    machine: MachineFile
+    origins: dict[str, Origin]
+
+    @property
+    def database_url(self) -> str:
+        """``[store] url``; a relative SQLite file lies beside the machine file."""
+        return resolve_url(self.machine.store.url, self.path.resolve().parent)
+
+    def values(self) -> list[tuple[str, Any, Origin]]:
+        """List effective values as (dotted key, value with secrets masked, origin), in the order of the documentation."""
+        found = _leaves(self.machine.model_dump(mode="json"))
+        return [(key, mask_secrets(value) if isinstance(value, str) else value, self.origins.get(key, "default")) for key, value in found]
+
+
+class _Environment(MachineFile, BaseSettings):
+    """Tells pydantic-settings which variables there can be; it is never filled itself."""
+
+    model_config = SettingsConfigDict(env_prefix=PREFIX, env_nested_delimiter="__", extra="forbid")
+
+
+def load_machine(path: Path | str) -> Loaded:
+    """Read and check a machine file.
+
+    Parameters
+    ----------
+    path : Path or str
+        The TOML file.
+
+    Returns
+    -------
+    Loaded
+        Effective values and where they come from.
+
+    Raises
+    ------
+    ConfigError
+        File, key, and what is expected there.
+    """
+    path = Path(path)
+    from_file = _read(path)
+    from_environment = _overrides()
+    merged = _merged(from_file, from_environment)
+    try:
+        # By way of JSON: there strict means that text is no number, while a list still is a tuple.
+        machine = MachineFile.model_validate_json(json.dumps(merged, default=str), strict=True)
+    except ValidationError as err:
+        raise _config_error(path, err.errors(), from_environment) from None
+    origins: dict[str, Origin] = dict.fromkeys((key for key, _ in _leaves(from_file)), "file")
+    origins |= dict.fromkeys((key for key, _ in _leaves(from_environment)), "environment")
+    return Loaded(path, machine, origins)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"machine file {path} does not exist", "give the path of a machine file, e.g. deploy/machine.toml") from None
+    except OSError as err:
+        raise ConfigError(f"machine file {path} cannot be read: {err.strerror}", "give a readable TOML file") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"machine file {path} is not UTF-8 text", "save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as err:
+        raise ConfigError(f"{path}: not valid TOML: {err}", "correct this line") from None
+
+
+def _overrides() -> dict[str, Any]:
+    try:
+        return {key: _typed(value) for key, value in EnvSettingsSource(_Environment)().items()}
+    except SettingsError as err:
+        raise ConfigError(
+            f"environment: {mask_secrets(str(err))}", "lists and tables are written as JSON, e.g. ABBE_TOOL_MM='[0,0,120]'"
+        ) from None
+
+
+def _typed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _typed(inner) for key, inner in value.items()}
+    if isinstance(value, str):
+        try:
+            return json.loads(value)
+        except ValueError:
+            return value
+    return value
+
+
+def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    both = {key: _merged(under[key], over[key]) for key in under if isinstance(under.get(key), dict) and isinstance(over.get(key), dict)}
+    return {**under, **over, **both}
+
+
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for number, inner in enumerate(value, start=1):
+                yield from _leaves(inner, f"{prefix}{key}[{number}].")
+        else:
+            yield prefix + key, value
+
+
+def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[str, Any]) -> ConfigError:
+    first, more = errors[0], len(errors) - 1
+    location = first["loc"]
+    source = f"{PREFIX} environment" if _holds(environment, location) else str(path)
+    tail = f" (and {more} more)" if more else ""
+    key = where(location)
+    if first["type"] == "extra_forbidden":
+        hint = nearest(str(location[-1]), _siblings(location))
+        return ConfigError(f"{source}: unknown key {key!r}{tail}", hint)
+    if first["type"] == "missing":
+        return ConfigError(f"{source}: key {key!r} is missing{tail}", f"add {location[-1]} = ...")
+    return ConfigError(mask_secrets(f"{source}: {key}: {expected(first)}{tail}"), "correct it; `abbe schema` describes every key")
+
+
+def _holds(values: Any, location: tuple[int | str, ...]) -> bool:
+    for part in location:
+        if not isinstance(values, dict) or part not in values:
+            return False
+        values = values[part]
+    return bool(location)
+
+
+def _siblings(location: tuple[int | str, ...]) -> list[str]:
+    model: type[BaseModel] = MachineFile
+    for part in location[:-1]:
+        field = model.model_fields.get(str(part))
+        if field is not None:
+            candidates = [field.annotation, *get_args(field.annotation)]
+            model = next(one for one in candidates if isinstance(one, type) and issubclass(one, BaseModel))
+    return list(model.model_fields)

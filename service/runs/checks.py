@@ -1,0 +1,196 @@
+"""Checks of exchange files. Every mistake is one FileFormatError: file, key, row, and what was expected."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from pydantic import BaseModel, ValidationError
+
+from service.errors import FileFormatError
+from service.explain import expected, shown, where
+from service.runs.formats import Columns, RunFile, Setup
+from service.storage.records import Doc
+
+UNITS = frozenset(
+    [
+        "mm",
+        "um",
+        "nm",
+        "m",
+        "s",
+        "ms",
+        "us",
+        "h",
+        "rad",
+        "urad",
+        "mrad",
+        "deg",
+        "C",
+        "K",
+        "Pa",
+        "hPa",
+        "mm_min",
+        "mm_s",
+        "min_1",
+        "rpm",
+        "Hz",
+        "kHz",
+        "N",
+        "kN",
+        "Nm",
+        "V",
+        "mV",
+        "A",
+        "W",
+        "kW",
+        "percent",
+        "permille",
+        "ppm",
+        "bits",
+    ]
+)
+PLAIN = frozenset(["seq", "count", "no", "index", "id", "flag", "ratio", "status", "quality", "valid"])
+"""Last parts of names of columns that have no unit."""
+MAX_BYTES = 512 * 2**20
+
+
+def read_json(path: Path) -> Doc:
+    """Read a JSON object from a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict
+        Its content, keys in order.
+
+    Raises
+    ------
+    FileFormatError
+        If it is missing, no UTF-8, no JSON, or holds NaN.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise FileFormatError(f"{path}: larger than {MAX_BYTES >> 20} MiB", "expected a run or campaign file")
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileFormatError(f"{path}: no such file", "give a folder with campaign.json and its run files") from None
+    except OSError as err:
+        raise FileFormatError(f"{path}: cannot be read: {err.strerror}", "check its access rights") from None
+    except UnicodeDecodeError as err:
+        raise FileFormatError(f"{path}: byte {err.start} is not UTF-8", "save the file as UTF-8") from None
+    except json.JSONDecodeError as err:
+        raise FileFormatError(f"{path}: line {err.lineno}, column {err.colno}: not JSON: {err.msg}", "correct the file") from None
+    except RecursionError:
+        raise FileFormatError(f"{path}: nested too deeply", "expected a run or campaign file") from None
+    if not isinstance(value, dict):
+        raise FileFormatError(f"{path}: expected a JSON object, got {shown(value)}", "see docs/schemas")
+    return value
+
+
+def check(path: Path, document: Doc, model: type[BaseModel]) -> None:
+    """Check a document against one of the formats.
+
+    Parameters
+    ----------
+    path : Path
+        Named in errors.
+    document : dict
+        The document; it is not changed.
+    model : type
+        A model of service.runs.formats.
+
+    Raises
+    ------
+    FileFormatError
+        For the first mistake.
+    """
+    try:
+        # By way of JSON so that a list is a tuple, as in the file; NaN gets through json.dumps and is refused by the model.
+        model.model_validate_json(json.dumps(document))
+    except ValidationError as err:
+        raise _format_error(path, err) from None
+
+
+def check_run(path: Path, document: Doc) -> None:
+    """Check a run file, its columns row by row.
+
+    Parameters
+    ----------
+    path : Path
+        Named in errors.
+    document : dict
+        The document.
+
+    Raises
+    ------
+    FileFormatError
+        For the first mistake.
+    """
+    for part, model in (("setup", Setup), ("columns", Columns)):
+        keys = document.get(part)
+        for key in keys if isinstance(keys, dict) else ():
+            _check_unit(path, f"{part}.{key}", key, model, units_needed=part == "columns")
+    check(path, document, RunFile)
+    columns = {key: values for key, values in document["columns"].items() if values is not None}
+    length = len(columns["t_s"])
+    for key, values in columns.items():
+        if len(values) != length:
+            raise FileFormatError(f"{path}: columns.{key}: expected {length} rows as in t_s, got {len(values)}", "correct the file")
+    times = columns["t_s"]
+    for row in range(1, length):
+        if times[row] < times[row - 1]:
+            raise FileFormatError(
+                f"{path}: columns.t_s, row {row + 1}: expected at least {times[row - 1]}, got {times[row]}", "time never runs back"
+            )
+
+
+def _check_unit(path: Path, place: str, key: str, model: type[BaseModel], *, units_needed: bool) -> None:
+    if key in model.model_fields:
+        return
+    for known in model.model_fields:
+        stem = _stem(known)
+        if stem != known and (key == stem or (key.startswith(stem + "_") and _is_unit_like(key[len(stem) + 1 :]))):
+            raise FileFormatError(
+                f"{path}: {place}: unknown unit suffix in {key!r}, expected {known!r}", "convert the values and rename the key"
+            )
+    last = key.rpartition("_")[2]
+    if units_needed and last not in UNITS | PLAIN and not key.endswith("_mm_min"):
+        raise FileFormatError(
+            f"{path}: {place}: unknown unit suffix {last!r}, expected a unit, e.g. _mm, _s, _C, _Pa, _percent", "rename the column"
+        )
+
+
+def _stem(key: str) -> str:
+    for unit in sorted(UNITS, key=len, reverse=True):
+        if key.endswith("_" + unit):
+            return key.removesuffix("_" + unit)
+    return key
+
+
+def _is_unit_like(text: str) -> bool:
+    return "_" not in text and len(text) <= 6 and text not in PLAIN
+
+
+def _format_error(path: Path, err: ValidationError) -> FileFormatError:
+    errors = err.errors()
+    # Of a union ("a list or nothing") pydantic reports every branch; the deepest one is what the writer meant.
+    first = max((one for one in errors if one["loc"][:2] == errors[0]["loc"][:2]), key=lambda one: len(one["loc"]))
+    location = tuple(
+        part for part in first["loc"] if not (isinstance(part, str) and (part.startswith(("list[", "tuple[")) or part in _TYPE_TAGS))
+    )
+    tail = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    if first["type"] == "missing":
+        return FileFormatError(f"{path}: key {where(location)!r} is missing{tail}", "see docs/schemas")
+    place = where(location)
+    if location[:1] == ("columns",) and len(location) == 3 and isinstance(location[2], int):
+        place = f"columns.{location[1]}, row {location[2] + 1}"
+    prefix = f"{path}: {place}: " if place else f"{path}: "
+    return FileFormatError(prefix + expected(first) + tail, "correct the file")
+
+
+_TYPE_TAGS = frozenset({"float", "int", "str", "polynomial", "table", "function-after[check_interval(), tuple[float, float]]"})

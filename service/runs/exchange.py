@@ -1,0 +1,203 @@
+"""Campaign folders in and out: read everything, check everything, then store everything, or nothing; write aside, then rename."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.errors import FileFormatError
+from service.runs.checks import check, check_run, read_json
+from service.runs.codec import JSON_CODEC, encode_json
+from service.runs.columns import pack_columns, run_document
+from service.runs.formats import CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
+from service.storage.records import CampaignRecord, Doc, ImportedRun, RunRecord
+from service.storage.store import Store
+
+CAMPAIGN_FILE = "campaign.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Folder:
+    """A campaign folder that was read and checked.
+
+    Parameters
+    ----------
+    campaign : dict
+        Content of ``campaign.json``.
+    runs : list of dict
+        Content of the run files, in the order of the campaign.
+    errors : dict or None
+        Content of the errors file that ``current_model`` names.
+    """
+
+    campaign: Doc
+    runs: list[Doc]
+    errors: Doc | None
+
+
+def read_folder(folder: Path) -> Folder:
+    """Read and check a campaign folder.
+
+    Parameters
+    ----------
+    folder : Path
+        With ``campaign.json`` and its run files.
+
+    Returns
+    -------
+    Folder
+        Documents with everything that the files hold.
+
+    Raises
+    ------
+    FileFormatError
+        For the first mistake in any file.
+    """
+    head = folder / CAMPAIGN_FILE
+    campaign = read_json(head)
+    check(head, campaign, CampaignFile)
+    runs = []
+    for number, entry in enumerate(campaign["runs"], start=1):
+        path = folder / entry["file"]
+        run = read_json(path)
+        check_run(path, run)
+        for key, wanted in (
+            ("run_id", entry["run_id"]),
+            ("test", entry["test"]),
+            ("role", entry["role"]),
+            ("campaign", campaign["campaign"]),
+        ):
+            if run[key] != wanted:
+                raise FileFormatError(f"{path}: {key}: expected {wanted!r} as in {CAMPAIGN_FILE}, runs[{number}], got {run[key]!r}")
+        runs.append(run)
+    errors = None
+    errors_file = campaign["current_model"].get("errors")
+    if errors_file is not None:
+        path = folder / errors_file
+        errors = read_json(path)
+        check(path, errors, ErrorsFile)
+    return Folder(campaign, runs, errors)
+
+
+def import_folder(store: Store, folder: Path) -> int:
+    """Store a campaign folder, all of it or, after any mistake, nothing.
+
+    Parameters
+    ----------
+    store : Store
+        Where to.
+    folder : Path
+        With ``campaign.json`` and its run files.
+
+    Returns
+    -------
+    int
+        Id of the campaign.
+
+    Raises
+    ------
+    FileFormatError
+        For the first mistake in any file.
+    StoreError
+        If a campaign of this name is there already.
+    """
+    content = read_folder(folder)
+    campaign, machine = content.campaign, content.campaign["machine"]
+    imported = [_imported(entry, run) for entry, run in zip(campaign["runs"], content.runs, strict=True)]
+    doc = {"imported": campaign, "errors": content.errors}
+    return store.import_campaign((machine.get("name") or campaign["campaign"], machine), (campaign["campaign"], doc), imported)
+
+
+def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
+    """Write a campaign as a folder. It appears complete or not at all.
+
+    Parameters
+    ----------
+    store : Store
+        Where from.
+    name_or_id : str or int
+        Campaign.
+    target : Path
+        Folder to make; an empty one may exist.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    FileFormatError
+        If the target exists and is not an empty folder, or cannot be written.
+    StoreError
+        If there is no such campaign, or its samples are damaged.
+    """
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise FileFormatError(f"{target} exists and is not an empty folder: nothing was written", "give a new folder")
+    record = store.campaign(name_or_id)
+    runs = store.runs(record.id)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as err:
+        raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "give a folder that may be written") from None
+    try:
+        aside.chmod(0o755)  # mkdtemp makes private folders, this one is for others
+        _write_folder(store, record, runs, aside)
+        if target.exists():
+            target.rmdir()
+        aside.rename(target)
+    except OSError as err:
+        raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "free disk space or give another folder") from None
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+    return target
+
+
+def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path) -> None:
+    entries, setups = [], dict[str, Doc]()
+    for run in runs:
+        document = run_document(run, store.chunks(run.id))
+        entry = run.start_doc.get("entry") or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
+        entries.append(entry)
+        setup = document["setup"]
+        setups.setdefault(setup["setup_id"], {"kind": run.test.partition("_")[0], "t_set_s": setup["t_set_s"]})
+        _write_json(folder / entry["file"], document)
+    _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
+    if record.doc.get("errors") is not None:
+        _write_json(folder / record.doc["imported"]["current_model"]["errors"], record.doc["errors"])
+
+
+def _campaign_document(store: Store, record: CampaignRecord, entries: list[Doc], setups: dict[str, Doc]) -> Doc:
+    imported = record.doc.get("imported")
+    if imported is not None:
+        return dict(imported) | {
+            "runs": entries,
+            "setups": setups | imported["setups"] if set(setups) - set(imported["setups"]) else imported["setups"],
+        }
+    base = {"format": CAMPAIGN_FORMAT, "campaign": record.name, "machine": store.machine(record.machine_id).doc}
+    assumed = {"current_model": {"includes": [], "errors": None}, "instruments": {}, "temperature_sensors": False}
+    return base | assumed | record.doc | {"setups": setups, "runs": entries}
+
+
+def _imported(entry: Doc, run: Doc) -> ImportedRun:
+    columns = run["columns"]
+    start_doc = {"setup": run["setup"], "machine": run["machine"], "entry": entry, "imported": run | {"columns": None}}
+    return ImportedRun(
+        run["run_id"], run["test"], run["role"], start_doc, len(columns["t_s"]), JSON_CODEC, encode_json(pack_columns(columns))
+    )
+
+
+def _safe(label: str) -> str:
+    return "".join(one if one.isalnum() or one in "-_." else "_" for one in label)
+
+
+def _write_json(path: Path, document: Doc) -> None:
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        json.dump(document, file, ensure_ascii=False, allow_nan=False)
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,0 +1,187 @@
+"""The exchange formats as pydantic models (run-format.md 2-4). They are also the source of docs/schemas/*.schema.json."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import ConfigDict, Field, model_validator
+
+from service.runs.machine_object import FileObject, MachineObject, Point
+
+RUN_FORMAT = "abbe-run/1"
+CAMPAIGN_FORMAT = "abbe-campaign/1"
+ERRORS_FORMAT = "abbe-errors/1"
+
+Test = Literal["ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear"]
+Role = Literal["identify", "holdout", "sealed"]
+Numbers = list[float]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+FileName = Annotated[str, Field(pattern=r"^[^/\\\x00]+\.json$")]
+"""A plain file of the same folder: a campaign must not reach files elsewhere."""
+
+SETUP_KEYS: dict[str, tuple[str, ...]] = {
+    "ballbar_helix": ("centre_mm", "radius_mm", "turns"),
+    "ballbar_circle": ("centre_mm", "radius_mm", "plane"),
+    "laser_diagonal": ("diagonal", "start_mm", "end_mm", "increment_mm", "steps", "nominal_beam"),
+    "laser_linear": ("axis", "start_mm", "end_mm"),
+}
+"""What ``setup`` must hold besides ``setup_id`` and ``t_set_s``."""
+
+
+class Setup(FileObject):
+    """How the instrument was mounted. The test decides which keys are needed."""
+
+    setup_id: str
+    t_set_s: float
+    centre_mm: Point | None = None
+    radius_mm: float | None = Field(None, gt=0.0)
+    turns: float | None = None
+    plane: Literal["XY", "YZ", "ZX", "XZ", "YX", "ZY"] | None = None
+    length_calibrated: bool | None = None
+    u_length_mm: float | None = Field(None, ge=0.0)
+    tool_mm: Point | None = None
+    diagonal: Literal["ppp", "npp", "pnp", "ppn"] | None = None
+    axis: Literal["X", "Y", "Z"] | None = None
+    start_mm: Point | None = None
+    end_mm: Point | None = None
+    increment_mm: Point | float | None = None
+    steps: int | None = Field(None, gt=0)
+    nominal_beam: Point | None = None
+    order: str | None = None
+
+
+class Columns(FileObject):
+    """Readings, one list a column, all of one length. Further columns carry their unit in the name."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"additionalProperties": {"anyOf": [{"type": "array", "items": {"type": "number"}}, {"type": "null"}]}}
+    )
+    __pydantic_extra__: dict[str, Numbers | None]
+
+    t_s: Numbers
+    x_mm: Numbers
+    y_mm: Numbers
+    z_mm: Numbers
+    feed_mm_min: Numbers
+    direction: list[Literal[1, -1]]
+    deviation_mm: Numbers | None
+    temp_x_C: Numbers | None = None  # noqa: N815 - names of the format
+    temp_y_C: Numbers | None = None  # noqa: N815
+    temp_z_C: Numbers | None = None  # noqa: N815
+    temp_spindle_C: Numbers | None = None  # noqa: N815
+    temp_air_C: Numbers | None = None  # noqa: N815
+    pressure_air_Pa: Numbers | None = None  # noqa: N815
+    valid: list[Literal[0, 1]] | None = None
+
+
+class RunFile(FileObject):
+    """One measured sequence (``abbe-run/1``)."""
+
+    format: Literal["abbe-run/1"]
+    campaign: Name
+    run_id: Name
+    test: Test
+    role: Role
+    machine: MachineObject
+    setup: Setup
+    columns: Columns
+
+    @model_validator(mode="after")
+    def _test_decides(self) -> Self:
+        for key in SETUP_KEYS[self.test]:
+            if getattr(self.setup, key) is None:
+                raise ValueError(f"key 'setup.{key}' is missing, expected for a run of test {self.test!r}")
+        if self.columns.deviation_mm is None and self.role != "sealed":
+            raise ValueError(
+                f"columns.deviation_mm: expected a list of numbers, got null (only a run of role 'sealed' may, this is {self.role!r})"
+            )
+        return self
+
+
+class CurrentModel(FileObject):
+    """What the present simulation of the machine knows."""
+
+    includes: list[str]
+    errors: FileName | None = None
+
+
+class CampaignSetup(FileObject):
+    """One mounting that several runs can share."""
+
+    kind: str
+    t_set_s: float
+
+
+class RunEntry(FileObject):
+    """One run of the campaign and its file."""
+
+    run_id: Name
+    test: Test
+    role: Role
+    file: FileName
+
+
+class CampaignFile(FileObject):
+    """Head of a campaign folder (``abbe-campaign/1``)."""
+
+    format: Literal["abbe-campaign/1"]
+    campaign: Name
+    machine: MachineObject
+    current_model: CurrentModel
+    instruments: dict[str, FileObject]
+    setups: dict[str, CampaignSetup]
+    temperature_sensors: bool
+    runs: list[RunEntry]
+
+    @model_validator(mode="after")
+    def _all_differ(self) -> Self:
+        for what, names in (("run_id", [run.run_id for run in self.runs]), ("file", [run.file for run in self.runs])):
+            twice = next((name for name in names if names.count(name) > 1), None)
+            if twice is not None:
+                raise ValueError(f"runs: {what} {twice!r} stands there twice, expected different ones")
+        if "campaign.json" in {run.file for run in self.runs} | {self.current_model.errors}:
+            raise ValueError("runs: a file is named 'campaign.json', expected another name")
+        return self
+
+
+class Polynomial(FileObject):
+    """value(x) = sum c_k (x - origin)^k, mm or rad."""
+
+    kind: Literal["polynomial"]
+    coefficients: Numbers
+    origin_mm: float
+
+
+class Tabulated(FileObject):
+    """Values at positions."""
+
+    kind: Literal["table"]
+    position_mm: Numbers
+    value: Numbers
+    interpolation: Literal["linear"]
+
+    @model_validator(mode="after")
+    def _equally_long(self) -> Self:
+        if len(self.position_mm) != len(self.value):
+            raise ValueError(f"expected as many values as positions, got {len(self.value)} and {len(self.position_mm)}")
+        return self
+
+
+class Squareness(FileObject):
+    """Squareness of the axes, rad."""
+
+    C0Y: float
+    B0Z: float
+    A0Z: float
+
+
+class ErrorsFile(FileObject):
+    """A machine's error functions (``abbe-errors/1``). Keys of ``motions``: component, or component@reverse."""
+
+    format: Literal["abbe-errors/1"]
+    squareness_rad: Squareness
+    motions: dict[
+        Annotated[str, Field(pattern="^E[XYZABC][XYZ](@reverse)?$")], Annotated[Polynomial | Tabulated, Field(discriminator="kind")]
+    ]
+    covariance: FileObject | None = None
+    not_observable: list[FileObject] = Field(default_factory=list)
