@@ -152,8 +152,8 @@ def _check_steps(kind: int, step: list[int]) -> None:
 
 
 def _counts(value_mm: float, what: str) -> int:
-    exact = value_mm * _PER_MM if math.isfinite(value_mm) else math.nan
-    if not abs(exact) < 1 << 31:
+    exact = value_mm * _PER_MM if math.isfinite(value_mm) else math.inf
+    if not -(1 << 31) - 0.5 < exact < (1 << 31) - 0.5:
         raise TableCodecError(f"grid {what} {value_mm} mm is not a number within +-21 m")
     if abs(exact - round(exact)) > _EXACT:
         raise TableCodecError(f"grid {what} {value_mm} mm is no multiple of {GRID_NM} nm; quantise the grid before computing the table")
