@@ -131,6 +131,15 @@ class Publisher:
         )
 
     async def _publish(self, client: aiomqtt.Client) -> None:
+        try:
+            await self._tell(client)
+        finally:
+            # Also when we are cancelled: aiomqtt then says goodbye properly, and the broker would not send the last will.
+            farewell = {"state": "offline", "since_utc": self._clock.utc().isoformat()}
+            with suppress(aiomqtt.MqttError):
+                await client.publish(self._topics.state, self._state_payload(farewell), qos=1, retain=True, timeout=FAREWELL_S)
+
+    async def _tell(self, client: aiomqtt.Client) -> None:
         told: dict[str, Any] | None = None
         while not self._stopping.is_set():
             self._wake.clear()  # before looking: what is put in while we look wakes us again
@@ -148,8 +157,6 @@ class Publisher:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(LOOK_S):
                         await self._wake.wait()
-        farewell = {"state": "offline", "since_utc": self._clock.utc().isoformat()}
-        await client.publish(self._topics.state, self._state_payload(farewell), qos=1, retain=True, timeout=FAREWELL_S)
 
     def _connected(self) -> None:
         self._on_change(True)

@@ -47,8 +47,9 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
 
 
 def figures(past: Sequence[Verification]) -> list[str]:
-    """Return the figures worth a column, in the order in which checks name them."""
-    return list(dict.fromkeys(key for check in past for key in check.values))[:SHOWN_FIGURES]
+    """Return the figures worth a column and a plot: those that are judged, or, if none is, the first few."""
+    judged = dict.fromkeys(key for check in past for key in check.values if check.limits.get(key) is not None)
+    return list(judged or dict.fromkeys(key for check in past for key in check.values))[:SHOWN_FIGURES]
 
 
 def trends(past: Sequence[Verification], zone: tzinfo) -> list[Markup]:

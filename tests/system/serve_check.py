@@ -1,0 +1,68 @@
+"""The service with a check that needs no devices: ``python serve_check.py CONFIG.json``. Run as a process by the tests beside it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+from service.cli.serve import configure_logs
+from service.events import Progress, ProgressSink
+from service.mqtt.broker import parse
+from service.mqtt.topics import Topics
+from service.scheduler.slots import Schedule
+from service.serve import Setup, serve
+
+
+@dataclass(frozen=True)
+class Result:
+    verdict: str = "pass"
+    values: Mapping[str, float] = field(default_factory=lambda: {"body_diagonal_um": 11.8, "helix_rms_um": 1.4})
+    uncertainties: Mapping[str, float] = field(default_factory=lambda: {"body_diagonal_um": 1.1, "helix_rms_um": 0.2})
+    limits: Mapping[str, float] = field(default_factory=lambda: {"body_diagonal_um": 20.0, "helix_rms_um": 5.0})
+    run_labels: tuple[str, ...] = ("helix-1",)
+    campaign: str = "check-1"
+    started_utc: datetime = field(default_factory=lambda: datetime.now(UTC))
+    duration_s: float = 0.2
+    text: str = "Every figure lies inside its limit."
+
+
+async def check(recipe: str, progress: ProgressSink) -> Result:
+    """``quick``: a moment. ``endless``: until cancelled, and then it says on stdout that it held the motion."""
+    progress(Progress("helix", 1, 2, 0.1, "revolution 1 of 2"))
+    if recipe == "endless":
+        try:
+            await asyncio.Event().wait()
+        finally:
+            print("held", flush=True)
+    return Result()
+
+
+def main() -> int:
+    given = json.loads(Path(sys.argv[1]).read_text())
+    configure_logs()
+    schedules = tuple(Schedule(name, cron, "UTC", recipe) for name, cron, recipe in given["schedules"])
+    broker = parse(given["mqtt"]) if given.get("mqtt") else None
+    topics = Topics("plant/abbe", "mill-7")
+    return serve(
+        Setup(
+            "mill-7",
+            {"name": "mill-7"},
+            {"laser": "modbus+tcp://127.0.0.1:5021"},
+            schedules,
+            given["store"],
+            broker,
+            topics,
+            "127.0.0.1",
+            given["port"],
+            lambda _: check,
+        )
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
