@@ -66,14 +66,14 @@ def no_task_left(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 async def _unfinished() -> list[str]:
-    me = asyncio.current_task()
-    tasks: list[asyncio.Task[Any]] = []
-    for _ in range(5):  # whoever was cancelled in the last line of a test needs a turn to end
-        tasks = [t for t in asyncio.all_tasks() if t is not me and not t.done()]
-        if not tasks:
-            return []
-        await asyncio.sleep(0)
-    names = [f"{t.get_name()} ({getattr(t.get_coro(), '__qualname__', t.get_coro())})" for t in tasks]
+    tasks = asyncio.all_tasks() - {asyncio.current_task()}
+    if not tasks:
+        return []
+    # Whoever was cancelled in the last line of a test, or serves a connection that was just closed, may still end by himself.
+    _, tasks = await asyncio.wait(tasks, timeout=0.3)
+    if not tasks:
+        return []
+    names = sorted(f"{t.get_name()} ({getattr(t.get_coro(), '__qualname__', t.get_coro())})" for t in tasks)
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
