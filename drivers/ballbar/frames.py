@@ -124,9 +124,9 @@ class FrameDecoder:
         at = bad_from = 0
         reason = "garbage"
         while True:
-            at = data.find(SYNC, at)
+            searched_from, at = at, data.find(SYNC, at)
             if at < 0:
-                at = size - 1 if data.endswith(b"\xa5") else size
+                at = size - 1 if data.endswith(b"\xa5", searched_from) else size
                 break
             if size - at < 4:
                 break

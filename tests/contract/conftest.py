@@ -165,6 +165,7 @@ class BarPeer:
         self.buffer = b""
         self.boot_id = 0xCAFE0001
         self.commands: list[tuple[int, int]] = []
+        self.asked = asyncio.Event()
         self.mute: set[int] = set()
         self.result = 0
         self.tag_offset = 0
@@ -195,6 +196,7 @@ class BarPeer:
     def command(self, kind: int, payload: bytes) -> None:
         tag = int.from_bytes(payload[:2], "little")
         self.commands.append((kind, tag))
+        self.asked.set()
         if kind in self.mute:
             return
         tag = (tag + self.tag_offset) & 0xFFFF
