@@ -9,7 +9,7 @@ import sys
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from service.events import Progress, ProgressSink
+    from service.events import ProgressSink
     from service.workflows.demo import DemoResult
 
 DEFAULT_FOLDER = "abbe-demo"
@@ -33,13 +33,14 @@ def demo(
     """Measure a simulated machine tool over real wires, correct it, and prove that it became better."""
     from rich.console import Console
 
+    from service.cli.progress import display
     from service.report.html import render_report
     from service.workflows.demo_report import demo_json, demo_report
 
     folder = keep or Path(DEFAULT_FOLDER)
     folder.mkdir(parents=True, exist_ok=True)
     log = Console(stderr=True)
-    with display(log) as sink, work_folder(folder, keep) as work:
+    with display() as sink, work_folder(folder, keep) as work:
         result = run_until_signal(seed, speed, work, sink)
     report = folder / "report.html"
     report.write_text(render_report(demo_report(result)), encoding="utf-8")
@@ -90,40 +91,6 @@ def run_until_signal(seed: int, speed: float, folder: Path, sink: ProgressSink) 
     return asyncio.run(main())
 
 
-@contextmanager
-def display(log: Console) -> Iterator[ProgressSink]:
-    """A progress bar with ETA on a terminal; one line per stage elsewhere."""
-    if not log.is_terminal:
-        last = [""]
-
-        def plain(p: Progress) -> None:
-            if p.stage != last[0]:
-                last[0] = p.stage
-                log.print(f"{p.stage}: {p.message}", highlight=False)
-
-        yield plain
-        return
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bars
-
-    columns: tuple[Any, ...] = (
-        TextColumn("{task.fields[stage]:<14}"),
-        BarColumn(),
-        TextColumn("{task.fields[eta]:>9}"),
-        TimeElapsedColumn(),
-    )
-    with Bars(*columns, TextColumn("{task.description}"), console=log) as bars:
-        tasks: dict[str, Any] = {}
-
-        def live(p: Progress) -> None:
-            if p.stage not in tasks:
-                tasks[p.stage] = bars.add_task(p.message, stage=p.stage, eta="", total=p.total)
-            eta = "" if p.eta_s is None else f"{p.eta_s:.0f} s left"
-            bars.update(tasks[p.stage], completed=p.done, description=p.message, eta=eta)
-
-        yield live
-
-
 def print_result(out: Console, result: DemoResult) -> None:
     """Before and after as a table, then the verdict."""
     from rich.table import Table
@@ -141,8 +108,6 @@ def print_result(out: Console, result: DemoResult) -> None:
         )
     out.print(table)
     found = demo_json(result)
-    share = found["volumetric_factor"]["share"]
-    out.print(
-        f"nine perfect one-axis tables would leave {found['best_nine_tables_rms_um']:.1f} um rms; reached {100 * share:.0f} % of that factor"
-    )
+    best, share = found["best_nine_tables_rms_um"], 100 * found["volumetric_factor"]["share"]
+    out.print(f"nine perfect one-axis tables would leave {best:.1f} um rms; {share:.0f} % of their factor was reached")
     out.print(("kept: " if found.get("kept") else "rolled back: ") + str(found.get("verdict", "")))

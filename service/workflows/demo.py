@@ -7,26 +7,20 @@ went.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
 from service.clock import Clock, SystemClock
 from service.devices.session import DeviceUrls, Session, open_session
 from service.events import Progress, ProgressSink
-from service.runs.columns import load_run
 from service.sequences.campaigns import identification, verification
 from service.site import Site, machine_doc, machine_from_doc
 from service.storage.store import Store
-from service.workflows.compensate import Pushed, Pusher
+from service.workflows.correct import Correction, correct, load_runs
 from service.workflows.measure import measure
-from service.workflows.solve import Solved, helix_misfit, solution_doc, solve_runs
-from service.workflows.verify import Decision, Figures, decide, figures
 from service.workflows.world import running_world, sealed_truth
 
-GRID = (25, 21, 19)
-LSB_NM = 100
 MAX_SAMPLES_PER_S = 6000
 """Ball-bar samples per wall second that the demonstration asks for at most, so that a small PC follows at high speed."""
 
@@ -41,18 +35,9 @@ class DemoResult:
     folder: Path
     started_utc: str
     duration_s: float = 0.0
-    noise_bar_um: float = 0.0
-    holdout_misfit_um: float = 0.0
-    before: Figures | None = None
-    after: Figures | None = None
-    solved: Solved | None = None
-    tables: NineTables | None = None
-    predicted: Predicted | None = None
-    pushed: Pushed | None = None
-    decision: Decision | None = None
+    correction: Correction | None = None
     truth_before: dict[str, Any] = field(default_factory=dict)
     truth_after: dict[str, Any] = field(default_factory=dict)
-    run_ids: list[int] = field(default_factory=list)
 
 
 def bar_rate_hz(speed: float) -> int:
@@ -117,46 +102,7 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
 async def _job(session: Session, store: Store, result: DemoResult, progress: ProgressSink) -> None:
     site, rate = result.site, bar_rate_hz(result.speed)
     before_ids = await measure(session, store, site, verification(site.machine, rate_hz=rate, name="verify-before"), progress=progress)
-    run_ids = await measure(session, store, site, identification(site.machine, rate_hz=rate), progress=progress)
-    progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
-    runs = await _load(store, run_ids)
-    before = await _load(store, before_ids)
-    solved = await asyncio.to_thread(solve_runs, site, runs)
-    result.run_ids = before_ids + run_ids
-    result.solved, result.before = solved, figures(before)
-    result.noise_bar_um = solved.noise_bar_mm * 1e3
-    result.holdout_misfit_um = helix_misfit(solved, next(r for r in before if r["test"] == "ballbar_helix")) * 1e3
-    result.tables = quantise(nine_tables(solved.joint, GRID), LSB_NM * 1e-6)
-    result.predicted = predict_residual(solved.joint, result.tables)
-    await _push_and_verify(session, store, result, progress)
-
-
-async def _push_and_verify(session: Session, store: Store, result: DemoResult, progress: ProgressSink) -> None:
-    site, solved, tables = result.site, result.solved, result.tables
-    assert solved is not None
-    assert tables is not None
-    assert result.before is not None
-    campaign = await asyncio.to_thread(store.campaign, "identify")
-    solution_id = await store.write(store.add_solution, campaign.id, "joint", result.run_ids, solution_doc(solved))
-    progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
-    pusher = Pusher(session.controller, store, site)
-    result.pushed = await pusher.push(tables, lsb_nm=LSB_NM, solution_id=solution_id, doc={"kind": "nine one-axis tables"})
-    plan = verification(site.machine, rate_hz=bar_rate_hz(result.speed), name="verify-after")
-    ids = await measure(session, store, site, plan, progress=progress)
-    result.run_ids = result.run_ids + ids
-    result.after = figures(await _load(store, ids))
-    result.decision = decide(result.before, result.after)
-    if result.decision.keep:
-        await pusher.keep()
-    else:
-        await pusher.roll_back(result.pushed, result.decision.text)
-        result.pushed = replace(result.pushed, bank=result.pushed.previous_bank)
-    image = await session.controller.read_bank(result.pushed.bank)
-    (result.folder / "active_bank.bin").write_bytes(image)
-    machine_id = await store.write(store.add_machine, site.name, site.doc)
-    verdict = "pass" if result.decision.keep else "fail"
-    await store.write(store.add_verification, machine_id, None, verdict, {"text": result.decision.text})
-
-
-async def _load(store: Store, run_ids: list[int]) -> list[dict[str, Any]]:
-    return await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
+    await measure(session, store, site, identification(site.machine, rate_hz=rate), progress=progress)
+    before = await load_runs(store, before_ids)
+    result.correction = await correct(session, store, site, "identify", before, rate_hz=rate, progress=progress)
+    (result.folder / "active_bank.bin").write_bytes(result.correction.image)

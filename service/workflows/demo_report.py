@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from models.compensation.tables import NineTables
 from models.solvers.joint import JointSolution
 from service.report.model import (
     ArrowField,
@@ -19,7 +20,8 @@ from service.report.model import (
     SummaryRow,
     TableCurve,
 )
-from service.workflows.demo import LSB_NM, DemoResult
+from service.workflows.correct import LSB_NM, Correction
+from service.workflows.demo import DemoResult
 from service.workflows.solve import not_observable
 from service.workflows.verify import Figures, figure_rows
 
@@ -38,22 +40,20 @@ def demo_json(result: DemoResult) -> dict[str, Any]:
     out["volumetric_factor"] = {"reached": rms0 / rms1, "bound": rms0 / best, "share": best / rms1}
     out["volumetric_reduction_share"] = (rms0 - rms1) / (rms0 - best)
     out["source_of_the_above"] = TRUTH + ", rigid motion removed"
-    out["measured"] = {
-        name: {"before": v, "u_before": u, "after": a, "u_after": ua} for name, (v, u), (a, ua) in _measured(result.before, result.after)
-    }
-    if result.predicted is not None:
-        p = result.predicted
+    c = result.correction
+    if c is not None:
+        out["measured"] = {
+            n: {"before": v, "u_before": u, "after": a, "u_after": ua} for n, (v, u), (a, ua) in _measured(c.before, c.after)
+        }
+        p = c.predicted
         out["predicted_rms_um"] = {"before": p.before_mm * 1e3, "after": p.after_mm * 1e3, "u_model": p.u_model_mm * 1e3}
-    if result.decision is not None:
-        out["kept"], out["verdict"] = result.decision.keep, result.decision.text
-    out["holdout_misfit_um"] = result.holdout_misfit_um
+        out["kept"], out["verdict"] = c.decision.keep, c.decision.text
+        out["holdout_misfit_um"] = c.holdout_misfit_um
     out["duration_s"] = round(result.duration_s, 1)
     return out
 
 
-def _measured(before: Figures | None, after: Figures | None) -> list[tuple[str, tuple[float, float], tuple[float, float]]]:
-    if before is None or after is None:
-        return []
+def _measured(before: Figures, after: Figures) -> list[tuple[str, tuple[float, float], tuple[float, float]]]:
     old, new = figure_rows(before), figure_rows(after)
     return [(k, old[k], new[k]) for k in old if k in new]
 
@@ -61,7 +61,8 @@ def _measured(before: Figures | None, after: Figures | None) -> list[tuple[str, 
 def summary_rows(result: DemoResult) -> list[SummaryRow]:
     """Before and after, measured figures first, then the sealed truth."""
     rows = []
-    for name, (v, u), (a, ua) in _measured(result.before, result.after):
+    c = result.correction
+    for name, (v, u), (a, ua) in _measured(c.before, c.after) if c is not None else []:
         title = _title(name)
         rows.append(SummaryRow(title, "µm", v, a, v / a if a > 0 else None, u, ua, "measured"))
     for key, title in zip(TRUTH_KEYS, ("Largest body diagonal", "Volumetric error, rms", "Volumetric error, maximum"), strict=True):
@@ -118,16 +119,11 @@ def _arrows(truth: dict[str, Any]) -> ArrowField | None:
     return ArrowField(np.asarray(truth["grid_mm"], dtype=np.float64), np.asarray(truth["deviation_um"], dtype=np.float64))
 
 
-def _curves(found: Figures | None) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
-    if found is None:
-        return {}
+def _curves(found: Figures) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
     return {k: (f.position_mm.tolist(), (f.deviation_mm * 1e3).tolist()) for k, f in found.diagonals.items()}
 
 
-def _tables(result: DemoResult) -> list[TableCurve]:
-    if result.tables is None:
-        return []
-    t = result.tables
+def _tables(t: NineTables) -> list[TableCurve]:
     return [
         TableCurve("XYZ"[a], "XYZ"[i], t.position_mm[a].tolist(), (t.correction_mm[a][:, i] * 1e3).tolist())
         for a in range(3)
@@ -136,47 +132,53 @@ def _tables(result: DemoResult) -> list[TableCurve]:
 
 
 def demo_report(result: DemoResult) -> DemoReport:
-    """Everything the report shows, from what the demonstration found."""
-    solved, decision = result.solved, result.decision
-    joint = solved.joint if solved is not None else None
-    noise = result.noise_bar_um
-    runs = (
-        [RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, noise if r.kind == "bar" else None) for r in joint.runs]
-        if joint
-        else []
-    )
-    residuals = [
-        ResidualSeries(r.label, "reading", list(range(r.residual_mm.size)), (r.residual_mm * 1e3).tolist())
-        for r in (joint.runs if joint else ())
-    ]
-    warnings = [
-        "Figures marked 'sealed truth' exist only because the machine is simulated; on a real machine the measured rows are all there is."
-    ]
-    if joint is not None and joint.estimate.variance_factor > 1.5:
-        warnings.append(
-            f"Residuals exceed the stated noise (variance factor {joint.estimate.variance_factor:.1f}); uncertainties were widened."
-        )
-    kept = decision is not None and decision.keep
+    """Everything the report shows, from what the demonstration found.
+
+    Raises
+    ------
+    ValueError
+        The demonstration did not get as far as a correction.
+    """
+    c = result.correction
+    if c is None:
+        raise ValueError("the demonstration holds no correction to report")
+    joint = c.solved.joint
     return DemoReport(
         title=f"Abbe: measure, correct, verify - {result.site.name}",
         machine={"chain": result.site.machine.chain, "stroke_mm": result.site.doc["stroke_mm"], "tool_mm": result.site.doc["tool_mm"]},
         created_utc=result.started_utc,
         seed=result.seed,
         versions={"abbe": version("abbe")},
-        verdict=("Table kept: " if kept else "Table rolled back: ") + (decision.text if decision else "no decision"),
-        accepted=kept if decision is not None else None,
+        verdict=("Table kept: " if c.decision.keep else "Table rolled back: ") + c.decision.text,
+        accepted=c.decision.keep,
         summary=summary_rows(result),
-        parameters=parameter_rows(joint) if joint else [],
-        not_observable=not_observable(joint) if joint else [],
-        runs=runs,
-        residuals=residuals,
-        tables=_tables(result),
+        parameters=parameter_rows(joint),
+        not_observable=not_observable(joint),
+        runs=_runs(c),
+        residuals=[ResidualSeries(r.label, "reading", list(range(r.residual_mm.size)), (r.residual_mm * 1e3).tolist()) for r in joint.runs],
+        tables=_tables(c.tables),
         table_lsb_um=LSB_NM * 1e-3,
         arrows_before=_arrows(result.truth_before),
         arrows_after=_arrows(result.truth_after),
-        diagonals_before=_curves(result.before),
-        diagonals_after=_curves(result.after),
-        contributions=contributions(joint) if joint else [],
-        push_log=list(result.pushed.log) if result.pushed else [],
-        warnings=warnings,
+        diagonals_before=_curves(c.before),
+        diagonals_after=_curves(c.after),
+        contributions=contributions(joint),
+        push_log=list(c.pushed.log),
+        warnings=_warnings(joint),
     )
+
+
+def _runs(c: Correction) -> list[RunRow]:
+    noise = c.solved.noise_bar_mm * 1e3
+    return [
+        RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, noise if r.kind == "bar" else None)
+        for r in c.solved.joint.runs
+    ]
+
+
+def _warnings(joint: JointSolution) -> list[str]:
+    texts = ["Figures marked 'sealed truth' exist only because the machine is simulated; on a real machine only the measured rows exist."]
+    factor = joint.estimate.variance_factor
+    if factor > 1.5:
+        texts.append(f"Residuals exceed the stated noise (variance factor {factor:.1f}): uncertainties are widened.")
+    return texts

@@ -1,0 +1,48 @@
+"""Progress with ETA on a terminal, one line per stage elsewhere."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from service.events import Progress, ProgressSink
+
+
+@contextmanager
+def display() -> Iterator[ProgressSink]:
+    """A progress bar with ETA on a terminal; one line per stage elsewhere."""
+    from rich.console import Console
+
+    log = Console(stderr=True)
+    if not log.is_terminal:
+        last = [""]
+
+        def plain(p: Progress) -> None:
+            if p.stage != last[0]:
+                last[0] = p.stage
+                log.print(f"{p.stage}: {p.message}", highlight=False)
+
+        yield plain
+        return
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns: tuple[Any, ...] = (
+        TextColumn("{task.fields[stage]:<14}"),
+        BarColumn(),
+        TextColumn("{task.fields[eta]:>9}"),
+        TimeElapsedColumn(),
+    )
+    with Bars(*columns, TextColumn("{task.description}"), console=log) as bars:
+        tasks: dict[str, Any] = {}
+
+        def live(p: Progress) -> None:
+            if p.stage not in tasks:
+                tasks[p.stage] = bars.add_task(p.message, stage=p.stage, eta="", total=p.total)
+            eta = "" if p.eta_s is None else f"{p.eta_s:.0f} s left"
+            bars.update(tasks[p.stage], completed=p.done, description=p.message, eta=eta)
+
+        yield live

@@ -1,0 +1,99 @@
+"""Sequences: geometry, dry run, and refusal before anything moves."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from models.machine import Machine
+from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from service.errors import StrokeError
+from service.sequences.campaigns import identification, quick_check, verification
+from service.sequences.check import dry_run, dry_run_campaign, positions
+from service.sequences.recipes import Diagonal, Helix, Linear
+from service.sequences.steps import MoveTo, ReadLaser, RecordPath, ZeroLaser
+
+MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
+
+
+def test_a_helix_stays_on_its_sphere_from_pole_to_equator_and_back():
+    out = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, direction=1).plan(MACHINE)
+    path = next(s for s in out.steps if isinstance(s, RecordPath)).points_mm
+    radii = [math.dist(p, (300.0, 250.0, 100.0)) for p in path]
+    assert max(abs(r - 150.0) for r in radii) < 1e-4  # the controller's 10 nm grid
+    assert path[0] == (300.0, 250.0, 250.0)
+    assert path[-1][2] == pytest.approx(100.0, abs=1e-5)
+    back = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, direction=-1).plan(MACHINE)
+    assert next(s for s in back.steps if isinstance(s, RecordPath)).points_mm == path[::-1]
+
+
+def test_the_area_law_spreads_points_evenly_over_the_hemisphere():
+    plan = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, law="area").plan(MACHINE)
+    z = np.array(next(s for s in plan.steps if isinstance(s, RecordPath)).points_mm)[:, 2]
+    assert np.ptp(np.diff(z)) < 1e-4
+
+
+@pytest.mark.parametrize("order", ["XYZ", "ZYX", "YXZ"])
+@pytest.mark.parametrize("diagonal", list(DIAGONALS))
+def test_step_diagonals_move_one_axis_at_a_time_and_return_the_way_they_came(diagonal, order):
+    start, end = diagonal_ends(MACHINE.stroke_mm, diagonal)
+    p = step_diagonal(start, end, 4, order)
+    assert len(p) == 2 * (3 * 4 + 1)
+    moved = np.abs(np.diff(p[:13], axis=0)) > 1e-9
+    assert (moved.sum(axis=1) == 1).all()
+    assert "".join("XYZ"[int(np.argmax(m))] for m in moved[:3]) == order
+    assert p[12] == pytest.approx(end)
+    assert (p[13:] == p[:13][::-1]).all()
+
+
+def test_laser_lines_approach_their_start_in_the_direction_of_the_first_motion():
+    for recipe in (Diagonal("d", "D", "identify", "npp"), Linear("l", "L", "identify", 0)):
+        plan = recipe.plan(MACHINE)
+        approach, start = (s.target_mm for s in plan.steps[:2] if isinstance(s, MoveTo))
+        end = plan.setup["end_mm"]
+        for a in range(3):
+            if end[a] != start[a]:
+                assert np.sign(start[a] - approach[a]) == np.sign(end[a] - start[a])
+        assert sum(isinstance(s, ZeroLaser) for s in plan.steps) == 1
+
+
+@pytest.mark.parametrize("chain", ["w-X-Y-b-Z-t", "w-b-X-Y-Z-t", "w-Z-b-X-Y-t"])
+@pytest.mark.parametrize("stroke", [(600, 500, 450), (812.8, 495, 508), (250, 300, 200)])
+def test_shipped_campaigns_fit_into_any_machine(chain, stroke):
+    m = Machine(chain, np.array([[-100.0, s - 100.0] for s in stroke]))
+    for plan in (identification(m), verification(m), quick_check(m)):
+        for d in dry_run_campaign(m, plan, 6000.0):
+            assert d.duration_s > 0
+            assert d.readings > 10
+        assert len({t.label for t in plan.tests}) == len(plan.tests)
+
+
+def test_verification_shares_no_centre_radius_or_path_with_the_identification():
+    used = [t.setup for t in identification(MACHINE).tests if t.test == "ballbar_helix"]
+    check = next(t.setup for t in verification(MACHINE).tests if t.test == "ballbar_helix")
+    assert all(u["centre_mm"] != check["centre_mm"] and u["radius_mm"] != check["radius_mm"] for u in used)
+    assert not [t for t in identification(MACHINE).tests if t.test == "laser_diagonal" and not t.setup.get("order")]
+
+
+def test_a_stroke_exceeded_names_axis_amount_and_remedy_before_anything_moves():
+    plan = Helix("h7", "A", "identify", (550.0, 250.0, 100.0), 150.0).plan(MACHINE)
+    with pytest.raises(StrokeError, match=r"test h7: X would go to .* mm beyond its stroke 0..600") as caught:
+        dry_run(MACHINE, plan)
+    assert "nothing has moved" in caught.value.remedy
+
+
+def test_a_feed_over_the_limit_is_refused():
+    with pytest.raises(StrokeError, match="6000 mm/min, allowed are 3000"):
+        dry_run_campaign(MACHINE, verification(MACHINE), 3000.0)
+
+
+def test_dry_run_times_a_path_and_counts_its_readings():
+    plan = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=1, feed_mm_min=1500.0, rate_hz=50, mount=False).plan(MACHINE)
+    run = dry_run(MACHINE, plan)
+    path = list(positions(plan.steps))[1:]
+    length = sum(math.dist(a, b) for a, b in pairwise(path))
+    assert run.path_mm == pytest.approx(length)
+    assert run.duration_s == pytest.approx(length / 1500 * 60)
+    assert run.readings == int(run.duration_s * 50)
+    assert sum(isinstance(s, ReadLaser) for s in plan.steps) == 0

@@ -1,0 +1,107 @@
+"""Tables from arrays to the controller's bytes: axis order, sign and unit, against bytes taken apart by hand from docs/protocols/cnc.md."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from drivers.cnc.tables import encode
+from models.compensation.tables import NineTables
+from service.errors import TableMismatch, TableRefused
+from service.site import TableLimits
+from service.workflows.compensate import check_limits, compare_bytes, compare_meaning, table_image, tables_from_image
+
+
+def tables(scale: float = 1.0) -> NineTables:
+    """Every one of the nine curves differs from every other, in size and in sign."""
+    positions = (np.linspace(0, 600, 4), np.linspace(0, 500, 3), np.linspace(-50, 400, 5))
+    curves = []
+    for a in range(3):
+        ramp = np.arange(positions[a].size)[:, None]
+        curves.append(scale * ramp * np.array([1e-3, -2e-3, 3e-3]) * (a + 1))
+    none = tuple(np.zeros_like(c) for c in curves)
+    return NineTables(positions, tuple(curves), none)
+
+
+def test_every_curve_stands_where_the_protocol_says_with_its_own_sign():
+    image = encode(table_image(tables(), 100, 7))
+    words = struct.unpack(f">{len(image) // 2}h", image)
+    assert struct.unpack(">H", image[:2])[0] == 0xABBE
+    assert words[2] == 1
+    assert words[8:11] == (4, 3, 5)
+    at = 24
+    for a, n in enumerate((4, 3, 5)):
+        for unit in (10, -20, 30):  # 1, -2, 3 um a step in 0.1 um units: output X, Y, Z
+            assert words[at : at + n] == tuple(unit * (a + 1) * k for k in range(n))
+            at += n
+    assert at == len(words) == words[3]
+    start_z = struct.unpack(">i", image[2 * 16 : 2 * 18])[0]
+    assert start_z == -5_000_000  # -50 mm in 10 nm
+
+
+@pytest.mark.parametrize("wrong", ["sign", "axis in", "axis out", "unit"])
+def test_an_encoder_that_lies_is_caught_by_the_independent_decoder(wrong):
+    want = tables()
+    curves, positions = [c.copy() for c in want.correction_mm], want.position_mm
+    if wrong == "sign":
+        curves = [-c for c in curves]
+    elif wrong == "axis out":
+        curves = [c[:, [1, 0, 2]] for c in curves]
+    elif wrong == "unit":
+        curves = [c * 10 for c in curves]
+    elif wrong == "axis in":
+        curves, positions = [curves[1], curves[0], curves[2]], (positions[1], positions[0], positions[2])
+    lied = NineTables(positions, tuple(curves), want.u_mm)
+    held = tables_from_image(encode(table_image(lied, 100, 7)))
+    with pytest.raises(TableMismatch):
+        compare_meaning(want, held, 100)
+
+
+def test_an_honest_encoder_passes_within_half_a_unit():
+    want = tables(1.2345)
+    compare_meaning(want, tables_from_image(encode(table_image(want, 100, 7))), 100)
+
+
+def test_one_flipped_bit_of_the_read_back_is_found_and_located():
+    image = encode(table_image(tables(), 100, 7))
+    for at in (0, 60, len(image) - 1):
+        held = bytearray(image)
+        held[at] ^= 1
+        with pytest.raises(TableMismatch, match=f"register {at // 2}"):
+            compare_bytes(image, bytes(held))
+    with pytest.raises(TableMismatch):
+        compare_bytes(image, image[:-2])
+
+
+@pytest.mark.parametrize(
+    ("limits", "what"),
+    [
+        (TableLimits(value_mm=0.01), "value .* exceeds"),
+        (TableLimits(change_mm=0.01), "change against the active table"),
+        (TableLimits(step_mm=0.004), "step between neighbours"),
+    ],
+)
+def test_limits_refuse_and_say_which_key_to_look_at(limits, what):
+    check_limits(tables(), None, TableLimits())
+    with pytest.raises(TableRefused, match=what) as caught:
+        check_limits(tables(), None, limits)
+    assert "Nothing was written" in caught.value.remedy
+    assert "table_" in caught.value.remedy
+
+
+def test_change_is_measured_against_the_active_table():
+    limits = TableLimits(change_mm=0.005)
+    check_limits(tables(1.1), tables(1.0), limits)
+    with pytest.raises(TableRefused, match="change"):
+        check_limits(tables(-1.0), tables(1.0), limits)
+
+
+def test_a_table_with_nan_or_off_zero_is_refused():
+    bad = tables()
+    bad.correction_mm[1][1, 2] = np.nan
+    with pytest.raises(TableRefused, match="table of Z over Y: holds values that are no numbers"):
+        check_limits(bad, None, TableLimits())
+    shifted = tables()
+    shifted.correction_mm[0][:, 0] += 0.01
+    with pytest.raises(TableRefused, match="not zero at its reference"):
+        check_limits(shifted, None, TableLimits())
