@@ -36,7 +36,7 @@ HOSTS = [
     ("cdnjs", "cloudflare"),
     ("googleapis", "com"),
 ]
-ADDRESS = re.compile("|".join(rf"\b{name}\.{end}\b" for name, end in HOSTS) + r"|--(?:extra-)?index-url|--find-links", re.IGNORECASE)
+ADDRESS = re.compile("|".join(rf"\b{name}\.{end}\b" for name, end in HOSTS) + r"|--(?:extra-)?index-url|--find-(?:links)", re.IGNORECASE)
 MACHINE_PATH = re.compile(r"(?<![\w.~$}])/(?:work|home|root|Users|mnt|media)/\w|\b[A-Z]:\\Users\\")
 
 

@@ -1,0 +1,62 @@
+# One way to do each thing. Everything runs in .venv of this folder; nothing else on the computer is changed.
+# A stamp file per lock file inside .venv remembers what is installed, so that setting up happens only when a lock changes.
+
+PYTHON ?= python3
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input
+RUN_READY := $(VENV)/.ready-run
+DEV_READY := $(VENV)/.ready-dev
+COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint fmt lock clean
+
+help: ## list what can be made
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo "Options go into ARGS: make demo ARGS=--help, make test ARGS='tests/unit -k table'. Another Python: make test PYTHON=python3.12"
+
+demo: $(RUN_READY) ## measure, correct and verify a simulated machine; writes a report
+	@$(BIN)/abbe demo $(ARGS)
+
+test: $(DEV_READY) ## all tests
+	@$(BIN)/pytest $(ARGS)
+
+lint: $(DEV_READY) ## style, formatting, types, import walls
+	$(BIN)/ruff check --output-format concise
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+fmt: $(DEV_READY) ## sort imports and format
+	$(BIN)/ruff check --fix-only --quiet
+	$(BIN)/ruff format
+
+lock: ## pin the dependencies of pyproject.toml anew (ARGS=--upgrade for newer versions)
+	@command -v uv >/dev/null || { echo "make lock needs uv, a Python package resolver: install it from your package source, then try again."; exit 1; }
+	$(COMPILE) $(ARGS) pyproject.toml -o requirements.lock
+	$(COMPILE) $(ARGS) --extra dev -c requirements.lock pyproject.toml -o requirements-dev.lock
+
+clean: ## remove caches and build products (.venv stays)
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find service drivers models simulators tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	|| { echo "Abbe needs Python 3.11 or newer, and '$(PYTHON)' is not: make ... PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) \
+	|| { rm -rf $(VENV); echo "'$(PYTHON) -m venv' failed (see above); on Debian and Ubuntu it needs the package python3-venv."; exit 1; }
+
+$(RUN_READY): requirements.lock | $(BIN)/python
+	@echo "setting up .venv from requirements.lock, about a minute"
+	@$(PIP) --require-hashes -r requirements.lock
+	@$(PIP) --no-deps --no-build-isolation -e .
+	@touch $@
+
+# The developers' lock holds everything of the users' lock (a test sees to it), so the second stamp is due as well.
+$(DEV_READY): requirements-dev.lock requirements.lock | $(BIN)/python
+	@echo "setting up .venv from requirements-dev.lock, about a minute"
+	@$(PIP) --require-hashes -r requirements-dev.lock
+	@$(PIP) --no-deps --no-build-isolation -e .
+	@touch $(RUN_READY) $@
