@@ -20,7 +20,8 @@ from pydantic_settings.exceptions import SettingsError
 from service.config_schema import MachineFile
 from service.errors import ConfigError
 from service.explain import expected, nearest, where
-from service.storage.engine import mask_secrets, resolve_url
+from service.secrets import mask_secrets
+from service.storage.engine import resolve_url
 
 PREFIX = "ABBE_"
 Origin = Literal["default", "file", "environment"]

@@ -43,10 +43,10 @@ class AxisPoints(_Section):
 class Devices(_Section):
     """Where the devices are; an absent one is not connected."""
 
-    ballbar: str | None = Field(None, description="serial:///dev/ttyUSB0?baud=460800 or socket://host:port")
-    laser: str | None = Field(None, description="modbus+tcp://host:port or modbus+rtu:///dev/ttyS0?baud=115200")
-    cnc: str | None = Field(None, description="modbus+tcp://host:port")
-    fixture: str | None = Field(None, description="fixture+console: or fixture+tcp://host:port")
+    ballbar: str | None = Field(default=None, description="serial:///dev/ttyUSB0?baud=460800 or socket://host:port")
+    laser: str | None = Field(default=None, description="modbus+tcp://host:port or modbus+rtu:///dev/ttyS0?baud=115200")
+    cnc: str | None = Field(default=None, description="modbus+tcp://host:port")
+    fixture: str | None = Field(default=None, description="fixture+console: or fixture+tcp://host:port")
 
     @model_validator(mode="after")
     def _urls(self) -> Self:
@@ -87,30 +87,32 @@ class StoreSection(_Section):
     """Where results are kept."""
 
     url: Annotated[str, AfterValidator(_database)] = Field(
-        "sqlite:///abbe.sqlite3", description="SQLite file (relative to the machine file's folder) or postgresql://user@host/name"
+        default="sqlite:///abbe.sqlite3", description="SQLite file (relative to the machine file's folder) or postgresql://user@host/name"
     )
 
 
 class Limits(_Section):
     """What must never be exceeded. A table beyond a limit is refused, not clamped."""
 
-    table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(200.0, description="largest correction at any grid point")
+    table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(default=200.0, description="largest correction at any grid point")
     table_change_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
-        200.0,
+        default=200.0,
         description="largest change of a correction against the active table; 50 is enough once a machine is corrected, but the first push "
         "on a raw machine replaces nothing by everything",
     )
-    table_step_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(20.0, description="largest change between neighbouring grid points")
-    feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(6000.0, description="fastest feed of any measurement")
-    temperature_c: Interval = Field((18.0, 24.0), description="air temperature in which a measurement is allowed")
+    table_step_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(
+        default=20.0, description="largest change between neighbouring grid points"
+    )
+    feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
+    temperature_c: Interval = Field(default=(18.0, 24.0), description="air temperature in which a measurement is allowed")
 
 
 class Verify(_Section):
     """Limits of the scheduled check: above one of them the machine does not pass."""
 
-    volumetric_rms_um: Positive = Field(10.0, description="rms volumetric error over the grid, rigid motion removed")
-    body_diagonal_um: Positive = Field(20.0, description="range of the deviation along the worst body diagonal")
-    helix_rms_um: Positive = Field(5.0, description="rms of the ball-bar residual on the check helix")
+    volumetric_rms_um: Positive = Field(default=10.0, description="rms volumetric error over the grid, rigid motion removed")
+    body_diagonal_um: Positive = Field(default=20.0, description="range of the deviation along the worst body diagonal")
+    helix_rms_um: Positive = Field(default=5.0, description="rms of the ball-bar residual on the check helix")
 
 
 def _broker(text: str | None) -> str | None:
@@ -126,16 +128,16 @@ class Mqtt(_Section):
     """Where results are published."""
 
     url: Annotated[str | None, AfterValidator(_broker)] = Field(
-        None, description="mqtt://[user:password@]host:1883; absent: nothing is published"
+        default=None, description="mqtt://[user:password@]host:1883; absent: nothing is published"
     )
-    topic_prefix: str = Field("abbe", pattern=r"^[^+#\s/][^+#\s]*$", description="first part of every topic")
+    topic_prefix: str = Field(default="abbe", pattern=r"^[^+#\s/][^+#\s]*$", description="first part of every topic")
 
 
 class Web(_Section):
     """Where the web page is served."""
 
-    host: str = Field("127.0.0.1", min_length=1, description="127.0.0.1: this computer only; 0.0.0.0: everybody on the network")
-    port: int = Field(8080, ge=1, le=65535)
+    host: str = Field(default="127.0.0.1", min_length=1, description="127.0.0.1: this computer only; 0.0.0.0: everybody on the network")
+    port: int = Field(default=8080, ge=0, le=65535, description="0: any free port")
 
 
 class ScheduleEntry(_Section):
@@ -143,9 +145,9 @@ class ScheduleEntry(_Section):
 
     name: str = Field(min_length=1, max_length=200)
     cron: str = Field(description="minute hour day month weekday, e.g. 0 6 * * 1")
-    timezone: str = Field("UTC", description="IANA name, e.g. Europe/Berlin")
-    recipe: str = Field("quick-check", min_length=1, description="what to measure")
-    grace_s: float = Field(300.0, ge=0.0, le=86_400.0, description="a slot found later than this is recorded as missed and not run")
+    timezone: str = Field(default="UTC", description="IANA name, e.g. Europe/Berlin")
+    recipe: str = Field(default="quick-check", min_length=1, description="what to measure")
+    grace_s: float = Field(default=300.0, ge=0.0, le=86_400.0, description="a slot found later than this is recorded as missed and not run")
 
     @field_validator("cron")
     @classmethod
@@ -171,10 +173,10 @@ class MachineFile(_Section):
 
     name: str = Field(min_length=1, max_length=200)
     chain: Chain = Field(description="carriages from workpiece w over bed b to tool t, e.g. w-X-Y-b-Z-t")
-    vertical_axis: str = Field("Z", pattern="^[XYZ]$")
+    vertical_axis: str = Field(default="Z", pattern="^[XYZ]$")
     stroke_mm: AxisIntervals
     pivots_mm: AxisPoints = AxisPoints()
-    tool_mm: Point = Field((0.0, 0.0, 0.0), description="from the spindle reference point to the functional point")
+    tool_mm: Point = Field(default=(0.0, 0.0, 0.0), description="from the spindle reference point to the functional point")
     devices: Devices = Devices()
     store: StoreSection = StoreSection()
     limits: Limits = Limits()

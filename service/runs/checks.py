@@ -12,45 +12,10 @@ from service.explain import expected, shown, where
 from service.runs.formats import Columns, RunFile, Setup
 from service.storage.records import Doc
 
-UNITS = frozenset(
-    [
-        "mm",
-        "um",
-        "nm",
-        "m",
-        "s",
-        "ms",
-        "us",
-        "h",
-        "rad",
-        "urad",
-        "mrad",
-        "deg",
-        "C",
-        "K",
-        "Pa",
-        "hPa",
-        "mm_min",
-        "mm_s",
-        "min_1",
-        "rpm",
-        "Hz",
-        "kHz",
-        "N",
-        "kN",
-        "Nm",
-        "V",
-        "mV",
-        "A",
-        "W",
-        "kW",
-        "percent",
-        "permille",
-        "ppm",
-        "bits",
-    ]
-)
-PLAIN = frozenset(["seq", "count", "no", "index", "id", "flag", "ratio", "status", "quality", "valid"])
+_OF_MOTION = ("mm", "um", "nm", "m", "rad", "urad", "mrad", "deg", "s", "ms", "us", "h", "mm_min", "mm_s", "rpm", "Hz", "kHz")
+_OF_OTHERS = ("C", "K", "Pa", "hPa", "N", "kN", "Nm", "V", "mV", "A", "W", "kW", "percent", "permille", "ppm", "bits")
+UNITS = frozenset({*_OF_MOTION, *_OF_OTHERS})
+PLAIN = frozenset(("seq", "count", "no", "index", "id", "flag", "ratio", "status", "quality", "valid"))
 """Last parts of names of columns that have no unit."""
 MAX_BYTES = 512 * 2**20
 

@@ -12,7 +12,8 @@ from typing import ParamSpec, Self, TypeVar
 from sqlalchemy import Connection, Engine
 
 from service.errors import StoreError
-from service.storage.engine import DEFAULT_URL, READ_ONLY_OPTION, make_engine, mask_secrets, translated
+from service.secrets import mask_secrets
+from service.storage.engine import DEFAULT_URL, READ_ONLY_OPTION, make_engine, translated
 from service.storage.migrate import upgrade
 
 P = ParamSpec("P")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,13 +14,13 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.pool import StaticPool
 
 from service.errors import StoreError
+from service.secrets import mask_secrets
 
 DEFAULT_URL = "sqlite:///abbe.sqlite3"
 BUSY_TIMEOUT_MS = 5000
 JOURNAL_LIMIT_BYTES = 64 * 2**20
 READ_ONLY_OPTION = "abbe_reads_only"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
-_PASSWORD = re.compile(r"(?<=://)([^:/@\s]*):[^@/\s]+(?=@)")
 
 
 def wal_is_safe(version: str = sqlite3.sqlite_version) -> bool:
@@ -39,22 +38,6 @@ def wal_is_safe(version: str = sqlite3.sqlite_version) -> bool:
     """
     number = tuple(int(part) for part in version.split("."))
     return number >= (3, 51, 3) or (number[:2] == (3, 44) and number >= (3, 44, 6)) or (number[:2] == (3, 50) and number >= (3, 50, 7))
-
-
-def mask_secrets(text: str) -> str:
-    """Hide the passwords of URLs in a text that people will see.
-
-    Parameters
-    ----------
-    text : str
-        Any text.
-
-    Returns
-    -------
-    str
-        The text with ``user:***@`` in place of ``user:password@``.
-    """
-    return _PASSWORD.sub(r"\1:***", text)
 
 
 def resolve_url(url: str, base: Path | None = None) -> str:

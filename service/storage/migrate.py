@@ -11,7 +11,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine
 
 from service.errors import StoreError
-from service.storage.engine import mask_secrets
+from service.secrets import mask_secrets
 
 _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after the other
 

@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from service.errors import StoreError
-from service.storage.engine import mask_secrets, resolve_url, wal_is_safe
+from service.secrets import mask_secrets
+from service.storage.engine import resolve_url, wal_is_safe
 from service.storage.owner import process_start, this_process
 from service.storage.records import ImportedRun
 from service.storage.store import Store

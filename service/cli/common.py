@@ -1,0 +1,130 @@
+"""What commands share: the database option, and output for people and for programs."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from service.storage.store import Store
+
+ENVIRONMENT = "ABBE_DB"
+DEFAULT = "sqlite:///abbe.sqlite3"
+
+DbOption = Annotated[
+    str | None,
+    typer.Option("--db", metavar="URL", help=f"Database. Default: {ENVIRONMENT} of the environment, else {DEFAULT}.", show_default=False),
+]
+MachineOption = Annotated[
+    Path | None, typer.Option("--machine", metavar="FILE", help="Use the database of this machine file.", show_default=False)
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+
+def database_url(db: str | None, machine: Path | None = None) -> str:
+    """Decide which database a command works on.
+
+    Parameters
+    ----------
+    db : str, optional
+        From ``--db``.
+    machine : Path, optional
+        From ``--machine``.
+
+    Returns
+    -------
+    str
+        ``--db`` or the machine file's, else the environment's, else the default.
+
+    Raises
+    ------
+    ConfigError
+        If both options are given.
+    """
+    from service.errors import ConfigError
+
+    if db is not None and machine is not None:
+        raise ConfigError("--db and --machine both name a database", "give one of them")
+    if machine is not None:
+        from service.config import load_machine
+
+        return load_machine(machine).database_url
+    return db or os.environ.get(ENVIRONMENT) or DEFAULT
+
+
+def open_store(url: str, *, must_exist: bool = True) -> Store:
+    """Open the database of a command.
+
+    Parameters
+    ----------
+    url : str
+        Database URL.
+    must_exist : bool
+        Whether a missing SQLite file is an error: a command that only reads must not leave an empty database behind.
+
+    Returns
+    -------
+    Store
+        Close it.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be opened.
+    """
+    from service.errors import StoreError
+    from service.storage.engine import parse_url
+    from service.storage.store import Store
+
+    parsed = parse_url(url)
+    if (
+        must_exist
+        and parsed.drivername == "sqlite"
+        and parsed.database
+        and parsed.database != ":memory:"
+        and not Path(parsed.database).exists()
+    ):
+        raise StoreError(f"there is no database {parsed.database}", f"give --db URL, --machine FILE or set {ENVIRONMENT}")
+    return Store.open(url)
+
+
+def print_json(value: Any) -> None:
+    """Write a value as JSON to stdout.
+
+    Parameters
+    ----------
+    value : object
+        JSON value.
+    """
+    sys.stdout.write(json.dumps(value, indent=2, ensure_ascii=False) + "\n")
+
+
+def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> None:
+    """Write a table to stdout; when piped, as wide as it needs and without lines.
+
+    Parameters
+    ----------
+    headings : sequence of str
+        Of the columns.
+    rows : iterable of sequence of str
+        Cells.
+    title : str, optional
+        Above it.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=400)
+    table = Table(*headings, title=title, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell, overflow="fold") for cell in row))  # Text: brackets of file names are not markup
+    console.print(table)

@@ -1,0 +1,42 @@
+"""``abbe check-config`` and ``abbe schema``: what a machine file says, and what it can say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.common import JsonOption, print_json, print_table
+
+
+def check_config(
+    file: Annotated[Path, typer.Argument(help="Machine file (TOML).", show_default=False)],
+    as_json: JsonOption = False,
+) -> None:
+    """Check a machine file and print its effective values and where each comes from."""
+    from service.config import load_machine
+    from service.secrets import mask_secrets
+
+    loaded = load_machine(file)
+    database = mask_secrets(loaded.database_url)
+    if as_json:
+        values = {key: {"value": value, "origin": origin} for key, value, origin in loaded.values()}
+        print_json({"file": str(file), "database": database, "values": values})
+        return
+    rows = [(key, "-" if value is None else json.dumps(value, ensure_ascii=False), origin) for key, value, origin in loaded.values()]
+    print_table(("key", "value", "from"), rows, title=f"{file} is good")
+    typer.echo(f"database: {database}")
+
+
+def schema(folder: Annotated[Path, typer.Argument(help="Folder to write to.")] = Path("docs/schemas")) -> None:
+    """Write the JSON Schemas of the machine file and of the exchange files."""
+    from service.errors import ConfigError
+    from service.schemas import write_schemas
+
+    try:
+        for path in write_schemas(folder):
+            typer.echo(str(path))
+    except OSError as err:
+        raise ConfigError(f"{folder}: cannot be written: {err.strerror}", "give a folder that may be written") from None

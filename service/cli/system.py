@@ -1,0 +1,49 @@
+"""``abbe version`` and ``abbe sim``: about the program, and the simulated machine beside it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from types import FrameType
+from typing import Any
+
+import typer
+
+SIM_SETTINGS: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Everything after ``sim`` belongs to the simulators, ``--help`` included."""
+
+
+def version() -> None:
+    """Print the versions of Abbe, Python and SQLite, and whether SQLite may use its write-ahead log."""
+    import platform
+    import sqlite3
+    from importlib import metadata
+
+    from service.storage.engine import wal_is_safe
+
+    log = "write-ahead log" if wal_is_safe() else "no write-ahead log: this SQLite has the WAL-reset bug"
+    typer.echo(f"abbe {metadata.version('abbe')} (Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}, {log})")
+
+
+def sim(context: typer.Context) -> None:
+    """Run the simulated machine and its instruments; arguments go to `python -m simulators`."""
+    # A group of its own: Ctrl-C reaches the child once, from here, and not a second time from the terminal.
+    own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
+    child = subprocess.Popen([sys.executable, "-m", "simulators", *context.args], **own_group)  # noqa: S603 - our own package
+
+    def forward(number: int, _frame: FrameType | None) -> None:
+        if child.poll() is None:
+            child.send_signal(number)
+
+    handlers = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        code = child.wait()
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if child.poll() is None:
+            child.kill()
+            child.wait()
+    raise typer.Exit(code if code >= 0 else 128 - code)

@@ -1,0 +1,57 @@
+"""JSON Schemas of everything that people write or exchange, generated from the models that check it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from service.config_schema import MachineFile
+from service.runs.formats import CampaignFile, ErrorsFile, RunFile
+from service.runs.machine_object import MachineObject
+
+MODELS: dict[str, type[BaseModel]] = {
+    "machine-file": MachineFile,
+    "machine": MachineObject,
+    "run": RunFile,
+    "campaign": CampaignFile,
+    "errors": ErrorsFile,
+}
+
+
+def schema_text(name: str) -> str:
+    """Generate one schema.
+
+    Parameters
+    ----------
+    name : str
+        Key of ``MODELS``.
+
+    Returns
+    -------
+    str
+        JSON text, the same at every call.
+    """
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | MODELS[name].model_json_schema()
+    return json.dumps(schema, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
+
+
+def write_schemas(folder: Path) -> list[Path]:
+    """Write all schemas.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to; made if missing.
+
+    Returns
+    -------
+    list of Path
+        The files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.schema.json" for name in MODELS]
+    for name, path in zip(MODELS, paths, strict=True):
+        path.write_text(schema_text(name), encoding="utf-8", newline="\n")
+    return paths
