@@ -1,0 +1,115 @@
+"""``python -m simulators``: the outside world as a process of its own, or (``truth``) its sealed truth as figures."""
+
+import argparse
+import asyncio
+import dataclasses
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from simulators import scenario as scenarios
+from simulators.scenario import Scenario, ScenarioError
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def _parser(prog: str, what: str) -> _Parser:
+    parser = _Parser(prog=prog, description=what)
+    parser.add_argument("scenario", nargs="?", type=Path, default=scenarios.DEFAULT_PATH, help="TOML file (default: the packaged vmc.toml)")
+    parser.add_argument("--seed", type=int, help="draw another machine")
+    return parser
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command line; gives the exit code."""
+    try:
+        return _truth(argv[1:]) if argv[:1] == ["truth"] else _serve(argv)
+    except (ScenarioError, OSError) as exc:
+        sys.stderr.write(f"simulators: {exc}\n".replace("\n", " ").rstrip() + "\n")
+        return 2
+
+
+def _serve(argv: Sequence[str]) -> int:
+    parser = _parser("simulators", "Simulated machine tool with ball-bar, laser, controller and fixture on real wires (127.0.0.1 only).")
+    parser.add_argument("--speed", type=float, help="simulated seconds per second")
+    parser.add_argument("--link-dir", type=Path, help="directory for stable links to the serial lines")
+    parser.add_argument("--watch-stdin", action="store_true", help="end when standard input ends")
+    parser.add_argument("--ballbar", choices=("pty", "tcp"), help="transport of the ball-bar")
+    parser.add_argument("--laser", choices=("tcp", "rtu"), help="transport of the laser")
+    for device in ("ballbar", "laser", "cnc", "fixture"):
+        parser.add_argument(f"--{device}-port", type=int, help=f"TCP port of the {device} (0 = any)")
+    options = parser.parse_args(argv)
+    return asyncio.run(_run(_overridden(scenarios.load(options.scenario), options), options.link_dir, watch=options.watch_stdin))
+
+
+def _overridden(scenario: Scenario, options: argparse.Namespace) -> Scenario:
+    """Scenario with the command line's choices put in."""
+    changes: dict[str, Any] = {}
+    for name in ("seed", "speed"):
+        if getattr(options, name) is not None:
+            changes[name] = getattr(options, name)
+    for device in ("ballbar", "laser", "cnc", "fixture"):
+        given = {"transport": getattr(options, device, None), "port": getattr(options, f"{device}_port")}
+        changes[device] = dataclasses.replace(getattr(scenario, device), **{k: v for k, v in given.items() if v is not None})
+    result = dataclasses.replace(scenario, **changes)
+    scenarios.check(result)
+    return result
+
+
+async def _run(scenario: Scenario, link_dir: Path | None, *, watch: bool) -> int:
+    from simulators.site import Site
+
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    if watch:
+        threading.Thread(target=_watch_stdin, args=(loop, stop), daemon=True).start()
+    site = Site(scenario, link_dir)
+    try:
+        sys.stdout.write(json.dumps(await site.start()) + "\n")
+        sys.stdout.flush()
+        await stop.wait()
+    finally:
+        await site.stop()
+    return 0
+
+
+def _watch_stdin(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
+    """Wait for the end of standard input: the parent is gone."""
+    while os.read(0, 4096):
+        pass
+    loop.call_soon_threadsafe(stop.set)
+
+
+def _truth(argv: Sequence[str]) -> int:
+    from simulators.truth.command import truth
+
+    parser = _parser("simulators truth", "The sealed truth: volumetric figures of the machine, with or without a correction.")
+    parser.add_argument("--bank", type=Path, help="compensation image (docs/protocols/cnc.md), big-endian words; absent: no correction")
+    parser.add_argument("--nodes", type=int, default=9, help="grid nodes per axis")
+    parser.add_argument("--arrows", action="store_true", help="add grid and deviation vectors")
+    options = parser.parse_args(argv)
+    scenario = scenarios.load(options.scenario)
+    if options.seed is not None:
+        scenario = dataclasses.replace(scenario, seed=options.seed)
+        scenarios.check(scenario)
+    if options.nodes < 2:
+        parser.error("--nodes: at least 2")
+    image = None if options.bank is None else options.bank.read_bytes()
+    sys.stdout.write(json.dumps(truth(scenario, image, options.nodes, arrows=options.arrows)) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""Telescoping ball-bar: the instrument (device), its bytes (wire) and the line they go over (port)."""

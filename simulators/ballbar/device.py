@@ -1,0 +1,138 @@
+"""The ball-bar as a state machine: mounting, streaming, samples. No bytes; mm inside, nm and µs where the box counts in them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from simulators.arrays import I64, B, F
+from simulators.scenario import Magnitudes
+from simulators.truth.draws import STREAM_BAR_NOISE, STREAM_CUP, Draws, generator
+
+RANGE_MM = 1.0
+MAX_RATE_HZ = 1000
+OUT_OF_RANGE, OVERRUN, SYNC, NO_BAR = 1, 4, 8, 16
+
+Locate = Callable[[F, F], F]
+"""Times (n,) s and axis positions (n, 3) mm to actual tool positions (n, 3) mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Successive samples as columns (n,): number since START, device time µs, reading nm, status bits."""
+
+    seq: I64
+    time_us: I64
+    reading_nm: I64
+    status: I64
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """Raw material of samples: what the world looked like at each instant."""
+
+    seq: I64
+    time_us: I64
+    axes_mm: F
+    sync: B
+
+
+class BallbarDevice:
+    """Samples on its own clock, which runs ``clock_offset_us`` ahead of the world's: it was switched on earlier."""
+
+    def __init__(self, draws: Draws, sizes: Magnitudes, locate: Locate, *, clock_offset_us: int = 0) -> None:
+        self._draws, self._sizes, self._locate = draws, sizes, locate
+        self.offset_us = clock_offset_us
+        self.rate_hz = 0
+        self._start_us = 0
+        self._next = 0
+        self._cup_mm: F | None = None
+        self._radius_mm = 0.0
+        self._mounts = 0
+        self._noise = generator(draws.seed, STREAM_BAR_NOISE)
+        self._taken: list[_Taken] = []
+        self._ready: list[Samples] = []
+
+    # ---- people --------------------------------------------------------------------------------------------------
+
+    def mount(self, radius_mm: float, tool_mm: F) -> None:
+        """Put the cup at the tool's actual position (3,), a little beside it, and hang in the bar of nominal length ``radius_mm``."""
+        self.settle()
+        rng = generator(self._draws.seed, STREAM_CUP, self._mounts)
+        self._mounts += 1
+        direction = rng.normal(size=3)
+        offset_mm = rng.uniform(*self._sizes.cup_offset_um) * 1e-3
+        self._cup_mm = tool_mm + direction / np.linalg.norm(direction) * offset_mm
+        self._radius_mm = radius_mm
+
+    def unmount(self) -> None:
+        """Take the bar away."""
+        self.settle()
+        self._cup_mm = None
+
+    # ---- commands ------------------------------------------------------------------------------------------------
+
+    def start(self, rate_hz: int, now_s: float) -> bool:
+        """Start streaming, numbered from 0; the first sample comes one period from now. False for an impossible rate."""
+        if not 0 < rate_hz <= MAX_RATE_HZ or MAX_RATE_HZ % rate_hz:
+            return False
+        self._taken.clear()
+        self._ready.clear()
+        self.rate_hz, self._next = rate_hz, 0
+        self._start_us = int(now_s * 1e6) + self._period_us
+        return True
+
+    def stop(self) -> None:
+        """Stop streaming; samples already taken stay."""
+        self.rate_hz = 0
+
+    @property
+    def _period_us(self) -> int:
+        return 1_000_000 // self.rate_hz
+
+    # ---- time ----------------------------------------------------------------------------------------------------
+
+    def due_s(self, until_s: float) -> F:
+        """Instants (world time, s) of the samples to be taken up to ``until_s``."""
+        if self.rate_hz == 0:
+            return np.empty(0)
+        count = (int(until_s * 1e6) - self._start_us) // self._period_us + 1 - self._next
+        if count <= 0:
+            return np.empty(0)
+        ticks = np.arange(self._next, self._next + count, dtype=np.float64)
+        return (self._start_us + self._period_us * ticks) * 1e-6
+
+    def record(self, axes_mm: F, sync: B) -> None:
+        """Take the next n samples: axis positions (n, 3) mm and sync levels (n,) at the instants ``due_s`` named."""
+        seq = np.arange(self._next, self._next + len(axes_mm))
+        self._taken.append(_Taken(seq, self._start_us + self._period_us * seq, axes_mm, sync))
+        self._next += len(axes_mm)
+
+    def take(self) -> Samples:
+        """Give all samples taken since the last call."""
+        self.settle()
+        ready, self._ready = self._ready, []
+        if len(ready) == 1:
+            return ready[0]
+        none = np.empty(0, dtype=np.int64)
+        return Samples(*(np.concatenate([none, *(getattr(s, name) for s in ready)]) for name in Samples.__slots__))
+
+    def settle(self) -> None:
+        """Turn raw material into readings, before anything the readings depend on is changed."""
+        if not self._taken:
+            return
+        parts, self._taken = self._taken, []
+        seq, time_us = (np.concatenate([getattr(p, name) for p in parts]) for name in ("seq", "time_us"))
+        axes_mm, sync = np.concatenate([p.axes_mm for p in parts]), np.concatenate([p.sync for p in parts])
+        noise = self._noise.normal(size=len(seq)) * self._draws.bar_noise_mm
+        status = np.where(sync, SYNC, 0)
+        reading_mm = np.zeros(len(seq))
+        if self._cup_mm is None:
+            status |= NO_BAR
+        else:
+            distance = np.linalg.norm(self._locate(time_us * 1e-6, axes_mm) - self._cup_mm, axis=1)
+            free = distance - self._radius_mm + self._draws.bar_length_error_mm + noise
+            reading_mm[:] = np.clip(free, -RANGE_MM, RANGE_MM)
+            status |= np.where(np.abs(free) > RANGE_MM, OUT_OF_RANGE, 0)
+        reading_nm = np.rint(reading_mm * 1e6).astype(np.int64)
+        self._ready.append(Samples(seq, time_us + self.offset_us, reading_nm, status.astype(np.int64)))

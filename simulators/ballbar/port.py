@@ -1,0 +1,138 @@
+"""The line the ball-bar's box speaks over: bytes in, bytes out, a bounded buffer, never blocking."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+from simulators.pseudo_serial import PseudoSerial
+
+BUFFER_BYTES = 65536
+BAUD = 460800
+
+Received = Callable[[bytes], None]
+
+
+class BytePort(Protocol):
+    """What the box needs of its line."""
+
+    @property
+    def url(self) -> str:
+        """Where a host finds it."""
+        ...
+
+    def room(self) -> int:
+        """Bytes that can be sent now without losing any."""
+        ...
+
+    def send(self, data: bytes) -> None:
+        """Send bytes (answers may exceed the room)."""
+        ...
+
+    def pump(self) -> None:
+        """Pass on what waits in the buffer."""
+        ...
+
+    async def open(self, received: Received) -> None:
+        """Be reachable from now on; ``received`` gets the host's bytes."""
+        ...
+
+    async def close(self) -> None:
+        """Be unplugged: the host sees the end of the line."""
+        ...
+
+
+class PtyPort:
+    """A serial line: a pseudo terminal, at a stable path when ``link`` is given."""
+
+    def __init__(self, link: Path | None) -> None:
+        self._link = link
+        self._serial: PseudoSerial | None = None
+
+    @property
+    def url(self) -> str:
+        """``serial://`` and the path of the terminal or of its link."""
+        path = "" if self._serial is None else self._serial.path
+        return f"serial://{path}?baud={BAUD}"
+
+    def room(self) -> int:
+        """Room in the buffer; none while unplugged."""
+        return 0 if self._serial is None else max(0, BUFFER_BYTES - self._serial.backlog)
+
+    def send(self, data: bytes) -> None:
+        """Send bytes."""
+        if self._serial is not None:
+            self._serial.send(data)
+
+    def pump(self) -> None:
+        """Pass on what waits in the buffer."""
+        if self._serial is not None:
+            self._serial.pump()
+
+    async def open(self, received: Received) -> None:
+        """Make the terminal."""
+        self._serial = PseudoSerial(received, self._link)
+
+    async def close(self) -> None:
+        """Hang up and take the link away."""
+        if self._serial is not None:
+            self._serial.close()
+            self._serial = None
+
+
+class TcpPort:
+    """The same bytes over raw TCP on 127.0.0.1; the newest connection is the one that counts."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._server: asyncio.Server | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._received: Received = lambda data: None
+
+    @property
+    def url(self) -> str:
+        """``socket://`` and the address."""
+        return f"socket://127.0.0.1:{self._port}"
+
+    def room(self) -> int:
+        """Room in the buffer; none without a host."""
+        if self._writer is None:
+            return 0
+        return max(0, BUFFER_BYTES - self._writer.transport.get_write_buffer_size())
+
+    def send(self, data: bytes) -> None:
+        """Send bytes."""
+        if self._writer is not None:
+            self._writer.write(data)
+
+    def pump(self) -> None:
+        """Do nothing: the transport passes its buffer on by itself."""
+
+    async def open(self, received: Received) -> None:
+        """Listen; the port found free is kept for the next time."""
+        self._received = received
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._port)
+        self._port = int(self._server.sockets[0].getsockname()[1])
+
+    async def close(self) -> None:
+        """Stop listening and drop the host."""
+        self._drop()
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._drop()
+        self._writer = writer
+        with suppress(ConnectionError):
+            while data := await reader.read(4096):
+                self._received(data)
+        if self._writer is writer:
+            self._writer = None
+        writer.close()
+
+    def _drop(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None

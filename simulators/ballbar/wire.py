@@ -1,0 +1,173 @@
+"""Bytes of the ball-bar's box (docs/protocols/ballbar.md), little-endian, and the conversation over them."""
+
+import struct
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.ballbar.device import MAX_RATE_HZ, OVERRUN, BallbarDevice, Samples
+from simulators.ballbar.port import BytePort
+
+SYNC_BYTES = b"\xa5\x5a"
+SAMPLE, INFO, ACK = 0x01, 0x02, 0x03
+IDENTIFY, START, STOP = 0x81, 0x82, 0x83
+MAX_PAYLOAD = 32
+OK, BAD_ARGUMENT, UNKNOWN_COMMAND = 0, 1, 2
+FIRMWARE_BCD = 0x0100
+SERIAL_NO = 4711
+MODEL = b"ABB-1"
+SAMPLE_BYTES = 24
+
+_SAMPLE_DTYPE = np.dtype(
+    [
+        ("sync", "u1", (2,)),
+        ("type", "u1"),
+        ("length", "u1"),
+        ("seq", "<u4"),
+        ("time_us", "<u8"),
+        ("reading_nm", "<i4"),
+        ("status", "<u2"),
+        ("crc", "<u2"),
+    ]
+)
+
+
+def _crc_table() -> NDArray[np.uint16]:
+    """CRC-16/CCITT-FALSE of each single byte value."""
+    table = []
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1
+        table.append(crc & 0xFFFF)
+    return np.array(table, dtype=np.uint16)
+
+
+_TABLE = _crc_table()
+_TABLE_LIST = [int(v) for v in _TABLE]
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE of some bytes."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = ((crc << 8) & 0xFFFF) ^ _TABLE_LIST[(crc >> 8) ^ byte]
+    return crc
+
+
+def encode(kind: int, payload: bytes) -> bytes:
+    """One frame."""
+    body = bytes([kind, len(payload)]) + payload
+    return SYNC_BYTES + body + struct.pack("<H", crc16(body))
+
+
+def encode_samples(samples: Samples) -> bytes:
+    """SAMPLE frames of n samples, all at once."""
+    frames = np.zeros(len(samples.seq), dtype=_SAMPLE_DTYPE)
+    frames["sync"] = (0xA5, 0x5A)
+    frames["type"], frames["length"] = SAMPLE, 18
+    frames["seq"] = samples.seq & 0xFFFFFFFF
+    frames["time_us"], frames["reading_nm"], frames["status"] = samples.time_us, samples.reading_nm, samples.status
+    columns = frames.view(np.uint8).reshape(-1, SAMPLE_BYTES)
+    crc = np.full(len(frames), 0xFFFF, dtype=np.uint16)
+    for i in range(2, SAMPLE_BYTES - 2):  # byte by byte, but all frames together
+        crc = (crc << 8) ^ _TABLE[(crc >> 8) ^ columns[:, i]]
+    frames["crc"] = crc
+    return frames.tobytes()
+
+
+def encode_info(tag: int, boot_id: int, rate_hz: int) -> bytes:
+    """INFO frame."""
+    return encode(INFO, struct.pack("<HIIHHH12s", tag, boot_id, SERIAL_NO, FIRMWARE_BCD, MAX_RATE_HZ, rate_hz, MODEL))
+
+
+def encode_ack(tag: int, command: int, result: int) -> bytes:
+    """ACK frame."""
+    return encode(ACK, struct.pack("<HBB", tag, command, result))
+
+
+class Parser:
+    """Finds the host's frames in a stream of bytes; garbage and frames with a wrong CRC are skipped without a word."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Give (type, payload) of each whole frame."""
+        self._buffer += data
+        while True:
+            begin = self._buffer.find(SYNC_BYTES)
+            if begin < 0:
+                del self._buffer[: max(0, len(self._buffer) - 1)]  # the last byte may be half a sync
+                return
+            del self._buffer[:begin]
+            if len(self._buffer) < 4:
+                return
+            length = self._buffer[3]
+            end = 6 + length
+            if length <= MAX_PAYLOAD and len(self._buffer) < end:
+                return
+            body = bytes(self._buffer[2 : end - 2])
+            if length > MAX_PAYLOAD or crc16(body) != struct.unpack_from("<H", self._buffer, end - 2)[0]:
+                del self._buffer[:2]  # not a frame: look for the next sync behind this one
+                continue
+            del self._buffer[:end]
+            yield body[0], body[2:]
+
+
+class BallbarWire:
+    """The box's conversation: answers commands, writes the samples that are due, drops whole samples when nobody reads."""
+
+    def __init__(self, device: BallbarDevice, port: BytePort, boot_id: int, now_s: Callable[[], float]) -> None:
+        self._device, self._port, self._boot_id, self._now_s = device, port, boot_id, now_s
+        self._parser = Parser()
+        self._overrun = False
+        self.samples_sent = 0
+        self.samples_dropped = 0
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the host. The world must be up to date."""
+        for kind, payload in self._parser.feed(data):
+            self.flush()  # samples older than the command leave before its answer
+            self._port.send(self._answer(kind, payload))
+
+    def flush(self) -> None:
+        """Write all samples taken so far."""
+        samples = self._device.take()
+        count = len(samples.seq)
+        kept = min(count, self._port.room() // SAMPLE_BYTES)
+        if kept:
+            status = samples.status[:kept].copy()
+            if self._overrun:
+                status[0] |= OVERRUN
+                self._overrun = False
+            self._port.send(encode_samples(Samples(samples.seq[:kept], samples.time_us[:kept], samples.reading_nm[:kept], status)))
+            self.samples_sent += kept
+        if kept < count:
+            self._overrun = True
+            self.samples_dropped += count - kept
+
+    def restart(self, boot_id: int) -> None:
+        """Power cycle of the box: new boot id, not streaming, nothing remembered."""
+        self._device.stop()
+        self._device.take()
+        self._boot_id, self._parser, self._overrun = boot_id, Parser(), False
+
+    def _answer(self, kind: int, payload: bytes) -> bytes:
+        tag = struct.unpack_from("<H", payload)[0] if len(payload) >= 2 else 0
+        if kind == IDENTIFY and len(payload) == 2:
+            return encode_info(tag, self._boot_id, self._device.rate_hz)
+        if kind == START and len(payload) == 4:
+            return encode_ack(tag, START, self._start(struct.unpack_from("<H", payload, 2)[0]))
+        if kind == STOP and len(payload) == 2:
+            self._device.stop()
+            return encode_ack(tag, STOP, OK)
+        return encode_ack(tag, kind, BAD_ARGUMENT if kind in (IDENTIFY, START, STOP) else UNKNOWN_COMMAND)
+
+    def _start(self, rate_hz: int) -> int:
+        if not self._device.start(rate_hz, self._now_s()):
+            return BAD_ARGUMENT
+        self.samples_sent = self.samples_dropped = 0
+        self._overrun = False
+        return OK

@@ -1,0 +1,1 @@
+"""CNC controller: motion, compensation banks (device) and its Modbus TCP map (wire)."""

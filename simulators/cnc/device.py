@@ -1,0 +1,256 @@
+"""The CNC controller as a state machine: interlocks, moves, paths, holds. No bytes; positions in mm, times in controller seconds."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from simulators.arrays import B, F
+from simulators.cnc.compensation import Compensation
+from simulators.cnc.motion import Motion
+from simulators.truth.machine import Geometry
+
+FIFO_SIZE = 8192
+_TOLERANCE_MM = 1e-9
+
+
+class Result(IntEnum):
+    """MOTION_RESULT and FIFO_RESULT."""
+
+    OK = 0
+    BAD_ARGUMENT = 1
+    INTERLOCK = 2
+    STROKE_LIMIT = 3
+    FIFO_FULL = 4
+    BUSY = 5
+
+
+class Hold(IntEnum):
+    """HOLD_REQUEST."""
+
+    RUN = 0
+    HOLD = 1
+    ABORT = 2
+
+
+ALARM_NONE, ALARM_ESTOP = 0, 1
+
+
+@dataclass(slots=True)
+class Switches:
+    """What people and the shop floor do to the controller."""
+
+    estop: bool = False
+    door_open: bool = False
+    remote: bool = True
+    referenced: bool = True
+    program_running: bool = False
+    spindle_turning: bool = False
+
+
+class Controller:
+    """Motion side of the controller, with its compensation banks beside it."""
+
+    def __init__(self, geometry: Geometry, *, lease_scale: float = 1.0) -> None:
+        self._low, self._high = geometry.low_mm, geometry.high_mm
+        self.comp = Compensation(lease_scale)
+        self.switches = Switches()
+        self.now_s = 0.0
+        self.position_mm: F = 0.5 * (self._low + self._high)
+        self.alarm = ALARM_NONE
+        self.drives_on = True
+        self.override_percent = 100
+        self.hold = Hold.RUN
+        self.in_position = True
+        self.in_position_s = 0.0
+        self.motions_done = 0
+        """Motions finished since boot; the wire compares it to know whether its last command has finished."""
+        self.path_running = False
+        self.path_start_s = 0.0
+        self.path_end_s = 0.0
+        self._path_points = 0
+        self._fifo: list[tuple[float, float, float]] = []
+        self._motion: Motion | None = None
+
+    # ---- reading -------------------------------------------------------------------------------------------------
+
+    @property
+    def moving(self) -> bool:
+        """A motion command is under way (also while held)."""
+        return self._motion is not None
+
+    @property
+    def held(self) -> bool:
+        """Feed hold is in effect: asked for, or the door is open."""
+        return self.hold == Hold.HOLD or self.switches.door_open
+
+    @property
+    def fifo_free(self) -> int:
+        """Points that still fit: those waiting and those of the running path not yet reached take room."""
+        waiting = len(self._fifo)
+        if self.path_running and self._motion is not None:
+            waiting += self._motion.vertex_count - self.path_points_done
+        return FIFO_SIZE - waiting
+
+    @property
+    def path_points_done(self) -> int:
+        """Points reached of the running or last path."""
+        if self.path_running and self._motion is not None:
+            return self._motion.vertices_reached(self.now_s)
+        return self._path_points
+
+    def may_move(self) -> bool:
+        """Whether the motion interlocks hold."""
+        s = self.switches
+        blocked = s.estop or s.door_open or s.program_running or s.spindle_turning or self.alarm != ALARM_NONE
+        return not blocked and s.remote and s.referenced and self.drives_on
+
+    def commanded(self, times_s: F) -> F:
+        """Commanded positions at n instants from now until the next command: (n, 3) mm."""
+        if self._motion is None:
+            return np.repeat(self.position_mm[None, :], times_s.size, axis=0)
+        return self._motion.position(times_s)
+
+    def turning_times(self, until_s: float) -> F:
+        """Instants after now and up to ``until_s`` at which the commanded point passes a vertex."""
+        return np.empty(0) if self._motion is None else self._motion.vertex_times(self.now_s, until_s)
+
+    def sync_level(self, times_s: F) -> B:
+        """Level of the path-running output at n instants from now on."""
+        if not self.path_running or self._motion is None:
+            return np.zeros(times_s.size, dtype=np.bool_)
+        level: B = (times_s >= self.path_start_s) & (times_s < self._motion.end_s())
+        return level
+
+    # ---- time ----------------------------------------------------------------------------------------------------
+
+    def advance(self, to_s: float) -> None:
+        """Let time pass; a motion that arrives in between ends exactly at its own instant."""
+        motion = self._motion
+        if motion is not None:
+            end_s = motion.end_s()
+            if end_s <= to_s:
+                self.now_s = max(end_s, self.now_s)
+                self.position_mm = motion.target_mm.copy()
+                self._finish(motion.vertex_count)
+            else:
+                self.position_mm = motion.position(np.array([to_s]))[0]
+        self.now_s = to_s
+
+    # ---- commands ------------------------------------------------------------------------------------------------
+
+    def move(self, target_mm: F, feed_mm_min: float) -> Result:
+        """Go straight to a target."""
+        refusal = self._refuse(feed_mm_min, target_mm[None, :])
+        if refusal:
+            return refusal
+        self._start(np.stack([self.position_mm, target_mm]), feed_mm_min)
+        return Result.OK
+
+    def path_clear(self) -> Result:
+        """Empty the FIFO."""
+        if self.moving:
+            return Result.BUSY
+        self._fifo.clear()
+        return Result.OK
+
+    def path_start(self, feed_mm_min: float) -> Result:
+        """Run all points in the FIFO from the current position."""
+        refusal = self._refuse(feed_mm_min, np.empty((0, 3)))
+        if refusal:
+            return refusal
+        if not self._fifo:
+            return Result.BAD_ARGUMENT
+        vertices = np.vstack([self.position_mm[None, :], np.array(self._fifo)])
+        self._fifo.clear()
+        self.path_running, self.path_start_s, self.path_end_s = True, self.now_s, 0.0
+        self._start(vertices, feed_mm_min)
+        return Result.OK
+
+    def fifo_push(self, points_mm: F) -> Result:
+        """Store path points (n, 3); a running path is extended by them."""
+        if not self._inside(points_mm):
+            return Result.STROKE_LIMIT
+        if len(points_mm) > self.fifo_free:
+            return Result.FIFO_FULL
+        if self.path_running and self._motion is not None:
+            self._motion.extend(points_mm)
+        else:
+            self._fifo.extend((float(x), float(y), float(z)) for x, y, z in points_mm)
+        return Result.OK
+
+    def reset_alarm(self) -> Result:
+        """Clear the alarm and switch the drives on again; refused while its cause lasts."""
+        if self.switches.estop:
+            return Result.INTERLOCK
+        self.alarm, self.drives_on = ALARM_NONE, True
+        self.in_position = not self.moving
+        return Result.OK
+
+    def request_hold(self, request: Hold) -> None:
+        """Take the level of HOLD_REQUEST."""
+        self.hold = request
+        if request == Hold.ABORT:
+            self._fifo.clear()
+            if self._motion is not None:
+                self._finish(self.path_points_done)
+        self._apply_speed()
+
+    def set_override(self, percent: int) -> None:
+        """Turn the feed override knob."""
+        self.override_percent = percent
+        self._apply_speed()
+
+    def set_door(self, *, is_open: bool) -> None:
+        """Open or close the door; a motion is held while it is open."""
+        self.switches.door_open = is_open
+        self._apply_speed()
+
+    def set_estop(self, *, pressed: bool) -> None:
+        """Press or release the emergency stop: motion ends where it is and does not count as done."""
+        self.switches.estop = pressed
+        if not pressed:
+            return
+        self.alarm, self.drives_on, self.in_position = ALARM_ESTOP, False, False
+        self._fifo.clear()
+        if self._motion is not None:
+            self._end_path(self.path_points_done)
+            self._motion = None
+
+    # ---- inner ---------------------------------------------------------------------------------------------------
+
+    def _refuse(self, feed_mm_min: float, points_mm: F) -> Result:
+        """Checks common to MOVE and PATH_START; OK = go."""
+        if self.moving:
+            return Result.BUSY
+        if not self.may_move() or self.hold == Hold.ABORT:
+            return Result.INTERLOCK
+        if not feed_mm_min > 0.0:
+            return Result.BAD_ARGUMENT
+        return Result.OK if self._inside(points_mm) else Result.STROKE_LIMIT
+
+    def _inside(self, points_mm: F) -> bool:
+        """Whether all points are within the strokes."""
+        return bool(np.all((points_mm >= self._low - _TOLERANCE_MM) & (points_mm <= self._high + _TOLERANCE_MM)))
+
+    def _start(self, vertices_mm: F, feed_mm_min: float) -> None:
+        self._motion = Motion(vertices_mm, feed_mm_min / 60.0, self.now_s)
+        self.in_position = False
+        self._apply_speed()
+        if self._motion.total_mm == 0.0:
+            self._finish(self._motion.vertex_count)
+
+    def _apply_speed(self) -> None:
+        if self._motion is not None:
+            self._motion.set_factor(0.0 if self.held else self.override_percent / 100.0, self.now_s)
+
+    def _finish(self, points_done: int) -> None:
+        """Count the motion as done, here and now."""
+        self._end_path(points_done)
+        self._motion = None
+        self.in_position, self.in_position_s = True, self.now_s
+        self.motions_done += 1
+
+    def _end_path(self, points_done: int) -> None:
+        if self.path_running:
+            self._path_points, self.path_end_s, self.path_running = points_done, self.now_s, False

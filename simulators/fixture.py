@@ -1,0 +1,180 @@
+"""The remote fixture (docs/protocols/fixture.md): whoever mounts bar and mirror, asked by JSON lines over TCP."""
+
+import asyncio
+import json
+import math
+from collections.abc import Awaitable, Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from simulators.scenario import AXES
+from simulators.world import World
+
+Answer = dict[str, Any]
+MAX_RADIUS_MM = 2000.0
+
+
+class FixtureError(ValueError):
+    """A request that cannot be done; the message goes back to whoever asked."""
+
+
+class Box(Protocol):
+    """What the fixture does to the ball-bar's box besides mounting."""
+
+    def ledger(self) -> Answer:
+        """Samples sent and dropped since the last start."""
+        ...
+
+    async def unplug(self) -> None:
+        """Pull the cable."""
+        ...
+
+    async def plug(self) -> str:
+        """Put the cable back; gives the URL."""
+        ...
+
+
+class Fixture:
+    """Serves requests one line at a time. ``advance`` brings the world up to date before each."""
+
+    def __init__(self, world: World, box: Box, advance: Callable[[], None]) -> None:
+        self._world, self._box, self._advance = world, box, advance
+        self._server: asyncio.Server | None = None
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._ops: dict[str, Callable[[Answer], Awaitable[Answer]]] = {
+            "identify": self._identify,
+            "mount_ballbar": self._mount_ballbar,
+            "mount_laser": self._mount_laser,
+            "unmount": self._unmount,
+            "estop": self._estop,
+            "door": self._door,
+            "beam": self._beam,
+            "drift": self._drift,
+            "unplug_ballbar": self._unplug,
+            "plug_ballbar": self._plug,
+            "ledger": self._ledger,
+        }
+
+    async def start(self, port: int) -> int:
+        """Listen on 127.0.0.1; gives the port."""
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", port)
+        return int(self._server.sockets[0].getsockname()[1])
+
+    async def stop(self) -> None:
+        """Close the listener and its connections."""
+        if self._server is not None:
+            self._server.close()
+        for writer in tuple(self._writers):
+            writer.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._writers.add(writer)
+        try:
+            while line := await reader.readline():
+                writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
+                await writer.drain()
+        except (ConnectionError, ValueError):  # gone, or a line without end
+            pass
+        finally:
+            self._writers.discard(writer)
+            writer.close()
+
+    async def answer(self, line: bytes) -> Answer:
+        """Answer one request line."""
+        request: Any = None
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise FixtureError("a JSON object is expected")
+            operation = self._ops.get(str(request.get("op")))
+            if operation is None:
+                raise FixtureError(f"unknown op: {request.get('op')}")
+            self._advance()
+            extra = await operation(request)
+        except (FixtureError, json.JSONDecodeError, UnicodeDecodeError) as exc:
+            number = request.get("id") if isinstance(request, dict) else None
+            return {"id": number, "ok": False, "error": str(exc)}
+        return {"id": request.get("id"), "ok": True, "time_us": round(self._world.time_s * 1e6), **extra}
+
+    # ---- what everybody may ask ----------------------------------------------------------------------------------
+
+    async def _identify(self, request: Answer) -> Answer:
+        return {"name": "Abbe simulator"}
+
+    async def _mount_ballbar(self, request: Answer) -> Answer:
+        radius_mm = _number(request, "radius_mm")
+        if not 0.0 < radius_mm <= MAX_RADIUS_MM:
+            raise FixtureError("radius_mm is out of range")
+        self._world.ballbar.mount(radius_mm, self._standing())
+        return {}
+
+    async def _mount_laser(self, request: Answer) -> Answer:
+        beam = request.get("beam")
+        if not isinstance(beam, list) or len(beam) != 3 or not all(_is_number(v) for v in beam):
+            raise FixtureError("beam: three numbers are expected")
+        direction = np.array(beam, dtype=np.float64)
+        if not 0.9 < float(np.linalg.norm(direction)) < 1.1:
+            raise FixtureError("beam is not a unit vector")
+        self._world.laser.mount(direction, self._standing())
+        return {}
+
+    async def _unmount(self, request: Answer) -> Answer:
+        self._world.ballbar.unmount()
+        self._world.laser.unmount()
+        return {}
+
+    def _standing(self) -> Any:
+        """Tool position; nobody reaches into a moving machine."""
+        if self._world.controller.moving:
+            raise FixtureError("the machine is moving")
+        return self._world.tool_position()
+
+    # ---- for tests only ------------------------------------------------------------------------------------------
+
+    async def _estop(self, request: Answer) -> Answer:
+        self._world.controller.set_estop(pressed=_switch(request, "on"))
+        return {}
+
+    async def _door(self, request: Answer) -> Answer:
+        self._world.controller.set_door(is_open=_switch(request, "on"))
+        return {}
+
+    async def _beam(self, request: Answer) -> Answer:
+        self._world.laser.block(blocked=_switch(request, "blocked"))
+        return {}
+
+    async def _drift(self, request: Answer) -> Answer:
+        axis = request.get("axis")
+        if axis not in AXES:
+            raise FixtureError("axis: X, Y or Z is expected")
+        self._world.add_scale(AXES.index(axis), _number(request, "um_per_m") * 1e-6)
+        return {}
+
+    async def _unplug(self, request: Answer) -> Answer:
+        await self._box.unplug()
+        return {}
+
+    async def _plug(self, request: Answer) -> Answer:
+        return {"ballbar": await self._box.plug()}
+
+    async def _ledger(self, request: Answer) -> Answer:
+        return {**self._box.ledger(), "sim_time_s": self._world.time_s}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _number(request: Answer, key: str) -> float:
+    value = request.get(key)
+    if not _is_number(value):
+        raise FixtureError(f"{key}: a number is expected")
+    return float(value)  # type: ignore[arg-type]
+
+
+def _switch(request: Answer, key: str) -> bool:
+    value = request.get(key)
+    if not isinstance(value, bool):
+        raise FixtureError(f"{key}: true or false is expected")
+    return value

@@ -1,0 +1,1 @@
+"""Laser displacement meter: the instrument (device) and its Modbus map (wire)."""

@@ -1,0 +1,106 @@
+"""The site: the world with its devices on real wires, kept in step with wall time."""
+
+import asyncio
+import secrets
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from simulators.ballbar.port import BytePort, PtyPort, TcpPort
+from simulators.ballbar.wire import BallbarWire
+from simulators.cnc.wire import CncRegisters
+from simulators.fixture import Fixture
+from simulators.laser.wire import LaserRegisters
+from simulators.modbus_wire import ModbusTcp
+from simulators.rtu_line import RtuLine
+from simulators.scenario import Scenario
+from simulators.world import LASER_CLOCK_US, World
+
+TICK_S = 0.005
+BALLBAR_LINK, LASER_LINK = "ballbar", "laser"
+
+
+class Site:
+    """All wires of one world. Simulated time = speed x wall time since ``start``."""
+
+    def __init__(self, scenario: Scenario, link_dir: Path | None = None) -> None:
+        self.world = World(scenario)
+        self._scenario = scenario
+        self._begin_s = 0.0
+        self._ticking: asyncio.TimerHandle | None = None
+        self._links = link_dir
+        port: BytePort = PtyPort(self._link(BALLBAR_LINK)) if scenario.ballbar.transport == "pty" else TcpPort(scenario.ballbar.port)
+        self._port = port
+        self._plugged = False
+        self.box = BallbarWire(self.world.ballbar, port, secrets.randbits(32), lambda: self.world.time_s)
+        cnc = CncRegisters(self.world.controller, secrets.randbits(32), self.advance)
+        laser = LaserRegisters(
+            self.world.laser, secrets.randbits(32), self.advance, self.world.tool_position, clock_offset_us=LASER_CLOCK_US
+        )
+        self._cnc = ModbusTcp(cnc)
+        self._laser: ModbusTcp | RtuLine = ModbusTcp(laser) if scenario.laser.transport == "tcp" else RtuLine(laser, self._link(LASER_LINK))
+        self._fixture = Fixture(self.world, self, self.advance)
+
+    def _link(self, name: str) -> Path | None:
+        return None if self._links is None else self._links / name
+
+    async def start(self) -> dict[str, Any]:
+        """Open all wires; gives what a host needs to know. Raises OSError when a port is taken."""
+        self._begin_s = asyncio.get_running_loop().time()
+        scenario = self._scenario
+        if self._links is not None:
+            self._links.mkdir(parents=True, exist_ok=True)
+        urls = {"ballbar": await self.plug()}
+        if isinstance(self._laser, ModbusTcp):
+            urls["laser"] = f"modbus+tcp://127.0.0.1:{await self._laser.start(scenario.laser.port)}?unit=1"
+        else:
+            urls["laser"] = await self._laser.start()
+        urls["cnc"] = f"modbus+tcp://127.0.0.1:{await self._cnc.start(scenario.cnc.port)}?unit=1"
+        urls["fixture"] = f"fixture+tcp://127.0.0.1:{await self._fixture.start(scenario.fixture.port)}"
+        self._tick()
+        return {"ready": True, **urls, "speed": scenario.speed, "machine": asdict(scenario.machine)}
+
+    async def stop(self) -> None:
+        """Close all wires and remove the links."""
+        if self._ticking is not None:
+            self._ticking.cancel()
+        await self._port.close()
+        await self._fixture.stop()
+        await self._laser.stop()
+        await self._cnc.stop()
+
+    def advance(self) -> None:
+        """Bring the world up to wall time."""
+        self.world.advance(self._scenario.speed * (asyncio.get_running_loop().time() - self._begin_s))
+
+    def _tick(self) -> None:
+        """Advance and pass on the samples that are due, again and again."""
+        self.advance()
+        self.box.flush()
+        self._port.pump()
+        self._ticking = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _received(self, data: bytes) -> None:
+        self.advance()
+        self.box.received(data)
+
+    # ---- the cable of the ball-bar's box -------------------------------------------------------------------------
+
+    async def unplug(self) -> None:
+        """Pull the cable: the line ends, and the box, fed by it, goes dark."""
+        if self._plugged:
+            self._plugged = False
+            await self._port.close()
+            self.box.restart(secrets.randbits(32))
+
+    async def plug(self) -> str:
+        """Put the cable in; gives the URL."""
+        if not self._plugged:
+            await self._port.open(self._received)
+            self._plugged = True
+        return self._port.url
+
+    def ledger(self) -> dict[str, Any]:
+        """Samples sent and dropped since the last start."""
+        self.box.flush()
+        return {"samples_sent": self.box.samples_sent, "samples_dropped": self.box.samples_dropped}

@@ -1,0 +1,80 @@
+"""Exact kinematics of a three-axis machine with finite rotations (docs/conventions.md, "Exact kinematics")."""
+
+import numpy as np
+
+from simulators.arrays import F
+from simulators.scenario import AXES, MachineConfig, parse_chain
+from simulators.truth.draws import Draws
+
+
+class Geometry:
+    """The nominal machine as arrays: ``low_mm``, ``high_mm``, ``tool_mm`` (3,), ``pivots_mm`` (3, 3), sides as axis indices."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self.work_side, self.tool_side = parse_chain(config.chain)
+        strokes = np.array([getattr(config.stroke_mm, axis) for axis in AXES])
+        self.low_mm: F = strokes[:, 0].copy()
+        self.high_mm: F = strokes[:, 1].copy()
+        self.pivots_mm: F = np.array([getattr(config.pivots_mm, axis) for axis in AXES])
+        self.tool_mm: F = np.array(config.tool_mm)
+
+
+class Machine:
+    """How the machine really stands: position of the tool in workpiece coordinates as a function of the axis positions."""
+
+    def __init__(self, geometry: Geometry, draws: Draws) -> None:
+        self.geometry = geometry
+        self.draws = draws
+        self.extra_scale: F = np.zeros(3)
+        """Scale error (mm/mm) that somebody added after the draw, about the start of each stroke."""
+
+    def motions(self, axis: int, position_mm: F) -> tuple[F, F]:
+        """Translational (mm, with squareness) and angular (rad) error of one carriage at n positions: two arrays (n, 3)."""
+        values = self.draws.motions[axis](position_mm)
+        shift = values[:, :3].copy()
+        shift[:, axis] += self.extra_scale[axis] * (position_mm - self.geometry.low_mm[axis])
+        c0y, b0z, a0z = self.draws.squareness
+        if axis == 1:
+            shift[:, 0] -= c0y * position_mm
+        elif axis == 2:
+            shift[:, 0] += b0z * position_mm
+            shift[:, 1] -= a0z * position_mm
+        return shift, values[:, 3:]
+
+    def tool_position(self, axes_mm: F) -> F:
+        """Position of the functional point relative to the workpiece, mm: axis positions (n, 3) give (n, 3).
+
+        Without errors this is axis positions + tool_mm.
+        """
+        geometry = self.geometry
+        point = np.broadcast_to(geometry.tool_mm, axes_mm.shape)
+        for axis in reversed(geometry.tool_side):  # from the tool inwards to the bed
+            shift, angle = self.motions(axis, axes_mm[:, axis])
+            shift[:, axis] += axes_mm[:, axis]
+            pivot = geometry.pivots_mm[axis]
+            point = pivot + rotate(angle, point - pivot) + shift
+        for axis in reversed(geometry.work_side):  # from the bed outwards to the workpiece
+            shift, angle = self.motions(axis, axes_mm[:, axis])
+            shift[:, axis] += axes_mm[:, axis]
+            pivot = geometry.pivots_mm[axis]
+            point = pivot + rotate(angle, point + shift - pivot)
+        return point
+
+
+def rotate(angle_rad: F, vector: F) -> F:
+    """Turn n vectors by n rotation vectors (right-handed, Rodrigues): both (n, 3)."""
+    theta = np.sqrt(np.einsum("ij,ij->i", angle_rad, angle_rad))
+    first = np.sinc(theta / np.pi)[:, None]  # sin(theta) / theta, well behaved at 0
+    second = 0.5 * np.sinc(theta / (2.0 * np.pi))[:, None] ** 2  # (1 - cos(theta)) / theta^2
+    once = _cross(angle_rad, vector)
+    turned: F = vector + first * once + second * _cross(angle_rad, once)
+    return turned
+
+
+def _cross(a: F, b: F) -> F:
+    """Cross product of rows; numpy's own is several times slower on short arrays."""
+    out = np.empty(b.shape)
+    out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return out
