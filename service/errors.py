@@ -64,6 +64,12 @@ class NotObservable(AbbeError):
     code = "SOL-001"
 
 
+class InstrumentsDisagree(AbbeError):
+    """Two instruments contradict each other by more than their calibration allows: one of them, or its set-up, is wrong."""
+
+    code = "SOL-002"
+
+
 class TableRefused(AbbeError):
     """A table breaks a limit (value, step, change). Nothing was written."""
 

@@ -63,6 +63,16 @@ class JointSolution:
         return {a: (self.estimate.value(f"backlash_{a}"), self.estimate.u(f"backlash_{a}")) for a in DIRECTIONS}
 
 
+def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: float = 5.0) -> list[tuple[str, float]]:
+    """Set-up unknowns farther from zero than ``limit`` prior standard deviations: (name, how many), largest first.
+
+    A bar length that far off means that ball-bar and laser do not measure in the same millimetres.
+    """
+    e = solution.estimate
+    found = [(n, abs(e.value(n)) / prior_sd[n]) for n in e.names if n in prior_sd and abs(e.value(n)) > limit * prior_sd[n]]
+    return sorted(found, key=lambda item: -item[1])
+
+
 @dataclass(frozen=True)
 class Setup:
     """Names and priors of the set-up unknowns of a campaign."""

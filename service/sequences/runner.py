@@ -28,6 +28,7 @@ POLL_S = 0.01
 STALL_S = 10.0
 BAD_IN_A_ROW = 25
 SYNC, BAD_BITS = 0b1000, 0b10101
+COMPENSATED = 3
 
 Tick = Callable[[float], None]
 
@@ -106,6 +107,7 @@ class Runner:
             case ZeroLaser():
                 laser = self._s.need_laser()
                 await laser.clear_beam()
+                await laser.set_environment_compensation(True)  # without it every length is 270 ppm too long
                 await laser.zero()
             case ReadLaser(direction, settle_s):
                 await self._read_laser(direction, settle_s, recorder, here)
@@ -127,6 +129,8 @@ class Runner:
         laser = self._s.need_laser()
         before = await laser.read()
         reading = await laser.read(after_count=before.sample_count)  # a sample that began after the axes had settled
+        if not reading.status >> COMPENSATED & 1:
+            raise MeasurementFault("the laser's environmental compensation was switched off during the run", "start the test again")
         await recorder.add_record(
             {
                 "host_s": reading.host_s,

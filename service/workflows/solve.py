@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from models.solvers.helix import HelixSolution, fit_helix
-from models.solvers.joint import JointSolution, bar_normals, solve_joint
-from models.solvers.observations import nominal_reading
+from models.solvers.joint import JointSolution, bar_normals, implausible, setup_unknowns, solve_joint
+from models.solvers.observations import RunData, nominal_reading
+from models.solvers.priors import Priors
 from models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, wang_four
-from service.errors import NotObservable
+from service.errors import InstrumentsDisagree, NotObservable
 from service.runs.observations import bar_noise_mm, run_data
 from service.site import Site
 
@@ -55,11 +56,30 @@ def solve_runs(site: Site, runs: list[dict[str, Any]]) -> Solved:
         sigma_mm={"bar": max(noise, 1e-4), "laser": LASER_SIGMA_MM},
         floor_mm={"bar": FLOOR_MM, "laser": FLOOR_MM},
     )
+    check_instruments(joint, data)
     helices = {}
     for run in data:
         if run.kind == "bar" and run.centre_mm is not None and run.radius_mm is not None:
             helices[run.label] = fit_helix(run.axes_mm, run.deviation_mm, run.centre_mm, run.radius_mm, sigma_mm=max(noise, 1e-4))
     return Solved(joint, helices, step_diagonals(used), noise)
+
+
+def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> None:
+    """Refuse a solution in which a bar, cup or mirror would have to be impossibly wrong.
+
+    Raises
+    ------
+    InstrumentsDisagree
+        Which set-up unknown, and by how much.
+    """
+    setup = setup_unknowns(data, Priors())
+    found = implausible(joint, dict(zip(setup.names, (float(v) for v in setup.prior_sd), strict=True)))
+    if found:
+        name, times = found[0]
+        raise InstrumentsDisagree(
+            f"{name.replace('_', ' ')} would have to be {times:.0f} times its calibration uncertainty",
+            "check the laser's air compensation, the bar's length and the mirror before measuring again; nothing was written",
+        )
 
 
 def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
