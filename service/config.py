@@ -144,7 +144,8 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[str, Any]) -> ConfigError:
-    first, more = errors[0], len(errors) - 1
+    # A mistyped key is both unknown and missing: what stands there says more than what does not.
+    first, more = min(errors, key=lambda one: one["type"] != "extra_forbidden"), len(errors) - 1
     location = first["loc"]
     source = f"{PREFIX} environment" if _holds(environment, location) else str(path)
     tail = f" (and {more} more)" if more else ""
@@ -154,7 +155,8 @@ def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[s
         return ConfigError(f"{source}: unknown key {key!r}{tail}", hint)
     if first["type"] == "missing":
         return ConfigError(f"{source}: key {key!r} is missing{tail}", f"add {location[-1]} = ...")
-    return ConfigError(mask_secrets(f"{source}: {key}: {expected(first)}{tail}"), "correct it; `abbe schema` describes every key")
+    wanted = expected(first).replace("expected an object", "expected a table of keys")
+    return ConfigError(mask_secrets(f"{source}: {key}: {wanted}{tail}"), "correct it; `abbe schema` describes every key")
 
 
 def _holds(values: Any, location: tuple[int | str, ...]) -> bool:

@@ -44,7 +44,8 @@ def expected(error: ErrorDetails) -> str:
     message = (
         error["msg"].removeprefix("Value error, ").replace("Input should be a valid", "expected a").replace("Input should be", "expected")
     )
-    message = message.replace("expected a integer", "expected an integer").replace("expected a object", "expected a table of keys")
+    for noun in ("integer", "array", "object"):
+        message = message.replace(f"expected a {noun}", f"expected an {noun}")
     if error["type"] == "value_error":
         return message  # our own validators say what they found
     return f"{message}, got {shown(error['input'])}"

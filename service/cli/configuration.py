@@ -12,7 +12,7 @@ from service.cli.common import JsonOption, print_json, print_table
 
 
 def check_config(
-    file: Annotated[Path, typer.Argument(help="Machine file (TOML).", show_default=False)],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Machine file (TOML).", show_default=False)],
     as_json: JsonOption = False,
 ) -> None:
     """Check a machine file and print its effective values and where each comes from."""
@@ -30,7 +30,7 @@ def check_config(
     typer.echo(f"database: {database}")
 
 
-def schema(folder: Annotated[Path, typer.Argument(help="Folder to write to.")] = Path("docs/schemas")) -> None:
+def schema(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")] = Path("docs/schemas")) -> None:
     """Write the JSON Schemas of the machine file and of the exchange files."""
     from service.errors import ConfigError
     from service.schemas import write_schemas

@@ -11,8 +11,8 @@ from service.cli.common import DbOption, MachineOption, database_url, open_store
 
 
 def export_campaign(
-    campaign: Annotated[str, typer.Argument(help="Name or number of the campaign.", show_default=False)],
-    folder: Annotated[Path, typer.Argument(help="New folder.", show_default=False)],
+    campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Name or number of the campaign.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.", show_default=False)],
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
@@ -26,7 +26,7 @@ def export_campaign(
 
 
 def import_campaign(
-    folder: Annotated[Path, typer.Argument(help="Folder with campaign.json.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with campaign.json.", show_default=False)],
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:

@@ -29,7 +29,7 @@ def runs(
 
 
 def show(
-    run: Annotated[str, typer.Argument(help="Number, label (r01) or campaign/label.", show_default=False)],
+    run: Annotated[str, typer.Argument(metavar="RUN", help="Number, label (r01) or campaign/label.", show_default=False)],
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
@@ -79,6 +80,10 @@ def check(path: Path, document: Doc, model: type[BaseModel]) -> None:
         model.model_validate_json(json.dumps(document))
     except ValidationError as err:
         raise _format_error(path, err) from None
+    try:
+        json.dumps(document, allow_nan=False)
+    except ValueError:
+        _check_finite(path, document)  # in a key that the format does not know
 
 
 def check_run(path: Path, document: Doc) -> None:
@@ -138,7 +143,18 @@ def _stem(key: str) -> str:
 
 
 def _is_unit_like(text: str) -> bool:
-    return "_" not in text and len(text) <= 6 and text not in PLAIN
+    return text in UNITS or ("_" not in text and len(text) <= 6 and text not in PLAIN)
+
+
+def _check_finite(path: Path, value: object, location: tuple[int | str, ...] = ()) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise FileFormatError(f"{path}: {where(location)}: expected a finite number, got {value}", "correct the file")
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _check_finite(path, inner, (*location, key))
+    if isinstance(value, list):
+        for index, inner in enumerate(value):
+            _check_finite(path, inner, (*location, index))
 
 
 def _format_error(path: Path, err: ValidationError) -> FileFormatError:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.api import BarSample
 from service.errors import StoreError
-from service.runs.codec import encode_bar, encode_json, decode_bar, decode_json
+from service.runs.codec import decode_bar, decode_json, encode_bar, encode_json
 
 SAMPLES = st.builds(
     BarSample,

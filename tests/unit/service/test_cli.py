@@ -1,0 +1,231 @@
+"""The command line: answers at once, one line for every mistake, exit codes that scripts can rely on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import LinkDown
+from service import cli
+from service.storage.engine import wal_is_safe
+from service.storage.store import Store
+
+pytestmark = pytest.mark.usefixtures("clean_environment")
+
+MACHINE_FILE = """
+name = "VMC-1"
+chain = "w-X-Y-b-Z-t"
+[stroke_mm]
+X = [0, 600]
+Y = [0, 500]
+Z = [0, 450]
+[mqtt]
+url = "mqtt://me:topsecret@127.0.0.1:1883"
+"""
+
+
+class Result:
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+
+class Abbe:
+    """Runs the command inside this process, in a folder of its own."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def __call__(self, *arguments: object) -> Result:
+        with pytest.raises(SystemExit) as ended:
+            cli.main([str(one) for one in arguments])
+        out, err = self._capsys.readouterr()
+        return Result(int(ended.value.code or 0), out, err)
+
+    def fails(self, *arguments: object) -> str:
+        """The one line of a bad input."""
+        result = self(*arguments)
+        assert (result.code, result.out) == (2, "")
+        assert result.err.startswith("error ")
+        assert result.err.count("\n") == 1
+        assert "topsecret" not in result.err
+        return result.err
+
+
+@pytest.fixture
+def abbe(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Abbe:
+    monkeypatch.chdir(tmp_path)
+    return Abbe(capsys)
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    path = tmp_path / "machine.toml"
+    path.write_text(MACHINE_FILE, encoding="utf-8")
+    return path
+
+
+def test_help_is_fast_and_imports_nothing_heavy() -> None:
+    program = "import sys\nfrom service.cli import run\nrun(['--help'])\nprint(sorted({m.partition('.')[0] for m in sys.modules}))"
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+        times.append(time.perf_counter() - start)
+    assert "check-config" in done.stdout
+    modules = done.stdout.splitlines()[-1]
+    assert not [name for name in ("numpy", "scipy", "sqlalchemy", "pydantic", "fastapi", "alembic", "rich") if f"'{name}'" in modules]
+    assert min(times) < 0.5
+
+
+def test_check_config(abbe: Abbe, machine: Path) -> None:
+    result = abbe("check-config", machine)
+    assert result.code == 0
+    lines = [line.split() for line in result.out.splitlines()]
+    assert ["chain", '"w-X-Y-b-Z-t"', "file"] in lines
+    assert ["web.port", "8080", "default"] in lines
+    assert "topsecret" not in result.out
+    assert "me:***@127.0.0.1" in result.out
+
+
+def test_check_config_json(abbe: Abbe, machine: Path, clean_environment: pytest.MonkeyPatch) -> None:
+    clean_environment.setenv("ABBE_WEB__PORT", "9000")
+    found = json.loads(abbe("check-config", machine, "--json").out)
+    assert found["values"]["web.port"] == {"value": 9000, "origin": "environment"}
+    assert found["values"]["mqtt.url"]["value"] == "mqtt://me:***@127.0.0.1:1883"
+    assert found["database"] == f"sqlite:///{machine.parent / 'abbe.sqlite3'}"
+
+
+def test_check_config_mistakes(abbe: Abbe, machine: Path) -> None:
+    assert abbe.fails("check-config", "none.toml").startswith("error CFG-001: machine file none.toml does not exist")
+    machine.write_text(MACHINE_FILE.replace("chain", "chian"), encoding="utf-8")
+    assert "did you mean 'chain'?" in abbe.fails("check-config", machine)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["chek-config"], "error USE-001: No such command 'chek-config'. Did you mean 'check-config'?"),
+        (["check-config"], "error USE-001: Missing argument 'FILE'"),
+        (["runs", "--dp", "x"], "error USE-001: No such option: --dp"),
+        (["runs"], "error STO-001: there is no database abbe.sqlite3 - give --db URL"),
+        (["runs", "--db", "nonsense"], "error STO-001: database URL 'nonsense' cannot be understood"),
+        (["runs", "--db", "sqlite://", "--machine", "m.toml"], "error CFG-001: --db and --machine both name a database"),
+        (["runs", "--machine", "m.toml"], "error CFG-001: machine file m.toml does not exist"),
+        (["runs", "--db", "postgresql://me:topsecret@127.0.0.1:1/x"], "me:***@127.0.0.1:1/x"),
+        (["show", "r01", "--db", "sqlite://"], "error STO-001: no run 'r01' in sqlite://"),
+        (["export", "c1", "out", "--db", "sqlite://"], "error STO-001: no campaign 'c1' in sqlite://"),
+        (["import", "nowhere", "--db", "sqlite://"], "error FMT-001: nowhere/campaign.json: no such file"),
+    ],
+)
+def test_bad_input_is_one_line(abbe: Abbe, arguments: list[str], message: str) -> None:
+    assert message in abbe.fails(*arguments)
+
+
+def test_no_command_prints_the_help(abbe: Abbe) -> None:
+    result = abbe()
+    assert result.code == 2
+    assert "check-config" in result.err + result.out
+
+
+def test_import_list_show_export(abbe: Abbe, campaign_folder: Path, tmp_path: Path) -> None:
+    assert abbe("import", campaign_folder).out == "imported campaign 'c1' with 3 runs into sqlite:///abbe.sqlite3\n"
+    assert "is in the database already" in abbe.fails("import", campaign_folder)
+    listed = json.loads(abbe("runs", "--json").out)
+    assert [(run["campaign"], run["run_id"], run["status"]) for run in listed] == [("c1", f"r0{n}", "complete") for n in (1, 2, 3)]
+    assert "r02" in abbe("runs", "--campaign", "c1").out
+    shown = abbe("show", "r02").out
+    assert "setup.radius_mm" in shown
+    assert "sealed" in shown
+    assert json.loads(abbe("show", "c1/r01", "--json").out) == json.loads((campaign_folder / "r01-x.json").read_text())
+    assert abbe("export", "c1", tmp_path / "out").out.startswith("exported campaign 'c1' with 3 runs")
+    assert "nothing was written" in abbe.fails("export", "c1", tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "campaign.json").read_text()) == json.loads((campaign_folder / "campaign.json").read_text())
+
+
+def test_import_of_a_bad_folder_makes_no_database(abbe: Abbe, campaign_folder: Path, tmp_path: Path) -> None:
+    (campaign_folder / "r03-x.json").write_text("{}")
+    assert "r03-x.json" in abbe.fails("import", campaign_folder)
+    assert not (tmp_path / "abbe.sqlite3").exists()
+
+
+def test_database_of_environment_and_machine_file(
+    abbe: Abbe, campaign_folder: Path, machine: Path, clean_environment: pytest.MonkeyPatch
+) -> None:
+    url = f"sqlite:///{machine.parent / 'abbe.sqlite3'}"
+    abbe("import", campaign_folder, "--machine", machine)
+    clean_environment.setenv("ABBE_DB", url)
+    assert len(json.loads(abbe("runs", "--json").out)) == 3
+    assert "no database" in abbe.fails("runs", "--db", "sqlite:///other.sqlite3")
+
+
+def test_incomplete_run_is_listed_as_such(abbe: Abbe) -> None:
+    program = (
+        "from service.storage.store import Store\n"
+        "s = Store.open()\n"
+        "s.start_run(s.add_campaign(s.add_machine('m', {}), 'c1', {}), 'r01', 'ballbar_helix', 'identify', {})\n"
+        "import os; os._exit(9)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 9
+    assert json.loads(abbe("runs", "--json").out)[0]["status"] == "incomplete"
+    with Store.open() as store:
+        assert store.run("r01").status == "running"
+
+
+def test_schema_writes_where_it_is_told(abbe: Abbe, tmp_path: Path) -> None:
+    assert abbe("schema", tmp_path / "new").code == 0
+    assert (tmp_path / "new" / "run.schema.json").exists()
+    (tmp_path / "file").write_text("x")
+    assert "cannot be written" in abbe.fails("schema", tmp_path / "file")
+
+
+def test_version(abbe: Abbe) -> None:
+    out = abbe("version").out
+    assert out.startswith("abbe 0.")
+    assert ("WAL-reset bug" in out) is not wal_is_safe()
+
+
+def test_driver_error_is_one_line(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: str | None, __: Path | None = None) -> str:
+        raise LinkDown("mqtt://me:topsecret@h", "open", "refused\nby peer", "plug it in")
+
+    monkeypatch.setattr("service.cli.show.database_url", broken)
+    assert abbe.fails("runs") == "error DRV-002: mqtt://me:***@h: open: refused by peer (plug it in)\n"
+
+
+def test_interrupt_exits_with_130(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: str | None, __: Path | None = None) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("service.cli.show.database_url", interrupted)
+    assert abbe("runs").code == 130
+
+
+CHILD = """
+import signal, sys
+signal.signal(signal.SIGINT, lambda *_: sys.exit(5))
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(6))
+print(sys.argv[1:], flush=True)
+signal.pause()
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 5), (signal.SIGTERM, 6)])
+def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    package = tmp_path / "simulators"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "__main__.py").write_text(CHILD)
+    command = [sys.executable, "-c", "from service.cli import main; main()", "sim", "a.toml", "--help", "--speed=3"]
+    process = subprocess.Popen(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "['a.toml', '--help', '--speed=3']\n"
+    process.send_signal(number)
+    assert process.wait(timeout=20) == code
+    process.stdout.close()

@@ -1,0 +1,167 @@
+"""The machine file: what it says, what the environment changes, and one line for every mistake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from service.config import load_machine
+from service.errors import ConfigError
+
+GOOD = """
+name = "VMC-1"
+chain = "w-X-Y-b-Z-t"
+vertical_axis = "Z"
+tool_mm = [0, 0, 120]
+
+[stroke_mm]
+X = [0, 600]
+Y = [0, 500]
+Z = [0, 450.5]
+
+[pivots_mm]
+X = [300, 250, -150]
+
+[devices]
+cnc = "modbus+tcp://127.0.0.1:1502"
+ballbar = "socket://127.0.0.1:4001"
+laser = "modbus+rtu:///dev/ttyS0?baud=115200"
+fixture = "fixture+console:"
+
+[limits]
+table_change_um = 50
+
+[mqtt]
+url = "mqtt://me:topsecret@127.0.0.1:1883"
+
+[[schedule]]
+name = "nightly"
+cron = "0 3 * * *"
+timezone = "Europe/Berlin"
+"""
+
+pytestmark = pytest.mark.usefixtures("clean_environment")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "machine.toml"
+    path.write_text(GOOD, encoding="utf-8")
+    return path
+
+
+def test_values_and_defaults(file: Path) -> None:
+    loaded = load_machine(file)
+    machine = loaded.machine
+    assert (machine.name, machine.chain, machine.tool_mm) == ("VMC-1", "w-X-Y-b-Z-t", (0.0, 0.0, 120.0))
+    assert (machine.stroke_mm.Z, machine.pivots_mm.X, machine.pivots_mm.Y) == ((0.0, 450.5), (300.0, 250.0, -150.0), (0.0, 0.0, 0.0))
+    assert (machine.limits.table_value_um, machine.limits.table_change_um, machine.limits.table_step_um) == (200.0, 50.0, 20.0)
+    assert (machine.web.host, machine.web.port, machine.store.url) == ("127.0.0.1", 8080, "sqlite:///abbe.sqlite3")
+    assert [(one.name, one.timezone, one.recipe) for one in machine.schedule] == [("nightly", "Europe/Berlin", "quick-check")]
+    assert loaded.database_url == f"sqlite:///{file.parent / 'abbe.sqlite3'}"
+
+
+def test_origins_and_masked_secrets(file: Path, clean_environment: pytest.MonkeyPatch) -> None:
+    clean_environment.setenv("ABBE_WEB__PORT", "9000")
+    clean_environment.setenv("ABBE_TOOL_MM", "[0, 0, 5]")
+    clean_environment.setenv("ABBE_STORE__URL", "postgresql://me:topsecret@db/abbe")
+    loaded = load_machine(file)
+    values = {key: (value, origin) for key, value, origin in loaded.values()}
+    assert loaded.machine.web.port == 9000
+    assert values["web.port"] == (9000, "environment")
+    assert values["tool_mm"] == ([0.0, 0.0, 5.0], "environment")
+    assert values["store.url"] == ("postgresql://me:***@db/abbe", "environment")
+    assert values["mqtt.url"] == ("mqtt://me:***@127.0.0.1:1883", "file")
+    assert values["web.host"] == ("127.0.0.1", "default")
+    assert values["schedule[1].cron"] == ("0 3 * * *", "file")
+    assert values["schedule[1].recipe"] == ("quick-check", "default")
+    assert loaded.database_url == "postgresql://me:topsecret@db/abbe"
+
+
+def test_machine_object_of_the_exchange_format(file: Path) -> None:
+    assert load_machine(file).machine.machine_doc() == {
+        "name": "VMC-1",
+        "chain": "w-X-Y-b-Z-t",
+        "vertical_axis": "Z",
+        "stroke_mm": {"X": [0.0, 600.0], "Y": [0.0, 500.0], "Z": [0.0, 450.5]},
+        "pivots_mm": {"X": [300.0, 250.0, -150.0], "Y": [0.0] * 3, "Z": [0.0] * 3},
+        "tool_mm": [0.0, 0.0, 120.0],
+    }
+
+
+BAD = [
+    ('name = "VMC-1"', "", "key 'name' is missing"),
+    ('name = "VMC-1"', "name = 5", "name: expected a string, got 5"),
+    ('chain = "w-X-Y-b-Z-t"', 'chain = "w-X-X-b-Z-t"', "chain: expected a chain from w to t with X, Y, Z and b once each"),
+    ('chain = "w-X-Y-b-Z-t"', 'chain = "t-X-Y-b-Z-w"', "chain: expected a chain"),
+    ('vertical_axis = "Z"', 'vertical_axis = "A"', "vertical_axis: "),
+    ('vertical_axis = "Z"', 'verticalaxis = "Z"', "unknown key 'verticalaxis' - did you mean 'vertical_axis'?"),
+    ("X = [0, 600]", "X = [600, 0]", r"stroke_mm.X: expected \[smaller, larger\], got \[600.0, 0.0\]"),
+    ("X = [0, 600]", "X = [0]", "stroke_mm.X"),
+    ("X = [0, 600]", "", "key 'stroke_mm.X' is missing"),
+    ("X = [0, 600]", "X = [0, inf]", r"stroke_mm.X\[2\]: expected a finite number"),
+    ("table_change_um = 50", "table_chang_um = 50", "unknown key 'limits.table_chang_um' - did you mean 'table_change_um'?"),
+    ("table_change_um = 50", "table_change_um = -1", "limits.table_change_um: expected .*greater than 0, got -1"),
+    ("table_change_um = 50", 'table_change_um = "much"', "limits.table_change_um: expected a number, got 'much'"),
+    ("table_change_um = 50", 'table_change_um = "50"', "limits.table_change_um: expected a number, got '50'"),
+    ("table_change_um = 50", "temperature_c = [24, 18]", "limits.temperature_c: expected"),
+    ("table_change_um = 50", "qqq = 1", "unknown key 'limits.qqq' - valid keys here: feed_mm_min, table_change_um"),
+    ("[limits]", "[limit]", "unknown key 'limit' - did you mean 'limits'?"),
+    ('name = "VMC-1"', 'name = "VMC-1"\nweb = 3', "web: expected a table of keys, got 3"),
+    ("modbus+tcp://127.0.0.1:1502", "modbus+tcp://127.0.0.1", "devices: cnc = .*the port is missing"),
+    ("modbus+tcp://127.0.0.1:1502", "http://127.0.0.1:1502", "devices: cnc = .*unknown scheme 'http'"),
+    ("modbus+tcp://127.0.0.1:1502", "socket://127.0.0.1:1502", "devices: cnc = .*expected modbus"),
+    ("me:topsecret@127.0.0.1:1883", "me:topsecret@127.0.0.1:bad", "mqtt.url"),
+    ('cron = "0 3 * * *"', 'cron = "0 3 * *"', r"schedule\[1\].cron: expected a cron expression"),
+    ('cron = "0 3 * * *"', "", r"key 'schedule\[1\].cron' is missing"),
+    (
+        "Europe/Berlin",
+        "Europe/Atlantis",
+        r"schedule\[1\].timezone: expected an IANA time zone .*, got 'Europe/Atlantis'",
+    ),
+    ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\ncorn = 1', r"unknown key 'schedule\[1\].corn' - did you mean 'cron'?"),
+    ("[[schedule]]", '[[schedule]]\nname="nightly"\ncron="0 3 * * *"\n[[schedule]]', "two schedules are named 'nightly'"),
+    ('name = "VMC-1"', "name = ", "not valid TOML: .*line 2"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), BAD, ids=[message[:40] for _, _, message in BAD])
+def test_mistake_is_one_line(file: Path, old: str, new: str, message: str) -> None:
+    assert old in GOOD
+    file.write_text(GOOD.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_machine(file)
+    assert "machine.toml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "topsecret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("ABBE_WEB__PORT", "eighty", "environment: web.port: expected an integer, got 'eighty'"),
+        ("ABBE_WEB__PROT", "80", "environment: unknown key 'web.prot' - did you mean 'port'?"),
+        ("ABBE_WEB__PORT", "70000", "environment: web.port: expected .*65535, got 70000"),
+        ("ABBE_TOOL_MM", "[1,", "environment: .*tool_mm"),
+        ("ABBE_STORE__URL", "oracle://me:topsecret@h/x", "environment: store.url: database 'oracle' is not supported"),
+    ],
+)
+def test_mistake_in_the_environment_is_one_line(
+    file: Path, clean_environment: pytest.MonkeyPatch, name: str, value: str, message: str
+) -> None:
+    clean_environment.setenv(name, value)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_machine(file)
+    assert "\n" not in str(caught.value)
+    assert "topsecret" not in str(caught.value)
+
+
+def test_file_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none.toml does not exist"):
+        load_machine(tmp_path / "none.toml")
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        load_machine(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b'name = "M\xfcller"')
+    with pytest.raises(ConfigError, match="is not UTF-8"):
+        load_machine(tmp_path / "latin.toml")
