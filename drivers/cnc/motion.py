@@ -124,7 +124,8 @@ class Motion:
     async def _command(self, command: int, operation: str, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> int:
         async with self._commands:
             status = await self._session.status()
-            if status.bits & Bit.FEED_HOLD and command in (reg.MOVE, reg.PATH_START):
+            reasons = reg.interlocks(status.bits)  # an open door may show as feed hold too: the door is what people have to hear about
+            if status.bits & Bit.FEED_HOLD and not reasons and command in (reg.MOVE, reg.PATH_START):
                 raise Refused(self._name, operation, "feed hold is on", "call resume or abort first, when it is safe")
             number = next_number(status.motion_ack_seq)
             try:
@@ -141,7 +142,8 @@ class Motion:
 
             result = await run_numbered(self._name, operation, number, write, acknowledge)
         if result:
-            raise Refused(self._name, operation, reg.MOTION_RESULT.get(result, f"result {result}"), "look at the machine, then try again")
+            detail = reg.MOTION_RESULT.get(result, f"result {result}") + (f": {', '.join(reasons)}" if reasons else "")
+            raise Refused(self._name, operation, detail, "look at the machine, then try again")
         return number
 
     async def _done(self, number: int) -> ControllerStatus:

@@ -82,7 +82,7 @@ SEAL, ACTIVATE, LEASE, RELEASE = 1, 2, 3, 4
 
 MOTION_RESULT = {
     1: "bad argument",
-    2: "interlock: door, e-stop, alarm, mode, reference, drives or a running NC program",
+    2: "interlock",
     3: "target beyond the strokes",
     4: "FIFO full",
     5: "busy moving",
@@ -115,6 +115,31 @@ class Bit(IntFlag):
     COMPENSATION_ON = 1 << 10
     NC_PROGRAM = 1 << 11
     SPINDLE = 1 << 12
+
+
+_MUST_BE_CLEAR = {
+    Bit.ESTOP: "the e-stop is pressed",
+    Bit.DOOR_OPEN: "the door is open",
+    Bit.ALARM: "there is an alarm",
+    Bit.NC_PROGRAM: "an NC program is running",
+}
+_MUST_BE_SET = {
+    Bit.REMOTE: "not in remote mode",
+    Bit.REFERENCED: "the axes are not referenced",
+    Bit.DRIVES_ON: "the drives are off",
+}
+
+
+def interlocks(bits: int) -> list[str]:
+    """Say in words which conditions for motion are not met; empty when the machine may move.
+
+    Parameters
+    ----------
+    bits : int
+        STATUS_BITS.
+    """
+    wrong = [text for bit, text in _MUST_BE_CLEAR.items() if bits & bit]
+    return wrong + [text for bit, text in _MUST_BE_SET.items() if not bits & bit]
 
 
 def decode_status(words: Sequence[int], host_s: float) -> ControllerStatus:

@@ -16,6 +16,10 @@ import pytest
 Trick = Callable[["Exchange"], Awaitable[None]]
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "speed(x): simulated seconds per second of the simulators in this test")
+
+
 class Exchange:
     """One request as the peer sees it, with the honest answer ready and the means to do something else."""
 
