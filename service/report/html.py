@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from service.report import plots
-from service.report.model import DemoReport, ParameterRow, RunRow, SummaryRow
+from service.report.model import SETUP_NOTE, DemoReport, ParameterRow, RunRow, SummaryRow
 from service.report.numbers import COVERAGE, NOT_AVAILABLE, finite, plain, printable, tidy, with_uncertainty
 from service.report.palette import style_rules
 from service.report.plots.residuals import common_range
@@ -44,7 +44,8 @@ def render_report(report: DemoReport) -> str:
             lsb=tidy(report.table_lsb_um),
             machine={key: _words(value) for key, value in report.machine.items()},
             summary=[_summary(row) for row in report.summary],
-            parameters=[_parameter(row) for row in report.parameters],
+            parameters=[_parameter(row) for row in report.parameters if row.note != SETUP_NOTE],
+            setup=[_parameter(row) for row in report.parameters if row.note == SETUP_NOTE],
             runs=[_run(row) for row in report.runs],
             pictures=_pictures(report),
         )
@@ -73,7 +74,8 @@ def _pictures(report: DemoReport) -> dict[str, list[Markup]]:
         "diagonals": _trusted([plots.diagonal_plot(report.diagonals_before, report.diagonals_after)] if diagonals else []),
         "ranking": _trusted([plots.contribution_bars(report.contributions)] if report.contributions else []),
         "polar": _trusted([plots.polar_plot(report.polar)] if report.polar else []),
-        "parameters": _trusted(plots.uncertainty_bars(report.parameters)),
+        "parameters": _trusted(plots.uncertainty_bars([p for p in report.parameters if p.note != SETUP_NOTE])),
+        "setup": _trusted(plots.uncertainty_bars([p for p in report.parameters if p.note == SETUP_NOTE], key="setup")),
         "tables": _trusted([plots.table_plot(report.tables, lsb_um=report.table_lsb_um)] if report.tables else []),
         "residuals": _trusted(residuals),
     }

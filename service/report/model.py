@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 Floats = Sequence[float] | NDArray[np.float64]
 Source = Literal["measured", "sealed truth of the simulator"]
 
+SETUP_NOTE = "set-up"
+"""Note of a parameter that belongs to the set-up (cup, bar, mirror) and not to the machine: the report folds these away."""
+
 
 @dataclass(frozen=True, slots=True)
 class SummaryRow:
@@ -29,7 +32,7 @@ class SummaryRow:
 
 @dataclass(frozen=True, slots=True)
 class ParameterRow:
-    """One identified parameter."""
+    """One identified parameter. ``note``: a word about it; ``SETUP_NOTE`` for those of the set-up."""
 
     name: str
     value: float | None

@@ -65,6 +65,8 @@ PARAMETERS = [
     ParameterRow("B0Z", -14.7, 0.83, "µrad", ""),
     ParameterRow("A0Z", 0.9, 0.79, "µrad", "not different from zero"),
     ParameterRow("backlash X", 3.12, 0.11, "µm", "lost motion"),
+    ParameterRow("cup B1 x", 12.1, 0.4, "µm", "set-up"),
+    ParameterRow("bar length 150", -0.4, 0.12, "µm", "set-up"),
 ]
 
 

@@ -66,7 +66,7 @@ def test_a_full_report_has_every_section_and_the_verdict_first(full_report: Demo
 
 def test_every_picture_is_xml_with_its_own_title_and_description(full_report: DemoReport) -> None:
     pictures = svgs(render_report(full_report))
-    assert len(pictures) == 2 + 1 + 1 + 1 + 3 + 1 + 4
+    assert len(pictures) == 2 + 1 + 1 + 1 + 3 + 1 + 1 + 4
     for picture in pictures:
         title, desc = picture.find("title"), picture.find("desc")
         assert title is not None
@@ -103,6 +103,14 @@ def test_the_uncertainty_decides_the_digits(full_report: DemoReport) -> None:
     page = render_report(full_report)
     assert re.search(r"41\.3</span><span class=\"u\"> ± 1\.0<", page)
     assert re.search(r"18\.20</span><span class=\"u\"> ± 0\.62<", page)
+
+
+def test_parameters_of_the_set_up_are_folded_away(full_report: DemoReport) -> None:
+    page = render_report(full_report)
+    fold = page[page.index("<details>") : page.index("</details>")]
+    assert ">cup B1 x<" in fold
+    assert ">EXX slope<" not in fold
+    assert page.count('<th scope="row">cup B1 x<') == 1
 
 
 def test_hostile_words_stay_words(minimal_report: DemoReport) -> None:
