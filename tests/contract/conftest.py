@@ -126,7 +126,13 @@ class RtuPeer(ModbusPeer):
         os.set_blocking(self.master, False)
         self.url = f"modbus+rtu://{os.ttyname(self.slave)}?baud=115200&unit=1"
         self.buffer = b""
+        self.one_at_a_time = asyncio.Lock()
         asyncio.get_running_loop().add_reader(self.master, self.readable)
+
+    async def in_turn(self, header: bytes, pdu: bytes) -> None:
+        """As a real device on a line: the next request is looked at when the last one is answered."""
+        async with self.one_at_a_time:
+            await self.handle(header, pdu, self.write, self.unplug)
 
     def readable(self) -> None:
         self.buffer += os.read(self.master, 4096)
@@ -136,7 +142,7 @@ class RtuPeer(ModbusPeer):
                 return
             frame, self.buffer = self.buffer[:size], self.buffer[size:]
             assert modbus_crc(frame[:-2]) == frame[-2:]
-            task = asyncio.get_running_loop().create_task(self.handle(frame[:1], frame[1:-2], self.write, self.unplug))
+            task = asyncio.get_running_loop().create_task(self.in_turn(frame[:1], frame[1:-2]))
             self.tasks.add(task)
             task.add_done_callback(self.tasks.discard)
 

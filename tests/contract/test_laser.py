@@ -183,6 +183,22 @@ async def test_a_reboot_is_noticed_by_the_clock(laser, meter):
     assert (await laser.read()).sample_count >= 1
 
 
+async def test_a_reboot_behind_a_reconnect_is_noticed_although_the_clock_went_on(tcp_peer):
+    meter = Meter(tcp_peer)
+    laser = await open_laser(tcp_peer.url)
+    await laser.read()
+    meter.boot(8)
+    meter.count = 1000
+
+    async def hang_up(exchange) -> None:
+        exchange.hang_up()
+
+    tcp_peer.tricks = [hang_up]
+    with pytest.raises(Rebooted):
+        await laser.read()
+    await laser.close()
+
+
 async def test_cancel_during_a_command(laser, meter):
     release = asyncio.Event()
 

@@ -74,7 +74,7 @@ async def test_a_late_reply_is_never_taken_for_the_next_answer(peer, link, count
         exchange.reply()
         done.set()
 
-    peer.tricks = [late] if not peer.rtu else [late, late]
+    peer.tricks = [late] if not peer.rtu else [silent, late]
     if not peer.rtu:
         assert await link.read(100, count) == tuple(range(100, 100 + count))  # repeated over a new connection
         release.set()
@@ -285,6 +285,21 @@ async def test_cancelled_before_it_was_sent_never_reaches_the_wire(peer, link):
     with pytest.raises(asyncio.CancelledError):
         await second
     assert peer.writes == []
+
+
+async def test_cancelled_during_the_quarantine_never_reaches_the_wire(rtu_peer):
+    link = await ModbusLink.connect(parse_url(rtu_peer.url), timeout_s=TIMEOUT_S)
+    rtu_peer.tricks = [silent]
+    with pytest.raises(ReplyTimeout):
+        await link.write(100, [1])
+    quarantined = asyncio.create_task(link.write(200, [2]))
+    await asyncio.sleep(TIMEOUT_S / 3)
+    quarantined.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await quarantined
+    await link.write(300, [3])
+    assert [address for address, _ in rtu_peer.writes] == [100, 300]
+    await link.close()
 
 
 async def test_cancel_at_every_loop_step(peer, link):

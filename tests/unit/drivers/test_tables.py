@@ -111,6 +111,14 @@ def test_refused(change, why):
         tables.encode(replace(SMALL, **change))
 
 
+@pytest.mark.parametrize("word", [0, 1, 2, 3, 7, 8, 11, 20])
+def test_a_header_that_contradicts_the_protocol_is_refused(word):
+    data = bytearray(tables.encode(SMALL))
+    data[2 * word] ^= 0x80
+    with pytest.raises(TableCodecError):
+        tables.decode(bytes(data))
+
+
 def test_every_truncation_and_extension_is_refused():
     data = tables.encode(SMALL)
     for size in range(len(data)):
