@@ -68,9 +68,9 @@ def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[s
 
 def site_of(config: MachineFile) -> Site:
     """What the machine file says, in the units and types of the workflows."""
-    pivots = {a: list(getattr(config.pivots_mm, a)) for a in AXES}
-    strokes = {a: list(getattr(config.stroke_mm, a)) for a in AXES}
-    doc = {"name": config.name, "chain": config.chain, "vertical_axis": config.vertical_axis, "stroke_mm": strokes, "pivots_mm": pivots}
+    doc: dict[str, Any] = {"name": config.name, "chain": config.chain, "vertical_axis": config.vertical_axis}
+    doc["stroke_mm"] = {a: list(getattr(config.stroke_mm, a)) for a in AXES}
+    doc["pivots_mm"] = {a: list(getattr(config.pivots_mm, a)) for a in AXES}
     doc["tool_mm"] = list(config.tool_mm)
     devices, limits = config.devices, config.limits
     return Site(

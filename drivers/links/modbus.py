@@ -7,6 +7,7 @@ reconnects, every reply compared with its request, and no way for a late reply t
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,9 @@ from pymodbus.pdu import ModbusPDU
 from drivers.errors import BadFrame, DeviceFault, DriverError, LinkDown, Refused, ReplyTimeout
 from drivers.links.modbus_reply import EXCEPTION_TEXT, rtu_mismatch, tcp_mismatch
 from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
+
+# Everything that goes wrong leaves here as a typed error: the library's own lines would only repeat it on stderr.
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 MAX_READ = 125
 MAX_WRITE = 123

@@ -1,7 +1,7 @@
 """From samples to the database, at most a few tens of milliseconds behind the device.
 
-The recorder only buffers and writes. A chunk is committed every `FLUSH_S` wall seconds; what a killed process leaves behind is every chunk
-committed before, and a run without an end: visibly incomplete.
+The recorder only buffers and writes. A chunk is committed as soon as `FLUSH_S` wall seconds have passed since the last; what a killed
+process leaves behind is every chunk committed before, and a run without an end: visibly incomplete.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from drivers.api import BarBatch, BarSample
+from drivers.links.shielded import run_to_end
 from service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from service.storage.store import Store
 
@@ -28,24 +29,30 @@ class Recorder:
         self._bar_host: list[float] = []
         self._records: list[dict[str, Any]] = []
         self._seq = {"bar": 0, "laser": 0}
+        self._loop = asyncio.get_running_loop()
+        self._flushed_s = self._loop.time()
         self.gaps: list[dict[str, int]] = []
-        self.samples = 0
 
-    def add_bar(self, batch: BarBatch) -> None:
+    async def add_bar(self, batch: BarBatch) -> None:
         """Take a batch of ball-bar samples; what the sequence numbers miss becomes an explicit gap."""
         if batch.missing:
             self.gaps.append({"before_seq": batch.samples[0].seq if batch.samples else -1, "missing": batch.missing})
         self._bar.extend(batch.samples)
         self._bar_host.append(batch.host_s)
-        self.samples += len(batch.samples)
+        await self._flush_when_due()
 
-    def add_record(self, record: dict[str, Any]) -> None:
+    async def add_record(self, record: dict[str, Any]) -> None:
         """Take one laser record."""
         self._records.append(record)
-        self.samples += 1
+        await self._flush_when_due()
+
+    async def _flush_when_due(self) -> None:
+        if self._loop.time() - self._flushed_s >= FLUSH_S:
+            await self.flush()
 
     async def flush(self) -> None:
         """Commit what is buffered."""
+        self._flushed_s = self._loop.time()
         if self._bar:
             samples, hosts = self._bar, self._bar_host
             self._bar, self._bar_host = [], []
@@ -62,22 +69,12 @@ class Recorder:
         self._seq[channel] += 1
         await self._store.write(self._store.append_chunk, self._run, channel, seq, n, codec, payload, *span)
 
-    async def _run_forever(self) -> None:
-        while True:
-            await asyncio.sleep(FLUSH_S)
-            await self.flush()
-
 
 @asynccontextmanager
 async def recording(store: Store, run_id: int) -> AsyncIterator[Recorder]:
-    """A recorder that commits in the background while the block runs, and once more at its end, also when it fails or is cancelled."""
+    """A recorder for one run; what is still buffered is committed at the end, also when the block fails or is cancelled."""
     recorder = Recorder(store, run_id)
     try:
-        async with asyncio.TaskGroup() as group:
-            flusher = group.create_task(recorder._run_forever())  # noqa: SLF001 - same module
-            try:
-                yield recorder
-            finally:
-                flusher.cancel()
+        yield recorder
     finally:
-        await recorder.flush()
+        await run_to_end(recorder.flush())

@@ -1,6 +1,6 @@
 """The demonstration: the whole job on a simulated machine over real wires.
 
-measure (before) -> identify -> solve -> push -> measure (after) -> keep or roll back; then the simulator's sealed truth says how well it
+identify -> measure (before) -> solve -> push -> measure (after) -> keep or roll back; then the simulator's sealed truth says how well it
 went.
 """
 
@@ -101,8 +101,8 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
 
 async def _job(session: Session, store: Store, result: DemoResult, progress: ProgressSink) -> None:
     site, rate = result.site, bar_rate_hz(result.speed)
-    before_ids = await measure(session, store, site, verification(site.machine, rate_hz=rate, name="verify-before"), progress=progress)
     await measure(session, store, site, identification(site.machine, rate_hz=rate), progress=progress)
+    before_ids = await measure(session, store, site, verification(site.machine, rate_hz=rate, name="verify-before"), progress=progress)
     before = await load_runs(store, before_ids)
     result.correction = await correct(session, store, site, "identify", before, rate_hz=rate, progress=progress)
     (result.folder / "active_bank.bin").write_bytes(result.correction.image)
