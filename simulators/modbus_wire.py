@@ -1,11 +1,14 @@
 """Modbus servers (TCP, RTU): the only file that knows pymodbus. A register map answers words, pymodbus carries them."""
 
 import asyncio
+import logging
 from typing import Protocol
 
 from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
+
+logging.getLogger("pymodbus").setLevel(logging.ERROR)  # a taken port is told by an exception, not by a line of its own
 
 _READ = (3, 4)
 _WRITE = (6, 16)
