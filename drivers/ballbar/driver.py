@@ -136,9 +136,8 @@ class SerialBallBar:
         Yields
         ------
         AsyncIterator of BarBatch
-            Without end. ``missing`` counts samples that the wire lost or that a consumer more than 30 s behind let go.
-            The iterator raises ``Rebooted`` when the box restarted, ``ReplyTimeout`` when no sample came for
-            max(1 s, 50 periods), ``LinkDown`` when the device has gone.
+            ``missing`` counts samples that the wire lost or that a consumer more than 30 s behind let go. The iterator
+            raises ``Rebooted`` when the box restarted, ``ReplyTimeout`` after max(1 s, 50 periods) of silence, ``LinkDown``.
 
         Raises
         ------

@@ -106,12 +106,7 @@ class FrameDecoder:
         return len(self._rest)
 
     def feed(self, chunk: bytes) -> list[Frame]:
-        """Take bytes, return what they complete.
-
-        Parameters
-        ----------
-        chunk : bytes
-            Any number of bytes.
+        """Take any number of bytes, return what they complete.
 
         Returns
         -------
@@ -120,9 +115,7 @@ class FrameDecoder:
         """
         data = self._rest + chunk if self._rest else chunk
         out: list[Frame] = []
-        size = len(data)
-        at = bad_from = 0
-        reason = "garbage"
+        size, at, bad_from, reason = len(data), 0, 0, "garbage"
         while True:
             searched_from, at = at, data.find(SYNC, at)
             if at < 0:

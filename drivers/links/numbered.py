@@ -32,10 +32,8 @@ async def run_numbered(
         For the error text.
     number : int
         The number inside the command, ``next_number(last acknowledged)``.
-    write : callable
-        Sends the command; called exactly once.
-    read_ack : callable
-        Reads (acknowledged number, result code).
+    write, read_ack : callable
+        Sends the command (called exactly once); reads (acknowledged number, result code).
     settle_s : float
         How long an acknowledge may take.
 
@@ -54,17 +52,21 @@ async def run_numbered(
         await write()
     except (ReplyTimeout, LinkDown, BadFrame) as error:
         doubt = error
-    clock = asyncio.get_running_loop().time
-    until = clock() + settle_s
-    while True:
-        acknowledged, result = await read_ack()
-        if acknowledged == number:
-            return result
-        if clock() >= until:
-            break
-        await asyncio.sleep(_POLL_S)
+    acknowledged, result = await _last_ack(number, read_ack, settle_s)
+    if acknowledged == number:
+        return result
     if doubt is not None:
         doubt.add_note(f"asked afterwards, the device says that command {number} was not executed (last executed: {acknowledged})")
         raise doubt
     detail = f"command {number} is not acknowledged (last executed: {acknowledged})"
     raise ReplyTimeout(device, operation, detail, "is another program sending commands to this device?")
+
+
+async def _last_ack(number: int, read_ack: Callable[[], Awaitable[tuple[int, int]]], settle_s: float) -> tuple[int, int]:
+    clock = asyncio.get_running_loop().time
+    until = clock() + settle_s
+    while True:
+        acknowledged, result = await read_ack()
+        if acknowledged == number or clock() >= until:
+            return acknowledged, result
+        await asyncio.sleep(_POLL_S)

@@ -267,7 +267,7 @@ async def test_the_same_bytes_over_a_socket(bar_peer):
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     bar_peer.on_start = lambda: bar_peer.send(b"".join(bar_peer.sample(i) for i in range(50)))
-    bar = await open_ballbar(f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+    bar = await open_ballbar(f"socket://localhost:{server.sockets[0].getsockname()[1]}")
     async with bar.stream(1000) as batches:
         assert await collect(batches, 50) == (list(range(50)), 0)
     await bar.close()
