@@ -22,12 +22,13 @@ from models.solvers.priors import Priors, term_prior_sd
 
 @dataclass(frozen=True)
 class RunFit:
-    """How one run was fitted: its residuals in the order of its readings, and their rms, mm."""
+    """How one run was fitted: residuals in the order of its (averaged) readings, their rms, and the rms that was expected, mm."""
 
     label: str
     kind: str
     residual_mm: F1
     rms_mm: float
+    expected_mm: float
 
 
 @dataclass(frozen=True)
@@ -200,10 +201,10 @@ def solve_joint(
     n_terms = len(terms)
     seen = project_out(a[:, :n_terms] / sigma[:, None], a[:, n_terms:] / sigma[:, None])
     rank = analyse(names[:n_terms], seen, prior[:n_terms])
-    return JointSolution(machine, terms, estimate, rank, _fits(runs, residual))
+    return JointSolution(machine, terms, estimate, rank, _fits(runs, residual, sigma))
 
 
-def _fits(runs: tuple[RunData, ...], residual: F1) -> tuple[RunFit, ...]:
-    ends = np.cumsum([r.deviation_mm.size for r in runs])
-    parts = np.split(residual, ends[:-1])
-    return tuple(RunFit(r.label, r.kind, v, float(np.sqrt(np.mean(v**2)))) for r, v in zip(runs, parts, strict=True))
+def _fits(runs: tuple[RunData, ...], residual: F1, sigma: F1) -> tuple[RunFit, ...]:
+    ends = np.cumsum([r.deviation_mm.size for r in runs])[:-1]
+    parts = zip(runs, np.split(residual, ends), np.split(sigma, ends), strict=True)
+    return tuple(RunFit(r.label, r.kind, v, float(np.sqrt(np.mean(v**2))), float(np.sqrt(np.mean(s**2)))) for r, v, s in parts)

@@ -109,5 +109,5 @@ def print_result(out: Console, result: DemoResult) -> None:
     out.print(table)
     found = demo_json(result)
     best, share = found["best_nine_tables_rms_um"], 100 * found["volumetric_factor"]["share"]
-    out.print(f"nine perfect one-axis tables would leave {best:.1f} um rms; {share:.0f} % of their factor was reached")
+    out.print(f"nine perfect one-axis tables would leave {best:.1f} µm rms; {share:.0f} % of their factor was reached")
     out.print(("kept: " if found.get("kept") else "rolled back: ") + str(found.get("verdict", "")))

@@ -28,7 +28,7 @@ MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too cl
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """What a check found. ``uncertainties`` are expanded (k = 2); figures in um by name."""
+    """What a check found. ``uncertainties`` are expanded (k = 2); figures in µm by name."""
 
     verdict: Verdict
     values: dict[str, float]
@@ -73,7 +73,7 @@ async def run_check(config: MachineFile, store: Store, recipe: str, progress: Pr
     rows = figure_rows(figures(runs))
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
     verdict = overall([judge(*rows[k], limits[k]) for k in limits if k in rows])
-    text = f"{MARK[verdict]}: " + ", ".join(f"{_name(k)} {rows[k][0]:.1f} um (limit {limits[k]:g})" for k in limits if k in rows)
+    text = f"{MARK[verdict]}: " + ", ".join(f"{_name(k)} {rows[k][0]:.1f} µm (limit {limits[k]:g})" for k in limits if k in rows)
     outside = _outside(runs, config.limits.temperature_c)
     if outside is not None:
         verdict = "cannot tell"

@@ -94,7 +94,7 @@ def check_limits(tables: NineTables, active: NineTables | None, limits: TableLim
                 if size[k] > limit:
                     at = tables.position_mm[a][k]
                     raise TableRefused(
-                        f"{name}: {what} {size[k] * 1e3:.1f} um at {at:.1f} mm exceeds the limit of {limit * 1e3:.1f} um",
+                        f"{name}: {what} {size[k] * 1e3:.1f} µm at {at:.1f} mm exceeds the limit of {limit * 1e3:.1f} µm",
                         f"check the measurement; if the machine is really so, raise {key} under [limits]. Nothing was written",
                     )
             if abs(values[0]) > 5e-7:
@@ -274,6 +274,6 @@ def compare_meaning(wanted: NineTables, held: NineTables | None, lsb_nm: int) ->
             off_value = np.abs(held.correction_mm[a][:, i] - wanted.correction_mm[a][:, i]).max()
             if off_grid > 1e-5 or off_value > 0.51e-6 * lsb_nm:
                 raise TableMismatch(
-                    f"table {name} means something else to an independent decoder (off by {off_value * 1e3:.2f} um)",
+                    f"table {name} means something else to an independent decoder (off by {off_value * 1e3:.2f} µm)",
                     "it was not activated; the encoder is wrong",
                 )

@@ -101,16 +101,25 @@ def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
 
 def contributions(joint: JointSolution) -> list[Contribution]:
     """Rms over its stroke of every translation and squareness, largest first (angles act through levers and are left to the map)."""
-    e, length = joint.estimate, joint.machine.length_mm
-    found: dict[str, float] = {}
+    weights: dict[str, list[tuple[int, float]]] = {}
     for k, term in enumerate(joint.terms):
-        value = float(joint.coefficients[k])
         if term.order == 0:
-            found[term.motion] = abs(value) * float(length[term.axis]) / np.sqrt(12.0) * 1e3
+            weights.setdefault(term.motion, []).append((k, float(joint.machine.length_mm[term.axis]) ** 2 / 12.0))
         elif term.component < 3:
-            found[term.motion] = float(np.hypot(found.get(term.motion, 0.0), value / np.sqrt(2 * term.order + 1) * 1e3))
-    found |= {f"backlash {a}": abs(e.value(f"backlash_{a}")) / 2 * 1e3 for a in "XYZ"}
-    return [Contribution(n, v) for n, v in sorted(found.items(), key=lambda item: -item[1])]
+            weights.setdefault(term.motion, []).append((k, 1.0 / (2 * term.order + 1)))
+    found = [_rms_of(joint, name, parts) for name, parts in weights.items()]
+    found += [Contribution(f"backlash {a}", abs(v) / 2 * 1e3, u / 2 * 1e3) for a, (v, u) in joint.backlash_mm().items()]
+    return sorted(found, key=lambda c: -(c.value_um or 0.0))
+
+
+def _rms_of(joint: JointSolution, name: str, parts: list[tuple[int, float]]) -> Contribution:
+    """Rms = sqrt(sum w c^2) and its standard uncertainty by propagation."""
+    index, w = [k for k, _ in parts], np.array([v for _, v in parts])
+    c = joint.coefficients[index]
+    rms = float(np.sqrt(np.sum(w * c**2)))
+    gradient = w * c / rms if rms > 0 else np.zeros_like(c)
+    u = float(np.sqrt(gradient @ joint.term_covariance[np.ix_(index, index)] @ gradient))
+    return Contribution(name, rms * 1e3, u * 1e3)
 
 
 def _arrows(truth: dict[str, Any]) -> ArrowField | None:
@@ -169,11 +178,8 @@ def demo_report(result: DemoResult) -> DemoReport:
 
 
 def _runs(c: Correction) -> list[RunRow]:
-    noise = c.solved.noise_bar_mm * 1e3
-    return [
-        RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, noise if r.kind == "bar" else None)
-        for r in c.solved.joint.runs
-    ]
+    joint = c.solved.joint
+    return [RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, r.expected_mm * 1e3) for r in joint.runs]
 
 
 def _warnings(joint: JointSolution) -> list[str]:

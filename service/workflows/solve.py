@@ -21,7 +21,7 @@ LEGENDRE_ORDER = 9
 LASER_SIGMA_MM = 3e-4
 FLOOR_MM = 3e-4
 """What smooth functions of this order do not follow: neither instrument is trusted below it."""
-SIGMA_GROWTH_NAMED = 0.2
+SEEN_SHARE = 0.2
 """A parameter whose data explain less than this share of its prior variance is listed as not seen."""
 
 
@@ -108,13 +108,26 @@ def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def not_observable(joint: JointSolution) -> list[str]:
-    """In words: combinations that leave no trace, then how many parameters rest on their prior."""
-    rank = joint.identifiability
-    texts = [c.text for c in rank.hidden]
-    names = [t.name for t, s in zip(joint.terms, joint.estimate.data_share, strict=False) if s < SIGMA_GROWTH_NAMED]
+    """In words: motions that the runs cannot tell apart (grouped over their orders), then parameters that rest on their prior."""
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for combination in joint.identifiability.hidden:
+        parts = [name.partition(".") for name, _ in combination.weights]
+        motions = tuple(sorted({motion for motion, _, _ in parts}))
+        groups.setdefault(motions, []).append(max(int(order or 0) for _, _, order in parts))
+    texts = [_apart(motions, sorted(orders)) for motions, orders in groups.items()]
+    names = [t.name for t, s in zip(joint.terms, joint.estimate.data_share, strict=False) if s < SEEN_SHARE]
     if names:
         texts.append(f"{len(names)} coefficients rest on their prior, the data hardly speak of them: {', '.join(names)}")
+    if groups:
+        texts.append("all runs used one tool length: what is named above may act differently with another tool")
     return texts
+
+
+def _apart(motions: tuple[str, ...], orders: list[int]) -> str:
+    span = f"order {orders[0]}" if orders[0] == orders[-1] else f"orders {orders[0]} to {orders[-1]}"
+    if len(motions) == 1:
+        return f"{motions[0]} ({span}) leaves no trace in these runs"
+    return f"{', '.join(motions[:-1])} and {motions[-1]} cannot be told apart ({span}, {len(orders)} combinations)"
 
 
 def solution_doc(solved: Solved) -> dict[str, Any]:

@@ -73,8 +73,8 @@ def decide(before: Figures, after: Figures) -> Decision:
     if gain <= needed:
         return Decision(
             False,
-            f"worst body diagonal {before.worst.value_mm * 1e3:.1f} -> {after.worst.value_mm * 1e3:.1f} um: "
-            f"no improvement beyond its uncertainty of {needed * 1e3:.1f} um",
+            f"worst body diagonal {before.worst.value_mm * 1e3:.1f} → {after.worst.value_mm * 1e3:.1f} µm: "
+            f"no improvement beyond its uncertainty of {needed * 1e3:.1f} µm",
         )
     pairs = [(f"diagonal {k}", before.diagonals[k], v) for k, v in after.diagonals.items() if k in before.diagonals]
     if before.helix is not None and after.helix is not None:
@@ -82,9 +82,9 @@ def decide(before: Figures, after: Figures) -> Decision:
     for name, old, new in pairs:
         worse = new.value_mm - old.value_mm
         if worse > WORSE_CAP_MM + _expanded(old, new):
-            return Decision(False, f"{name} got worse by {worse * 1e3:.1f} um, although the worst diagonal improved")
+            return Decision(False, f"{name} got worse by {worse * 1e3:.1f} µm, although the worst diagonal improved")
     return Decision(
-        True, f"worst body diagonal {before.worst.value_mm * 1e3:.1f} -> {after.worst.value_mm * 1e3:.1f} um (U = {needed * 1e3:.1f} um)"
+        True, f"worst body diagonal {before.worst.value_mm * 1e3:.1f} → {after.worst.value_mm * 1e3:.1f} µm (U = {needed * 1e3:.1f} µm)"
     )
 
 
@@ -104,7 +104,7 @@ def overall(verdicts: list[Verdict]) -> Verdict:
 
 
 def figure_rows(found: Figures) -> dict[str, tuple[float, float]]:
-    """Figures as (value, standard uncertainty) in um, by the names used in limits, JSON and reports."""
+    """Figures as (value, standard uncertainty) in µm, by the names used in limits, JSON and reports."""
     rows = {f"diagonal_{k}_um": (f.value_mm * 1e3, f.u_mm * 1e3) for k, f in found.diagonals.items()}
     rows["body_diagonal_um"] = (found.worst.value_mm * 1e3, found.worst.u_mm * 1e3)
     if found.helix is not None:

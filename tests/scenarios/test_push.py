@@ -84,7 +84,7 @@ async def test_a_table_over_its_limit_writes_no_register(start_sims, tmp_path):
     async with bench(sims, tmp_path) as (site, store, session):
         before = await session.controller.comp_status()
         strict = replace(site, limits=TableLimits(value_mm=1e-3))
-        with pytest.raises(TableRefused, match=r"exceeds the limit of 1\.0 um"):
+        with pytest.raises(TableRefused, match=r"exceeds the limit of 1\.0 µm"):
             await Pusher(session.controller, store, strict).push(
                 linear_tables(site, np.full((3, 3), 1e-5)), lsb_nm=100, solution_id=None, doc={}
             )
