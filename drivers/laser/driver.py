@@ -34,6 +34,7 @@ class ModbusLaser:
         self._boot_id: int | None = None
         self._connection = link.connections
         self._last_us = -1
+        self._shown_at_command: int | None = None  # a command acts on the samples after it: this one may still be the old state
         self._command_lock = asyncio.Lock()
 
     async def identify(self) -> DeviceInfo:
@@ -51,6 +52,7 @@ class ModbusLaser:
         self._boot_id = counts["BOOT_ID"]
         self._connection = self._link.connections
         self._last_us = -1
+        self._shown_at_command = None
         return DeviceInfo("laser", "LDDM", str(counts["SERIAL_NO"]), counts["BOOT_ID"], f"map {counts['MAP_VER']}")
 
     async def zero(self) -> None:
@@ -88,7 +90,7 @@ class ModbusLaser:
         await self._command(reg.ENVIRONMENT, int(on), "switch environmental compensation")
 
     async def read(self, *, after_count: int | None = None) -> LaserReading:
-        """Read the current output sample, or wait for one that is newer than ``after_count``.
+        """Read the current output sample, or wait for one that is newer than ``after_count`` and than the last command.
 
         Parameters
         ----------
@@ -108,14 +110,16 @@ class ModbusLaser:
             async with asyncio.timeout(self._read_timeout_s):
                 while True:
                     reading = await self._read_once()
-                    if after_count is None or 0 < (reading.sample_count - after_count) % (1 << 32) < 1 << 31:
+                    if _newer(reading, after_count) and _newer(reading, self._shown_at_command):
                         break
                     await asyncio.sleep(_POLL_S)
         except TimeoutError as error:
             if isinstance(error, ReplyTimeout):
                 raise
-            detail = f"no sample after number {after_count} within {self._read_timeout_s:g} s"
+            floor = self._shown_at_command if after_count is None else after_count
+            detail = f"no sample after number {floor} within {self._read_timeout_s:g} s"
             raise ReplyTimeout(self.name, "read", detail, "is the meter measuring?") from None
+        self._shown_at_command = None
         self._check_beam(reading.status)
         return reading
 
@@ -160,7 +164,12 @@ class ModbusLaser:
             result = await run_numbered(self.name, operation, number, write, self._read_ack)
         if result:
             raise Refused(self.name, operation, reg.RESULT_TEXT.get(result, f"result {result}"), "free the beam, or clear_beam first")
+        self._shown_at_command = (await self._read_once()).sample_count
 
     async def _read_ack(self) -> tuple[int, int]:
         counts = reg.ACKNOWLEDGE.counts(await self._link.read(reg.ACKNOWLEDGE.base, reg.ACKNOWLEDGE.count))
         return counts["CMD_ACK_SEQ"], counts["CMD_RESULT"]
+
+
+def _newer(reading: LaserReading, count: int | None) -> bool:
+    return count is None or 0 < (reading.sample_count - count) % (1 << 32) < 1 << 31

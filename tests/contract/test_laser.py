@@ -119,6 +119,19 @@ async def test_commands(laser, meter):
     assert meter.commands == [(1, 0), (2, 0), (3, 1)]
 
 
+async def test_after_a_command_the_sample_still_shown_is_not_taken(laser, meter):
+    """A command acts on the samples after it; the one being shown is the old state and would read as a wrong displacement."""
+    await laser.read()
+    await laser.zero()
+    shown = meter.count
+    assert (await laser.read()).sample_count > shown
+    meter.advance_per_read = 0
+    assert (await laser.read()).sample_count == shown + 1  # the wait is for the first reading only
+    await laser.zero()
+    with pytest.raises(ReplyTimeout, match="no sample after"):
+        await laser.read()
+
+
 async def test_a_refused_command(laser, meter):
     meter.result = 2
     with pytest.raises(Refused, match="beam blocked"):
