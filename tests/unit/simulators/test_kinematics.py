@@ -46,10 +46,9 @@ def rule_g(m: Machine, chain: str, p: np.ndarray) -> np.ndarray:
             d[:, 0] += b0z * p[:, 2]
             d[:, 1] += -a0z * p[:, 2]
         place = order.index(name)
-        if place > bed:  # tool side: travels of the carriages nearer the tool
-            counted = order[place + 1 : -1]
-        else:  # work side: all travels but those of carriages nearer the workpiece
-            counted = [a for a in AXES if a not in order[1:place]]
+        nearer_tool = order[place + 1 : -1]
+        not_nearer_work = [a for a in AXES if a not in order[1:place]]
+        counted = nearer_tool if place > bed else not_nearer_work
         r = np.tile(m.geometry.tool_mm, (len(p), 1)) - np.array(PIVOTS[name], dtype=float)
         for axis in counted:
             r[:, AXES.index(axis)] += p[:, AXES.index(axis)]
