@@ -9,11 +9,10 @@ import numpy as np
 from models.arrays import F1
 from models.solvers.joint import bar_normals
 from models.solvers.observations import RunData, nominal_reading
+from models.solvers.priors import U_WAVELENGTH
 
 U_REPEAT_MM = 1e-4
 """Repeatability of a re-mounted ball-bar's shape reading, an assumption until repeats are measured."""
-U_AIR_REL = 0.3e-6
-"""Relative uncertainty of the wavelength after environmental compensation (about 0.3 K or 1 hPa)."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ def diagonal_figure(run: RunData) -> Figure:
     half = np.array([(out[p] - back[p]) / 2 for p in both])
     scatter = float(np.std(half, ddof=1))  # of a mean of two readings, like the mean itself
     length = both[-1] - both[0]
-    return Figure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_AIR_REL * length)), np.array(both), mean)
+    return Figure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_WAVELENGTH * length)), np.array(both), mean)
 
 
 def helix_figure(run: RunData) -> Figure:

@@ -15,6 +15,10 @@ from models.geometry.bases import Term
 from models.machine import Machine
 
 
+U_WAVELENGTH = 0.3e-6
+"""Relative standard uncertainty of the laser's wavelength after environmental compensation (about 0.3 K or 1 hPa): no scale is known better."""
+
+
 @dataclass(frozen=True, slots=True)
 class Priors:
     """Standard deviations of the priors.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from models.compensation.summary import mean_linear
 from models.compensation.tables import NineTables
 from models.solvers.joint import JointSolution
 from service.report.model import (
@@ -82,12 +83,11 @@ def _title(name: str) -> str:
 
 def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
     """The parameters people ask for, with standard uncertainty: scales, squareness, lost motion, then the cups, bars and mirrors."""
-    e, length = joint.estimate, joint.machine.length_mm
+    e = joint.estimate
     rows = []
-    for a, axis in enumerate("XYZ"):
-        name, per = f"E{axis}{axis}.1", 2.0 / length[a] * 1e6
-        rows.append(ParameterRow(f"E{axis}{axis} slope", e.value(name) * per, e.u(name) * per, "µm/m", "scale error"))
-    rows += [ParameterRow(n, e.value(n) * 1e6, e.u(n) * 1e6, "µrad", "squareness") for n in ("C0Y", "B0Z", "A0Z")]
+    for p in mean_linear(joint):
+        unit, note = ("µm/m", "scale error, mean over the volume") if p.name[0] == "E" else ("µrad", "squareness, mean over the volume")
+        rows.append(ParameterRow(p.name, p.value * 1e6, p.u * 1e6, unit, note))
     rows += [
         ParameterRow(f"backlash {a}", v * 1e3, u * 1e3, "µm", "lost motion, not compensated") for a, (v, u) in joint.backlash_mm().items()
     ]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from models.compensation.summary import mean_linear
 from models.solvers.helix import HelixSolution, fit_helix
 from models.solvers.joint import JointSolution, bar_normals, implausible, setup_unknowns, solve_joint
 from models.solvers.observations import RunData, nominal_reading
@@ -138,6 +139,7 @@ def solution_doc(solved: Solved) -> dict[str, Any]:
         "model": f"rigid21/legendre{LEGENDRE_ORDER}",
         "abbe": version("abbe"),
         "parameters": {n: {"value": e.value(n), "u": e.u(n), "data_share": float(s)} for n, s in zip(e.names, e.data_share, strict=True)},
+        "mean_over_volume": {p.name: {"value": p.value, "u": p.u} for p in mean_linear(joint)},
         "rank": {"rank": joint.identifiability.rank, "of": joint.identifiability.n_parameters},
         "not_observable": not_observable(joint),
         "variance_factor": e.variance_factor,

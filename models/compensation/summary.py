@@ -1,0 +1,51 @@
+"""Scale errors and squareness as the whole volume sees them: slopes of the main effects, with their uncertainty.
+
+The coefficients of the model are stated at the carriages' pivots, where one tool length often cannot separate them from angles. Their mean
+effect over the volume - which is what one-axis tables correct - is known far better, and is what people mean by "the" squareness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.arrays import F1
+from models.compensation.tables import main_effect
+from models.machine import AXES
+from models.solvers.joint import JointSolution
+from models.solvers.priors import U_WAVELENGTH
+
+SQUARENESS = (("C0Y", 0, 1, -1.0), ("B0Z", 0, 2, 1.0), ("A0Z", 1, 2, -1.0))
+"""Name, the two axes, and the sign that turns the sum of both slopes into it (docs/conventions.md)."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeanParameter:
+    """A linear parameter averaged over the volume: mm/mm for scales (EXX...), rad for squareness, with its standard uncertainty."""
+
+    name: str
+    value: float
+    u: float
+
+
+def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9) -> tuple[MeanParameter, ...]:
+    """Mean scale error of X, Y, Z (slope of EXX, EYY, EZZ) and mean squareness C0Y, B0Z, A0Z over the volume.
+
+    Least-squares slopes over equidistant positions; scales carry the laser's wavelength uncertainty, which all readings share.
+    """
+    slopes = {}
+    for a in range(3):
+        first, last = (float(v) for v in solution.machine.stroke_mm[a])
+        p = np.linspace(first, last, positions)
+        weight = (p - p.mean()) / np.sum((p - p.mean()) ** 2)
+        slopes[a] = np.einsum("p,pik->ik", weight, main_effect(solution.machine, solution, a, p, nodes))
+    found = [_parameter(solution, f"E{AXES[a]}{AXES[a]}", slopes[a][a], U_WAVELENGTH) for a in range(3)]
+    found += [_parameter(solution, name, sign * (slopes[a][b] + slopes[b][a])) for name, a, b, sign in SQUARENESS]
+    return tuple(found)
+
+
+def _parameter(solution: JointSolution, name: str, gradient: F1, u_common: float = 0.0) -> MeanParameter:
+    value = float(gradient @ solution.coefficients)
+    u = float(np.sqrt(gradient @ solution.term_covariance @ gradient))
+    return MeanParameter(name, value, float(np.hypot(u, u_common)))
