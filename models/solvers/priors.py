@@ -1,7 +1,7 @@
 """Typical sizes of error motions and set-up errors: documented priors, never hidden ones.
 
 They are wide (a first machine is expected well inside them) and only decide what the data leave open: `Estimate.data_share` tells.
-Sources: effects.md 1 (typical magnitudes of machine tools), published machine data (Yang Table 2: 100 urad scales; Pahk: up to 110 urad).
+Sources: effects.md 2 (typical magnitudes of geometry), published machine data (Yang Table 2: 100 urad scales; Pahk: up to 110 urad).
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from models.arrays import F1
 from models.geometry.bases import Term
 from models.machine import Machine
 
-
 U_WAVELENGTH = 0.3e-6
-"""Relative standard uncertainty of the laser's wavelength after environmental compensation (about 0.3 K or 1 hPa): no scale is known better."""
+"""Relative standard uncertainty of the laser's wavelength after air compensation (about 0.3 K or 1 hPa): no scale is known better."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,12 @@ def sim(context: typer.Context) -> None:
     """Run the simulated machine and its instruments; arguments go to `python -m simulators`."""
     # A group of its own: Ctrl-C reaches the child once, from here, and not a second time from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
-    child = subprocess.Popen([sys.executable, "-m", "simulators", *context.args], **own_group)  # noqa: S603 - our own package
+    words = list(context.args)
+    if words[:1] != ["truth"] and "--watch-stdin" not in words:
+        # The child ends when this pipe closes: not even SIGKILL of this process leaves it behind.
+        words.append("--watch-stdin")
+        own_group["stdin"] = subprocess.PIPE
+    child = subprocess.Popen([sys.executable, "-m", "simulators", *words], **own_group)  # noqa: S603 - our own package
 
     def forward(number: int, _frame: FrameType | None) -> None:
         if child.poll() is None:
