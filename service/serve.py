@@ -42,7 +42,8 @@ log = structlog.get_logger("abbe.serve")
 
 STOP_S = 4.5
 """Promised are 5 s from the signal to the end of the process; what hangs after this is cut off. The store survives that."""
-HOLD_S = 3.0
+HOLD_S = 2.5
+GOODBYE_S = 1.2
 FLUSH_S = 5.0
 
 
@@ -135,8 +136,7 @@ class Service:
         """Work until ``stop``, or, with ``once``, until every recipe was run once; return whether all of those passed."""
         passed = True
         async with asyncio.TaskGroup() as parts:
-            if self._publisher is not None:
-                parts.create_task(self._publisher.run(), name="mqtt")
+            mqtt = parts.create_task(self._publisher.run() if self._publisher is not None else stop.wait(), name="mqtt")
             parts.create_task(self._server.serve(sockets=[self._listening]), name="web")
             work = parts.create_task(self._once() if once else self._timetable(), name="scheduler")
             beat = parts.create_task(self._heartbeat(), name="heartbeat")
@@ -150,6 +150,8 @@ class Service:
             self._server.should_exit = True
             if self._publisher is not None:
                 self._publisher.stop()
+            await asyncio.wait({mqtt}, timeout=GOODBYE_S)
+            mqtt.cancel()  # a broker that accepts connections and then says nothing would hold us up
             beat.cancel()
             stopped.cancel()
         return passed

@@ -38,7 +38,8 @@ async def check(recipe: str, progress: ProgressSink) -> Result:
         try:
             await asyncio.Event().wait()
         finally:
-            print("held", flush=True)
+            sys.stdout.write("held\n")
+            sys.stdout.flush()
     return Result()
 
 

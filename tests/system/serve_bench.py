@@ -1,0 +1,155 @@
+"""Real processes for the service's system tests. Waiting is always for a line that a process writes, never for time to pass."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).parent
+PATIENCE_S = 30.0
+
+
+def require(name: str, *places: str) -> str:
+    """Return the path of a program; skip the test without it, or fail if ABBE_TEST_REQUIRE demands it."""
+    found = next((path for place in (name, *places) if (path := shutil.which(place))), None)
+    if found is None:
+        if name in os.environ.get("ABBE_TEST_REQUIRE", ""):
+            pytest.fail(f"{name} is required by ABBE_TEST_REQUIRE and not installed")
+        pytest.skip(f"{name} is not installed (apt-get install -y {name})")
+    return found
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Process:
+    """A child process whose lines can be waited for."""
+
+    def __init__(self, *command: str | Path, env: dict[str, str] | None = None) -> None:
+        self.lines: list[str] = []
+        self._queue: queue.Queue[str | None] = queue.Queue()
+        self._child = subprocess.Popen(
+            [str(part) for part in command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            bufsize=1,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})},
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._child.stdout is not None
+        for line in self._child.stdout:
+            self._queue.put(line.rstrip("\n"))
+        self._queue.put(None)
+
+    def expect(self, text: str, patience_s: float = PATIENCE_S) -> str:
+        """Return the next line that contains ``text``."""
+        deadline_s = time.monotonic() + patience_s
+        while True:
+            try:
+                line = self._queue.get(timeout=max(deadline_s - time.monotonic(), 0.001))
+            except queue.Empty:
+                raise AssertionError(f"no line with {text!r} within {patience_s} s; there were:\n" + "\n".join(self.lines[-40:])) from None
+            if line is None:
+                self._queue.put(None)
+                raise AssertionError(f"the process ended without a line with {text!r}; there were:\n" + "\n".join(self.lines[-40:]))
+            self.lines.append(line)
+            if text in line:
+                return line
+
+    def kill(self) -> None:
+        self._child.kill()
+        self._end()
+
+    def terminate(self, number: int = signal.SIGTERM) -> tuple[int, float]:
+        """Send a signal; return exit code and seconds until the end."""
+        started_s = time.monotonic()
+        self._child.send_signal(number)
+        code = self._child.wait(timeout=PATIENCE_S)
+        took_s = time.monotonic() - started_s
+        self._end()
+        return code, took_s
+
+    def wait(self) -> int:
+        code = self._child.wait(timeout=PATIENCE_S)
+        self._end()
+        return code
+
+    def _end(self) -> None:
+        self._child.wait(timeout=PATIENCE_S)
+        self._reader.join(timeout=PATIENCE_S)
+        assert self._child.stdout is not None
+        self._child.stdout.close()
+        while not self._queue.empty():
+            line = self._queue.get()
+            if line is not None:
+                self.lines.append(line)
+        self._queue.put(None)
+
+    def close(self) -> None:
+        if self._child.poll() is None:
+            self.kill()
+
+
+class Broker:
+    """A real Mosquitto that keeps its subscribers' sessions on disk, on a port that stays the same."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = free_port()
+        self._program = require("mosquitto", "/usr/sbin/mosquitto")
+        self._config = folder / "mosquitto.conf"
+        data = folder / "broker"
+        data.mkdir()
+        self._config.write_text(
+            f"listener {self.port} 127.0.0.1\nallow_anonymous true\nuser root\n"
+            f"persistence true\npersistence_location {data}/\nautosave_on_changes true\nautosave_interval 1\n"
+        )
+        self.process = self.start()
+
+    @property
+    def url(self) -> str:
+        return f"mqtt://127.0.0.1:{self.port}"
+
+    def start(self) -> Process:
+        self.process = Process(self._program, "-v", "-c", self._config)
+        self.process.expect("running")
+        return self.process
+
+    def subscriber(self) -> Process:
+        """Return a real client with a session of its own: what is published while it reconnects is kept for it."""
+        program = require("mosquitto_sub")
+        at = ("-h", "127.0.0.1", "-p", str(self.port))
+        receiver = Process(program, *at, "-q", "1", "-c", "-i", "receiver", "-t", "plant/#", "-F", "MSG %t %p")
+        self.process.expect("Sending SUBACK to receiver")
+        return receiver
+
+
+def service(folder: Path, **config: Any) -> Process:
+    """Start the service with the check that needs no devices."""
+    path = folder / "service.json"
+    path.write_text(json.dumps({"store": f"sqlite:///{folder / 'abbe.sqlite3'}", **config}))
+    return Process(sys.executable, HERE / "serve_check.py", path)
+
+
+def payload(line: str) -> dict[str, Any]:
+    """Return the JSON of a subscriber's line."""
+    loaded: dict[str, Any] = json.loads(line.split(" ", 2)[2])
+    return loaded
