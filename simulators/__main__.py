@@ -93,7 +93,7 @@ def _watch_stdin(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
 
 
 def _truth(argv: Sequence[str]) -> int:
-    from simulators.truth.command import truth
+    from simulators.sealed import truth
 
     parser = _parser("simulators truth", "The sealed truth: volumetric figures of the machine, with or without a correction.")
     parser.add_argument("--bank", type=Path, help="compensation image (docs/protocols/cnc.md), big-endian words; absent: no correction")

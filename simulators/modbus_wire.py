@@ -41,8 +41,10 @@ def _device(registers: RegisterMap, unit: int) -> SimDevice:
                 return ExcCodes.ILLEGAL_ADDRESS
             block[address - start : address - start + count] = words
             return None
-        if function not in _WRITE or values is None:
+        if function not in _WRITE:
             return ExcCodes.ILLEGAL_FUNCTION
+        if values is None:  # pymodbus fetches the echo of an FC6: the block has just taken it
+            return None
         return None if registers.write(address, [int(v) for v in values]) else ExcCodes.ILLEGAL_ADDRESS
 
     return SimDevice(id=unit, simdata=[SimData(0, count=registers.size, values=0, datatype=DataType.REGISTERS)], action=action)
