@@ -24,6 +24,7 @@ def measure(
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: recipe and time.")] = "",
     rate_hz: Annotated[int, typer.Option(help="Ball-bar samples per second; must divide 1000.")] = 100,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would move and how long it takes; move nothing.")] = False,
+    path: Annotated[bool, typer.Option("--path", help="With --dry-run: every commanded position, as CSV.")] = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample."""
     from service.cli.ask import console_ask
@@ -40,7 +41,7 @@ def measure(
     plan = _plan(site.machine, recipe, helix, rate_hz, name or f"{'helix' if helix else recipe} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     if dry_run:
-        print_dry_run(plan.name, runs)
+        print_path(plan) if path else print_dry_run(plan.name, runs)
         return
 
     async def work(store: Store) -> None:
@@ -111,6 +112,16 @@ def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int, name: str) ->
     if recipe not in plans:
         raise ConfigError(f"there is no recipe {recipe!r}", f"use one of: {RECIPES}")
     return plans[recipe](machine, rate_hz=rate_hz, name=name)
+
+
+def print_path(plan: CampaignPlan) -> None:
+    """Every commanded position of the plan, one CSV line each: test, X, Y, Z in mm."""
+    from service.sequences.check import positions
+
+    typer.echo("test,x_mm,y_mm,z_mm")
+    for test in plan.tests:
+        for x, y, z in positions(test.steps):
+            typer.echo(f"{test.label},{x:.5f},{y:.5f},{z:.5f}")
 
 
 def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
