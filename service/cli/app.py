@@ -8,6 +8,7 @@ from service.cli.configuration import check_config, schema
 from service.cli.demo import demo
 from service.cli.exchange import export_campaign, import_campaign
 from service.cli.measure import correct, measure
+from service.cli.serve import serve
 from service.cli.show import runs, show
 from service.cli.system import SIM_SETTINGS, sim, version
 
@@ -23,6 +24,7 @@ app = typer.Typer(
 app.command("demo")(demo)
 app.command("measure")(measure)
 app.command("correct")(correct)
+app.command("serve")(serve)
 app.command("check-config")(check_config)
 app.command("runs")(runs)
 app.command("show")(show)

@@ -5,35 +5,81 @@ from __future__ import annotations
 import logging
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-PROBLEM = 2
+if TYPE_CHECKING:
+    from service.config import Loaded
+    from service.events import ProgressSink
+    from service.scheduler.ports import Check, CheckResult
+    from service.scheduler.store import ServiceStore
+    from service.serve import Setup
 
 
 def serve(
-    machine: Annotated[Path, typer.Argument(help="Machine file (TOML).")],
-    port: Annotated[int | None, typer.Option(help="Port of the status page, instead of [web] port.", min=0, max=65535)] = None,
+    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
+    port: Annotated[int | None, typer.Option(help="Port of the status page, instead of [web] port; 0: any.", min=0, max=65535)] = None,
     once: Annotated[
-        bool, typer.Option("--once", help="Run every recipe of the timetable once, now, and end: exit code 1 unless all pass.")
+        bool, typer.Option("--once", help="Run every recipe of the timetable once, now, and end; exit code 1 unless all pass.")
     ] = False,
 ) -> None:
-    """Run scheduled checks unattended, publish their results, show a status page. Ends on Ctrl-C or SIGTERM."""
-    from service.errors import AbbeError
+    """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
+    from service.config import load_machine
     from service.serve import serve as run
 
+    setup = setup_of(load_machine(machine), port)
     configure_logs()
-    try:
-        code = run(_setup(machine, port), once=once)
-    except AbbeError as problem:
-        typer.echo(f"abbe serve: {problem} [{problem.code}]", err=True)
-        raise typer.Exit(PROBLEM) from problem
-    raise typer.Exit(code)
+    raise typer.Exit(run(setup, once=once))
 
 
-def _setup(machine: Path, port: int | None) -> object:
-    raise NotImplementedError
+def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
+    """Return what the service is to do.
+
+    Parameters
+    ----------
+    loaded : Loaded
+        The machine file.
+    port : int, optional
+        Instead of the file's.
+
+    Raises
+    ------
+    AbbeError
+        A schedule names no recipe, or its paths leave the machine's strokes: better now than at the first slot, at night.
+    """
+    from service.mqtt.broker import parse
+    from service.mqtt.topics import Topics
+    from service.scheduler.slots import Schedule, checked
+    from service.sequences.check import dry_run_campaign
+    from service.serve import Setup
+    from service.site import site_of
+    from service.workflows.check import recipe_plan, run_check
+
+    config = loaded.machine
+    site = site_of(config)
+    schedules = tuple(checked(Schedule(entry.name, entry.cron, entry.timezone, entry.recipe, entry.grace_s)) for entry in config.schedule)
+    for schedule in schedules:
+        dry_run_campaign(site.machine, recipe_plan(schedule.recipe, site.machine), site.max_feed_mm_min)
+
+    def check_on(store: ServiceStore) -> Check:
+        async def check(recipe: str, progress: ProgressSink) -> CheckResult:
+            return await run_check(config, store, recipe, progress)
+
+        return check
+
+    return Setup(
+        machine=config.name,
+        doc=site.doc,
+        devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
+        schedules=schedules,
+        store_url=loaded.database_url,
+        broker=None if config.mqtt.url is None else parse(config.mqtt.url),
+        topics=Topics(config.mqtt.topic_prefix, config.name),
+        host=config.web.host,
+        port=config.web.port if port is None else port,
+        check=check_on,
+    )
 
 
 def configure_logs() -> None:
