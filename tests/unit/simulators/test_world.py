@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from simulators.scenario import Scenario, from_dict
+from simulators.truth.figures import deviation
 from simulators.world import World
 
 OWNER = 7
@@ -137,3 +138,36 @@ def test_an_hour_at_once_is_cheap_and_complete(quiet_world) -> None:
     got = world.ballbar.take()
     assert len(got.seq) == 360_000
     assert np.array_equal(np.diff(got.seq), np.ones(359_999))
+
+
+def test_the_wires_and_the_sealed_figures_speak_of_the_same_machine() -> None:
+    """The mean of both approach directions, without drift, is what the truth command reports."""
+    world = World(from_dict({"seed": 6, "magnitudes": {"drift_sd_um": 0.0}}))
+    node = np.array([450.0, 100.0, 300.0])
+    both = []
+    for side in (-1.0, 1.0):
+        go(world, node + side * 5.0)
+        both.append(go(world, node))
+    expected = deviation(world.machine, node[None, :])[0]
+    np.testing.assert_allclose(np.mean(both, axis=0) - node - world.machine.geometry.tool_mm, expected, atol=1e-7)
+    assert np.linalg.norm(both[0] - both[1]) > 1e-3
+
+
+def test_every_mount_draws_anew_within_the_stated_sizes() -> None:
+    world = World(Scenario(seed=3))
+    here = world.tool_position()
+    cups, tilts, beams = [], [], []
+    for _ in range(400):
+        world.ballbar.mount(100.0, here)
+        assert world.ballbar._cup_mm is not None
+        cups.append(world.ballbar._cup_mm - here)
+        world.laser.mount(np.array([0.0, 0.6, 0.8]), here)
+        assert world.laser._mount is not None
+        tilts.append(world.laser._mount.normal - [0.0, 0.6, 0.8])
+        beams.append(world.laser._mount.beam - [0.0, 0.6, 0.8])
+    for vectors, low, high in ((cups, 2e-3, 30e-3), (tilts, 30e-6, 300e-6), (beams, 100e-6, 300e-6)):
+        sizes = np.linalg.norm(vectors, axis=1)
+        assert low * 0.999 <= sizes.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < sizes.max() <= high * 1.001
+    assert np.abs(np.array(tilts) @ [0.0, 0.6, 0.8]).max() < 1e-12, "perpendicular to the beam"
+    assert np.abs(np.mean(cups, axis=0)).max() < 3e-3, "in every direction"
