@@ -37,6 +37,7 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
         past=past,
         latest=past[0] if past else None,
         figures=figures(past),
+        latest_figures=_judged_first(past[0]) if past else [],
         trends=trends(past, zone),
         marks=MARKS,
         zone=zone,
@@ -58,10 +59,31 @@ def trends(past: Sequence[Verification], zone: tzinfo) -> list[Markup]:
     for key in figures(past):
         name, unit = words.figure_name(key)
         points = [
-            Point(check.started_utc, value, check.uncertainties.get(key) or 0.0, check.limits.get(key), check.verdict)
+            Point(check.started_utc, value, check.uncertainties.get(key) or 0.0, check.limits.get(key), figure_verdict(check, key))
             for check in past
             if (value := check.values.get(key)) is not None
         ]
         if points:
             plots.append(Markup(trend_svg(name, unit, points, zone)))  # noqa: S704 - our own writer, which escapes
     return plots
+
+
+def figure_verdict(check: Verification, key: str) -> str:
+    """Return what one figure says, by the same guard-banded rule as the check's own verdict.
+
+    If the check's verdict does not follow from its figures, then its reason (say, the temperature) is one for each of them.
+    """
+    found = {name: _judged(check, name) for name in check.limits if check.values.get(name) is not None}
+    worst = next((verdict for verdict in ("fail", "cannot tell", "pass") if verdict in found.values()), None)
+    return found.get(key, check.verdict) if worst == check.verdict else check.verdict
+
+
+def _judged(check: Verification, key: str) -> str:
+    value, limit, expanded = check.values[key], check.limits[key], check.uncertainties.get(key) or 0.0
+    if value is None or limit is None:
+        return "cannot tell"
+    return "pass" if value + expanded <= limit else "fail" if value - expanded > limit else "cannot tell"
+
+
+def _judged_first(check: Verification) -> list[str]:
+    return sorted(check.values, key=lambda key: check.limits.get(key) is None)

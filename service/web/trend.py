@@ -11,12 +11,12 @@ from html import escape
 from service.web.words import number
 
 WIDTH, HEIGHT = 560, 230
-LEFT, RIGHT, TOP, BOTTOM = 58, 14, 16, 40
+LEFT, RIGHT, TOP, BOTTOM = 58, 40, 16, 40
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One check's figure."""
+    """One check's figure. ``verdict`` is of the figure, not of the whole check."""
 
     at: datetime
     value: float
@@ -100,15 +100,15 @@ def _grid(y: _Scale) -> list[str]:
 
 
 def _dates(points: Sequence[Point], x: _Scale, zone: tzinfo) -> list[str]:
-    first, last = points[0].at, points[-1].at
-    form = "%H:%M:%S" if last - first < timedelta(minutes=10) else "%H:%M" if last - first < timedelta(hours=36) else "%d %b"
-    shown = [first + (last - first) * part for part in ((0, 1 / 3, 2 / 3, 1) if last > first else (0,))]
+    length = timedelta(seconds=x.high - x.low)
+    form = "%H:%M:%S" if length < timedelta(minutes=10) else "%H:%M" if length < timedelta(hours=36) else "%d %b"
     texts = []
-    for index, moment in enumerate(shown):
-        anchor = "middle" if len(shown) == 1 else ("start", "middle", "middle", "end")[index]
-        text = moment.astimezone(zone).strftime(form)
-        texts.append(f'<text class="tick" x="{x(moment.timestamp()):.1f}" y="{HEIGHT - BOTTOM + 17}" text-anchor="{anchor}">{text}</text>')
-    day = last.astimezone(zone).strftime("%Y-%m-%d")
+    for part in (0.125, 0.375, 0.625, 0.875):
+        moment = datetime.fromtimestamp(x.low + part * (x.high - x.low), zone)
+        texts.append(
+            f'<text class="tick" x="{x(moment.timestamp()):.1f}" y="{HEIGHT - BOTTOM + 17}" text-anchor="middle">{moment:{form}}</text>'
+        )
+    day = points[-1].at.astimezone(zone).strftime("%Y-%m-%d")
     texts.append(
         f'<text class="axis" x="{WIDTH - RIGHT}" y="{HEIGHT - 5}" text-anchor="end">time ({escape(str(zone))}), up to {day}</text>'
     )
@@ -124,7 +124,8 @@ def _limit(points: Sequence[Point], x: _Scale, y: _Scale) -> list[str]:
     last_y = known[-1][1]
     return [
         f'<path class="limit" d="{path}"/>',
-        f'<text class="limit-text" x="{WIDTH - RIGHT}" y="{last_y - 5:.1f}" text-anchor="end">limit</text>',
+        # Beside the plot, not in it: the newest point is where one looks, and it may lie on the limit.
+        f'<text class="limit-text" x="{WIDTH - RIGHT + 5}" y="{last_y + 4:.1f}">limit</text>',
     ]
 
 

@@ -153,3 +153,23 @@ def payload(line: str) -> dict[str, Any]:
     """Return the JSON of a subscriber's line."""
     loaded: dict[str, Any] = json.loads(line.split(" ", 2)[2])
     return loaded
+
+
+class Machine:
+    """The simulators as a process, and a machine file that names their ports."""
+
+    def __init__(self, folder: Path, speed: float, *sections: str) -> None:
+        self.process = Process(sys.executable, "-m", "simulators", "--speed", str(speed), "--ballbar", "tcp", "--link-dir", folder)
+        ready = json.loads(self.process.expect('"ready"'))
+        machine = ready["machine"]
+        lines = ['name = "mill-7"', f"chain = {json.dumps(machine['chain'])}", f"tool_mm = {json.dumps(machine['tool_mm'])}"]
+        for table in ("stroke_mm", "pivots_mm"):
+            lines += [f"[{table}]", *(f"{axis} = {json.dumps(value)}" for axis, value in machine[table].items())]
+        lines += ["[devices]", *(f"{role} = {json.dumps(ready[role])}" for role in ("cnc", "ballbar", "laser", "fixture"))]
+        self.file = folder / "machine.toml"
+        self.file.write_text("\n".join([*lines, *sections]) + "\n")
+
+
+def abbe(*arguments: str | Path) -> Process:
+    """Start the command ``abbe``."""
+    return Process(sys.executable, "-c", "from service.cli import main; main()", *arguments)

@@ -20,6 +20,8 @@ from service.web import words
 from service.web.app import create_app
 from service.web.board import Board
 from service.web.headers import HEADERS
+from service.web.page import figure_verdict
+from service.web.schemas import Verification
 from service.web.trend import Point, trend_svg
 from service.web.view import View
 from tests.unit.service_serve.fakes import STEP, FakeClock, Result, utc
@@ -190,6 +192,23 @@ def test_trend_is_well_formed_for_any_number_of_points(count: int) -> None:
 def test_trend_survives_figures_without_size_or_limit() -> None:
     svg = trend_svg("x", "", [Point(NOW, 0.0, 0.0, None, "pass"), Point(NOW, -3.0, 0.0, None, "pass")], utc(2026, 1, 1).tzinfo)  # type: ignore[arg-type]
     assert "limit" not in svg
+
+
+@pytest.mark.parametrize(
+    ("verdict", "diagonal", "helix", "expected"),
+    [
+        ("fail", 23.4, 1.4, ("fail", "pass")),
+        ("pass", 11.0, 1.4, ("pass", "pass")),
+        ("cannot tell", 19.5, 1.4, ("cannot tell", "pass")),
+        ("cannot tell", 11.0, 1.4, ("cannot tell", "cannot tell")),  # too warm: the reason is not in the figures
+    ],
+)
+def test_a_point_shows_the_verdict_of_its_figure(verdict: str, diagonal: float, helix: float, expected: tuple[str, str]) -> None:
+    doc = record.found(
+        record.Occasion("m", WEEKLY, NOW), Result(verdict=verdict, values={"body_diagonal_um": diagonal, "helix_rms_um": helix})
+    )
+    check = Verification.model_validate({"id": 1, **doc})
+    assert (figure_verdict(check, "body_diagonal_um"), figure_verdict(check, "helix_rms_um")) == expected
 
 
 def test_words() -> None:

@@ -1,0 +1,125 @@
+"""The whole service against the simulated machine: two checks by itself, a broker killed in between, the page, a stop while measuring."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import pytest
+
+from service.scheduler.store import ServiceStore
+from tests.system.serve_bench import Broker, Machine, abbe, free_port, payload
+from tests.system.test_serve_page import browser, only_us, open_page, shot
+
+pytestmark = [pytest.mark.scenario, pytest.mark.browser, pytest.mark.timeout(240)]
+
+SPEED = 60.0
+
+
+@pytest.fixture
+def ending() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+def sections(broker: Broker, port: int, cron: str) -> list[str]:
+    timetable = ["[[schedule]]", 'name = "often"', f"cron = {json.dumps(cron)}", 'recipe = "quick-check"']
+    return ["[mqtt]", f'url = "{broker.url}"', 'topic_prefix = "plant/abbe"', "[web]", f"port = {port}", *timetable]
+
+
+def test_two_scheduled_checks_and_a_broker_that_dies(tmp_path: Path, ending: ExitStack) -> None:
+    port, started_s = free_port(), time.monotonic()
+    broker = Broker(tmp_path)
+    ending.callback(lambda: broker.process.close())
+    receiver = ending.enter_context(closing(broker.subscriber()))
+    machine = Machine(tmp_path, SPEED, *sections(broker, port, "*/20 * * * * *"))
+    ending.callback(machine.process.close)
+    running = ending.enter_context(closing(abbe("serve", machine.file)))
+
+    receiver.expect("mill-7/verification", 120)
+    broker.process.kill()
+    running.expect('"check done"', 120)
+    running.expect('"check done"', 120)
+    broker.start()
+    receiver.expect("mill-7/verification", 60)
+    took_s = time.monotonic() - started_s
+
+    with browser() as seen:
+        open_page(seen, port)
+        assert seen.page.locator("tr[data-id]").count() >= 2
+        assert seen.page.locator("svg.trend").count() == 2
+        assert "mqtt://127.0.0.1" in seen.page.locator("main").inner_text()
+        shot(seen.page, "serve-acceptance.png")
+        assert seen.errors == []
+        assert only_us(seen)
+
+    code, stop_s = running.terminate()
+    assert (code, stop_s < 5.0) == (0, True)
+    assert took_s < 180.0
+    receiver.expect('"state":"offline"')
+    got = [payload(line) for line in receiver.lines if "/verification " in line]
+    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        kept = store.verifications_of("mill-7")
+        waiting = [json.loads(row.payload)["verification"] for row in store.outbox_pending()]
+    assert all(check.campaign_id is not None for check in kept)
+    assert sorted({message["verification"] for message in got} | set(waiting)) == sorted(check.id for check in kept)
+    assert {"body_diagonal_um", "helix_rms_um"} <= got[0]["values"].keys()
+
+
+def test_sigterm_while_the_machine_moves(tmp_path: Path, ending: ExitStack) -> None:
+    broker = Broker(tmp_path)
+    ending.callback(lambda: broker.process.close())
+    receiver = ending.enter_context(closing(broker.subscriber()))
+    machine = Machine(tmp_path, 5.0, *sections(broker, free_port(), "* * * * * *"))
+    ending.callback(machine.process.close)
+    running = ending.enter_context(closing(abbe("serve", machine.file)))
+    receiver.expect('"state":"measuring"')
+    running.expect("skipped")
+    code, stop_s = running.terminate()
+    assert (code, stop_s < 5.0) == (0, True)
+    assert not any("Traceback" in line for line in running.lines)
+    receiver.expect('"state":"offline"')
+
+
+def test_the_machine_goes_away_and_the_service_says_so(tmp_path: Path, ending: ExitStack) -> None:
+    broker = Broker(tmp_path)
+    ending.callback(lambda: broker.process.close())
+    receiver = ending.enter_context(closing(broker.subscriber()))
+    machine = Machine(tmp_path, 5.0, *sections(broker, free_port(), "*/2 * * * * *"))
+    ending.callback(machine.process.close)
+    running = ending.enter_context(closing(abbe("serve", machine.file)))
+    receiver.expect('"state":"measuring"')
+    machine.process.kill()
+    result = payload(receiver.expect("mill-7/verification", 60))
+    assert (result["verdict"], result["cause"]["code"][:3]) == ("cannot tell", "DRV")
+    alarm = payload(receiver.expect('"code":"DRV'))
+    assert alarm["machine"] == "mill-7"
+    running.expect('"slot done"')
+    running.expect('"check done"', 60)  # the loop goes on
+    assert running.terminate()[0] == 0
+
+
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, ending: ExitStack) -> None:
+    broker = Broker(tmp_path)
+    ending.callback(lambda: broker.process.close())
+    machine = Machine(tmp_path, SPEED, *sections(broker, free_port(), "0 6 * * 1"))
+    machine.process.close()
+    good = machine.file.read_text()
+    cases = {
+        'recipe = "no-such"': good.replace('recipe = "quick-check"', 'recipe = "no-such"'),
+        "0.0.0.0": good.replace("[web]", '[web]\nhost = "0.0.0.0"'),
+        "cron": good.replace("0 6 * * 1", "0 25 * * 1"),
+    }
+    for text in cases.values():
+        machine.file.write_text(text)
+        wrong = abbe("serve", machine.file)
+        assert wrong.wait() == 2
+        assert len(wrong.lines) == 1, wrong.lines
+        assert wrong.lines[0].startswith("error CFG-001: ")
+    machine.file.write_text(good)
+    taken = abbe("serve", machine.file, "--port", str(broker.port))
+    assert taken.wait() == 2
+    assert [line for line in taken.lines if line.startswith("error ")] == taken.lines

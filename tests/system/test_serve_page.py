@@ -1,0 +1,160 @@
+"""The page in a real browser: what it shows, that it asks nobody else, and that it notices when the service is gone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, sync_playwright
+
+from drivers.errors import LinkDown
+from service.scheduler import record
+from service.scheduler.slots import Schedule
+from service.scheduler.store import ServiceStore
+from tests.system.serve_bench import free_port, require, service
+from tests.system.serve_check import Result
+
+pytestmark = pytest.mark.browser
+
+ARTIFACTS = Path(__file__).parents[2] / "artifacts"
+QUIET = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+]
+WEEKLY = Schedule("weekly", "0 6 * * 1", "Europe/Berlin", "quick-check")
+TIMETABLE = [["weekly", "0 6 * * 1", "quick"], ["night", "30 2 1 1 *", "quick"]]
+
+
+@dataclass
+class Seen:
+    """What the browser asked for and complained about."""
+
+    page: Page
+    requests: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+
+
+@contextmanager
+def browser(**context: Any) -> Iterator[Seen]:
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=require("chromium"), args=QUIET)
+        try:
+            page = chromium.new_page(viewport={"width": 1280, "height": 768}, **context)
+            seen = Seen(page)
+            page.on("request", lambda request: seen.requests.append(request.url))
+            page.on("console", lambda message: seen.errors.append(message.text) if message.type == "error" else None)
+            page.on("pageerror", lambda error: seen.errors.append(str(error)))
+            yield seen
+        finally:
+            chromium.close()
+
+
+def fill(folder: Path, weeks: int) -> None:
+    """Store a history that ends in a failure, with one check that could not be completed."""
+    now = datetime.now(UTC)
+    with ServiceStore.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
+        machine = store.add_machine("mill-7", {"name": "mill-7"})
+        for week in range(weeks):
+            at = now - timedelta(days=7 * (weeks - 1 - week), hours=3)
+            occasion = record.Occasion("mill-7", WEEKLY, at)
+            if week == weeks - 3:
+                doc = record.failed(
+                    occasion, LinkDown("modbus+tcp://127.0.0.1:5021", "connect", "connection refused", "is the laser on?"), at, 5.0
+                )
+            else:
+                drift = 11.0 + 0.02 * week**2 + 1.2 * math.sin(1.7 * week)
+                verdict = "fail" if drift - 1.1 > 20 else "pass" if drift + 1.1 <= 20 else "cannot tell"
+                text = f"{verdict}: worst body diagonal {drift:.1f} µm (limit 20)"
+                values = {
+                    "diagonal_ppp_um": drift - 3,
+                    "diagonal_npp_um": drift,
+                    "body_diagonal_um": drift,
+                    "helix_rms_um": 1.2 + 0.1 * week + 0.2 * math.cos(week),
+                }
+                result = Result(
+                    verdict, values, text=text, started_utc=at, duration_s=312.0, campaign=f"quick-check {at:%Y-%m-%d %H:%M:%S}"
+                )
+                doc = record.found(occasion, result)
+            store.keep_verification(machine, doc, [])
+
+
+def shot(page: Page, name: str, *, full: bool = False) -> None:
+    ARTIFACTS.mkdir(exist_ok=True)
+    page.screenshot(path=ARTIFACTS / name, full_page=full)
+
+
+def open_page(seen: Seen, port: int) -> None:
+    seen.page.goto(f"http://127.0.0.1:{port}/")
+    seen.page.wait_for_selector("html[data-ready=yes]")
+
+
+def only_us(seen: Seen) -> bool:
+    return bool(seen.requests) and all(url.startswith("http://127.0.0.1:") for url in seen.requests)
+
+
+def test_history_in_the_browser(tmp_path: Path) -> None:
+    port = free_port()
+    fill(tmp_path, 24)
+    with closing(service(tmp_path, schedules=TIMETABLE, port=port)) as running, browser() as seen:
+        running.expect("planned")
+        open_page(seen, port)
+        assert seen.page.locator("tr[data-id]").count() == 20
+        assert seen.page.locator(".verdict").inner_text() == "✖ fail"
+        assert seen.page.locator("svg.trend").count() == 2
+        assert seen.page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth"), "scrolls sideways"
+        shot(seen.page, "serve-history.png")
+        shot(seen.page, "serve-history-full.png", full=True)
+        assert seen.errors == []
+        assert only_us(seen)
+
+
+def test_it_refreshes_itself_and_says_when_the_service_is_gone(tmp_path: Path) -> None:
+    port = free_port()
+    with closing(service(tmp_path, schedules=[["fast", "*/3 * * * * *", "quick"]], port=port)) as running, browser() as seen:
+        running.expect("planned")
+        open_page(seen, port)
+        seen.page.locator("tr[data-id]").nth(1).wait_for(timeout=20_000)
+        assert seen.page.locator(".verdict").inner_text() == "✔ pass"
+        assert not seen.page.locator("#lost").is_visible()
+        assert seen.errors == []
+        assert running.terminate()[0] == 0
+        seen.page.wait_for_selector("#lost:visible", timeout=10_000)
+        assert seen.page.evaluate("document.body.classList.contains('stale')")
+        shot(seen.page, "serve-lost.png")
+        assert only_us(seen)
+
+
+def test_a_running_check_in_dark_colours(tmp_path: Path) -> None:
+    port = free_port()
+    fill(tmp_path, 9)
+    with (
+        closing(service(tmp_path, schedules=[["endless", "* * * * * *", "endless"]], port=port)) as running,
+        browser(color_scheme="dark") as seen,
+    ):
+        running.expect("skipped")
+        open_page(seen, port)
+        assert seen.page.locator(".state").inner_text() == "measuring"
+        assert seen.page.locator("#job-stage").inner_text() == "helix"
+        assert float(seen.page.locator("#job-bar").get_attribute("value") or "nan") == 1.0
+        shot(seen.page, "serve-dark.png")
+        assert seen.errors == []
+
+
+def test_empty_page(tmp_path: Path) -> None:
+    port = free_port()
+    with closing(service(tmp_path, schedules=[["yearly", "0 0 1 1 *", "quick"]], port=port)) as running, browser() as seen:
+        running.expect("planned")
+        open_page(seen, port)
+        assert "No check has been made yet" in seen.page.locator("main").inner_text()
+        shot(seen.page, "serve-empty.png")
+        assert seen.errors == []
