@@ -225,7 +225,7 @@ def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signa
     command = [sys.executable, "-c", "from service.cli import main; main()", "sim", "a.toml", "--help", "--speed=3"]
     process = subprocess.Popen(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    assert process.stdout.readline() == "['a.toml', '--help', '--speed=3']\n"
+    assert process.stdout.readline() == "['a.toml', '--help', '--speed=3', '--watch-stdin']\n"
     process.send_signal(number)
     assert process.wait(timeout=20) == code
     process.stdout.close()
