@@ -13,6 +13,7 @@ import ipaddress
 import os
 import signal
 import socket
+import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 RUN_MARK = f"ABBE_TEST_RUN={os.getpid()}"
 Require = Callable[[str, bool, str], None]
+POSTGRES = "postgresql://postgres@127.0.0.1:5432/"
 
 
 def _require(name: str, present: bool, reason: str) -> None:
@@ -44,6 +46,29 @@ def shared() -> Path:
     path = ROOT.parent / "shared"
     _require("shared", path.is_dir(), "the folder ../shared (vectors, data, examples) is not beside the repository")
     return path
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Callable[[], str]]:
+    """Make throw-away databases on a real PostgreSQL; gives their URLs."""
+    psycopg = pytest.importorskip("psycopg")
+    try:
+        server = psycopg.connect(POSTGRES, autocommit=True, connect_timeout=3)
+    except psycopg.OperationalError:
+        _require("postgresql", False, f"no PostgreSQL at {POSTGRES}")
+        return
+    made: list[str] = []
+
+    def make() -> str:
+        name = f"abbe_test_{uuid.uuid4().hex}"
+        server.execute(f"CREATE DATABASE {name}")
+        made.append(name)
+        return POSTGRES + name
+
+    yield make
+    for name in made:
+        server.execute(f"DROP DATABASE {name} WITH (FORCE)")
+    server.close()
 
 
 # --- asyncio tasks -------------------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,8 +16,6 @@ from service.storage.migrate import current_revision, downgrade, head_revision, 
 from service.storage.store import Store
 from service.storage.tables import metadata
 
-SERVER = "postgresql://postgres@127.0.0.1:5432/"
-
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
@@ -27,18 +24,9 @@ def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
         yield engine
         engine.dispose()
         return
-    psycopg = pytest.importorskip("psycopg")
-    try:
-        server = psycopg.connect(SERVER, autocommit=True, connect_timeout=3)
-    except psycopg.OperationalError:
-        pytest.skip(f"no PostgreSQL at {SERVER}")
-    name = f"abbe_test_{uuid.uuid4().hex}"
-    server.execute(f"CREATE DATABASE {name}")
-    engine = make_engine(SERVER + name)
+    engine = make_engine(request.getfixturevalue("postgres")())
     yield engine
     engine.dispose()
-    server.execute(f"DROP DATABASE {name} WITH (FORCE)")
-    server.close()
 
 
 def test_up_gives_the_tables_of_the_program(engine: Engine) -> None:
