@@ -1,0 +1,74 @@
+"""What lies in deploy/ is what it says: the example loads, the unit is valid and locked down, the broker starts, images are pinned."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from service.cli.serve import setup_of
+from service.config import load_machine
+from tests.system.serve_bench import Process, free_port, require
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    """The unit with a program that exists here: systemd-analyze insists on one."""
+    copy = tmp_path / "abbe.service"
+    copy.write_text(re.sub(r"(?m)^ExecStart=\S+", "ExecStart=/bin/true", (DEPLOY / "abbe.service").read_text()))
+    return copy
+
+
+def test_the_example_is_a_complete_machine_file() -> None:
+    setup = setup_of(load_machine(DEPLOY / "machine.example.toml"))
+    assert [schedule.name for schedule in setup.schedules] == ["weekly"]
+    assert set(setup.devices) == {"ballbar", "laser", "cnc", "fixture"}
+    assert setup.broker is not None
+    assert setup.host == "127.0.0.1"
+
+
+def test_the_unit_is_valid(unit: Path) -> None:
+    done = subprocess.run([require("systemd-analyze"), "verify", unit], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_unit_is_locked_down(unit: Path) -> None:
+    command = [require("systemd-analyze"), "security", "--offline=true", "--threshold=25", "--no-pager", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-300:]
+
+
+def test_the_broker_starts_with_its_file(tmp_path: Path) -> None:
+    config = tmp_path / "mosquitto.conf"
+    text = (
+        (DEPLOY / "mosquitto.conf")
+        .read_text()
+        .replace("/mosquitto/data/", f"{tmp_path}/")
+        .replace("listener 1883", f"listener {free_port()} 127.0.0.1")
+    )
+    config.write_text(text + "user root\n")
+    with closing(Process(require("mosquitto", "/usr/sbin/mosquitto"), "-c", config)) as broker:
+        broker.expect("running")
+
+
+def test_the_postgres_lock_is_a_part_of_the_other_lock() -> None:
+    whole = (ROOT / "requirements-dev.lock").read_text()
+    lines = [line for line in (DEPLOY / "requirements-postgres.lock").read_text().splitlines() if line and not line.startswith("#")]
+    assert sum(not line.startswith(" ") for line in lines) == 2
+    assert [line for line in lines if line.rstrip(" \\") not in whole] == []
+
+
+def test_containers_stay_on_this_computer() -> None:
+    compose = (DEPLOY / "compose.yaml").read_text()
+    published = re.findall(r'ports: \["([^"]+)"\]', compose)
+    assert len(published) == 2
+    assert all(port.startswith("127.0.0.1:") for port in published)
+    images = re.findall(r"(?m)^\s*image: (\S+)", compose) + re.findall(r"(?m)^FROM (\S+)", (DEPLOY / "Dockerfile").read_text())
+    assert not any("." in image.split("/")[0] for image in images if "/" in image), "a registry's address"
+    assert "password" not in re.sub(r"postgres_password|POSTGRES_PASSWORD_FILE|/secrets/\S+", "", compose).lower()
