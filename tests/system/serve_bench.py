@@ -25,7 +25,7 @@ def require(name: str, *places: str) -> str:
     """Return the path of a program; skip the test without it, or fail if ABBE_TEST_REQUIRE demands it."""
     found = next((path for place in (name, *places) if (path := shutil.which(place))), None)
     if found is None:
-        if name in os.environ.get("ABBE_TEST_REQUIRE", ""):
+        if name in os.environ.get("ABBE_TEST_REQUIRE", "").split(","):
             pytest.fail(f"{name} is required by ABBE_TEST_REQUIRE and not installed")
         pytest.skip(f"{name} is not installed (apt-get install -y {name})")
     return found

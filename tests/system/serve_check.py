@@ -32,8 +32,10 @@ class Result:
 
 
 async def check(recipe: str, progress: ProgressSink) -> Result:
-    """``quick``: a moment. ``endless``: until cancelled, and then it says on stdout that it held the motion."""
+    """What the recipe says: ``quick`` takes a moment, ``defect`` is a fault of this program, ``endless`` runs until it is cancelled."""
     progress(Progress("helix", 1, 2, 0.1, "revolution 1 of 2"))
+    if recipe == "defect":
+        raise KeyError("a defect")
     if recipe == "endless":
         try:
             await asyncio.Event().wait()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from collections.abc import Iterator
@@ -10,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from drivers.cnc.registers import Bit
+from drivers.registry import open_controller
+from service.config import load_machine
 from service.scheduler.store import ServiceStore
 from tests.system.serve_bench import Broker, Machine, abbe, free_port, payload
 from tests.system.test_serve_page import browser, only_us, open_page, shot
@@ -82,6 +86,34 @@ def test_sigterm_while_the_machine_moves(tmp_path: Path, ending: ExitStack) -> N
     assert (code, stop_s < 5.0) == (0, True)
     assert not any("Traceback" in line for line in running.lines)
     receiver.expect('"state":"offline"')
+    asyncio.run(stands_still(load_machine(machine.file).machine.devices.cnc or ""))
+
+
+async def stands_still(url: str) -> None:
+    """Ask the controller over a connection of our own, for a second of its time, whether its axes move."""
+    controller = await open_controller(url)
+    try:
+        first = await controller.status()
+        now = first
+        while now.ctrl_us - first.ctrl_us < 1_000_000:
+            assert not now.bits & (Bit.MOVING | Bit.PATH_RUNNING)
+            assert now.position_mm == first.position_mm
+            now = await controller.status()
+    finally:
+        await controller.close()
+
+
+def test_once_runs_every_recipe_and_says_by_its_exit_code_that_the_machine_is_out_of_limits(tmp_path: Path, ending: ExitStack) -> None:
+    broker = Broker(tmp_path)
+    ending.callback(lambda: broker.process.close())
+    receiver = ending.enter_context(closing(broker.subscriber()))
+    machine = Machine(tmp_path, SPEED, *sections(broker, free_port(), "0 6 * * 1"))
+    ending.callback(machine.process.close)
+    once = ending.enter_context(closing(abbe("serve", machine.file, "--once", "--port", "0")))
+    once.expect("check done", 120)
+    assert once.wait() == 1
+    result = payload(receiver.expect("mill-7/verification"))
+    assert (result["verdict"], result["schedule"]) == ("fail", "often (once)")
 
 
 def test_the_machine_goes_away_and_the_service_says_so(tmp_path: Path, ending: ExitStack) -> None:

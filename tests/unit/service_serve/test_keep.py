@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -32,9 +32,17 @@ class NoWait(FakeClock):
         self.pauses.append(s)
 
 
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
+    make: Callable[[], str] = request.getfixturevalue("postgres")
+    return make()
+
+
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[ServiceStore]:
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as opened:
+def store(url: str) -> Iterator[ServiceStore]:
+    with ServiceStore.open(url) as opened:
         yield opened
 
 
@@ -42,8 +50,7 @@ def shelf_of(store: ServiceStore, posted: list[int]) -> StoreShelf:
     return StoreShelf(store, NoWait(), ("mill-7", store.add_machine("mill-7", {})), TOPICS, lambda: posted.append(1))
 
 
-async def test_slots_survive_the_process(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
+async def test_slots_survive_the_process(url: str) -> None:
     with ServiceStore.open(url) as store:
         ledger = StoreLedger(store, NoWait(), "mill-7")
         assert await ledger.last_claimed("weekly") is None
@@ -56,10 +63,10 @@ async def test_slots_survive_the_process(tmp_path: Path) -> None:
         assert await StoreLedger(store, NoWait(), "mill-8").claim("weekly", SLOT)
 
 
-async def test_two_processes_race_for_slots(store: ServiceStore, tmp_path: Path) -> None:
+async def test_two_processes_race_for_slots(store: ServiceStore, url: str) -> None:
     slots = [utc(2026, 6, 1 + day, hour) for day in range(5) for hour in range(20)]
     won: list[list[bool]] = [[], []]
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as other:
+    with ServiceStore.open(url) as other:
         threads = [
             threading.Thread(target=lambda s=s, w=w: w.extend(s.claim_slot("m/weekly", slot) for slot in slots))
             for s, w in zip((store, other), won, strict=True)
@@ -123,10 +130,12 @@ async def test_a_store_that_fails_for_a_while(store: ServiceStore, monkeypatch: 
     assert await shelf.keep(record.found(OCCASION, Result())) == 1
 
 
-async def test_a_store_that_stays_broken_is_an_error(store: ServiceStore, tmp_path: Path) -> None:
+async def test_a_store_that_stays_broken_is_an_error(tmp_path: Path) -> None:
     clock = NoWait()
+    store = ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}")
     with sqlite3.connect(tmp_path / "abbe.sqlite3") as raw:
         raw.execute("DROP TABLE slots")
     with pytest.raises(StoreError):
         await StoreLedger(store, clock, "m").claim("weekly", SLOT)
     assert clock.pauses == list(PAUSES_S)
+    store.close()
