@@ -11,10 +11,13 @@ import typer
 
 if TYPE_CHECKING:
     from service.config import Loaded
+    from service.config_schema import MachineFile
     from service.events import ProgressSink
     from service.scheduler.ports import Check, CheckResult
+    from service.scheduler.slots import Schedule
     from service.scheduler.store import ServiceStore
     from service.serve import Setup
+    from service.site import Site
 
 
 def serve(
@@ -50,17 +53,12 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     """
     from service.mqtt.broker import parse
     from service.mqtt.topics import Topics
-    from service.scheduler.slots import Schedule, checked
-    from service.sequences.check import dry_run_campaign
     from service.serve import Setup
     from service.site import site_of
-    from service.workflows.check import recipe_plan, run_check
+    from service.workflows.check import run_check
 
     config = loaded.machine
     site = site_of(config)
-    schedules = tuple(checked(Schedule(entry.name, entry.cron, entry.timezone, entry.recipe, entry.grace_s)) for entry in config.schedule)
-    for schedule in schedules:
-        dry_run_campaign(site.machine, recipe_plan(schedule.recipe, site.machine), site.max_feed_mm_min)
 
     def check_on(store: ServiceStore) -> Check:
         async def check(recipe: str, progress: ProgressSink) -> CheckResult:
@@ -72,7 +70,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         machine=config.name,
         doc=site.doc,
         devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
-        schedules=schedules,
+        schedules=_timetable(config, site),
         store_url=loaded.database_url,
         broker=None if config.mqtt.url is None else parse(config.mqtt.url),
         topics=Topics(config.mqtt.topic_prefix, config.name),
@@ -80,6 +78,17 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         port=config.web.port if port is None else port,
         check=check_on,
     )
+
+
+def _timetable(config: MachineFile, site: Site) -> tuple[Schedule, ...]:
+    from service.scheduler.slots import Schedule, checked
+    from service.sequences.check import dry_run_campaign
+    from service.workflows.check import recipe_plan
+
+    schedules = tuple(checked(Schedule(entry.name, entry.cron, entry.timezone, entry.recipe, entry.grace_s)) for entry in config.schedule)
+    for schedule in schedules:
+        dry_run_campaign(site.machine, recipe_plan(schedule.recipe, site.machine), site.max_feed_mm_min)
+    return schedules
 
 
 def configure_logs() -> None:

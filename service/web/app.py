@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import Annotated, Protocol
 
 from fastapi import FastAPI, Query
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, Response
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.staticfiles import StaticFiles
 
 from service.web import problems
 from service.web.headers import SecurityHeaders
-from service.web.page import HERE, environment, render
+from service.web.page import HERE, ICON, environment, render
 from service.web.schemas import Health, Problem, Status, Verification, Verifications
 
 PAGE_ROWS = 60
@@ -59,6 +59,10 @@ def _add_routes(app: FastAPI, source: Source) -> None:
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     async def page() -> HTMLResponse:
         return HTMLResponse(render(env, await source.status(), await source.verifications(PAGE_ROWS)))
+
+    @app.get("/icon.svg", include_in_schema=False)
+    async def icon() -> Response:
+        return Response(ICON, media_type="image/svg+xml")
 
     @app.get("/api/v1/status", responses=trouble)
     async def status() -> Status:

@@ -17,6 +17,11 @@ from service.web.trend import Point, trend_svg
 HERE = Path(__file__).parent
 MARKS = {"pass": "✔", "fail": "✖", "cannot tell": "◐"}
 SHOWN_FIGURES = 4
+ICON = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><rect width="32" height="32" rx="6" fill="#22506e"/>'
+    '<path d="M6 24 16 7l10 17M10 18h12" fill="none"'
+    ' stroke="#fff" stroke-width="3" stroke-linejoin="round" stroke-linecap="round"/></svg>'
+)
 
 
 def environment() -> Environment:

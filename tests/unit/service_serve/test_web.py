@@ -131,7 +131,7 @@ async def test_names_from_outside_stay_text(site: Site) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/api/v1/status", "/healthz", "/readyz", "/static/page.css", "/static/status.js", "/nothing", "/docs"]
+    "path", ["/", "/api/v1/status", "/healthz", "/readyz", "/static/page.css", "/static/status.js", "/icon.svg", "/nothing", "/docs"]
 )
 async def test_headers_on_every_answer(site: Site, path: str) -> None:
     answer = await site.client.get(path)
@@ -154,6 +154,10 @@ async def test_errors_are_problem_documents(site: Site, path: str, status: int) 
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
     assert answer.json()["status"] == status
+
+
+async def test_the_icon_is_a_picture(site: Site) -> None:
+    assert ElementTree.fromstring((await site.client.get("/icon.svg")).text).tag.endswith("svg")
 
 
 async def test_nothing_can_be_posted(site: Site) -> None:
