@@ -20,6 +20,7 @@ from service.sequences.steps import CampaignPlan
 from service.site import site_of
 from service.storage.store import Store
 from service.workflows.measure import measure
+from service.workflows.recover import recover
 from service.workflows.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
 
 RECIPES: dict[str, Callable[[Machine], CampaignPlan]] = {"quick-check": quick_check, "verification": verification}
@@ -68,6 +69,7 @@ async def run_check(config: MachineFile, store: Store, recipe: str, progress: Pr
     plan = recipe_plan(recipe, site.machine)
     plan = CampaignPlan(f"{plan.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
     async with open_session(site.urls) as session:
+        await recover(session.controller, store, site)
         run_ids = await measure(session, store, site, plan, progress=progress, clock=clock)
     runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
     rows = figure_rows(figures(runs))

@@ -7,7 +7,7 @@ were read back. Every state is a row of the push journal before the action it pe
 from __future__ import annotations
 
 import secrets
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from models.compensation.tables import NineTables
 from models.machine import AXES
 from service.errors import TableMismatch, TableRefused
 from service.site import Site, TableLimits
+from service.storage.owner import this_process
 from service.storage.store import Store
 
 KIND_NINE = 1
@@ -161,7 +162,13 @@ class Pusher:
         machine_id = await self._store.write(self._store.add_machine, self._site.name, self._site.doc)
         table_id = await self._store.write(self._store.add_table, machine_id, solution_id, image, crc32(image), doc)
         self._journal = {"base_bank": base.active_bank, "base_crc": base.bank_crc[base.active_bank], "base_image_hex": base_image.hex()}
-        self._journal |= {"target_bank": target, "crc": crc32(image), "boot_id": base.boot_id, "gen": base.gen}
+        self._journal |= {
+            "target_bank": target,
+            "crc": crc32(image),
+            "boot_id": base.boot_id,
+            "gen": base.gen,
+            "owner": asdict(this_process()),
+        }
         self._push_id = await self._store.write(self._store.add_push, machine_id, table_id, "STAGING", self._journal)
         self._note(f"base: bank {base.active_bank}, CRC {base.bank_crc[base.active_bank]:08X}; target: bank {target}")
         await self._c.lease(self._owner, LEASE_MS)

@@ -16,6 +16,7 @@ from service.site import Site
 from service.storage.store import Store
 from service.workflows.compensate import Pushed, Pusher
 from service.workflows.measure import measure
+from service.workflows.recover import recover
 from service.workflows.solve import Solved, helix_misfit, solution_doc, solve_runs
 from service.workflows.verify import Decision, Figures, decide, figure_rows, figures
 
@@ -65,6 +66,9 @@ async def correct(
     TableMismatch
         The controller does not hold what was sent: it was not activated.
     """
+    said = await recover(session.controller, store, site)
+    if said is not None:
+        progress(Progress("recover", 1.0, 1.0, 0.0, said))
     record = await asyncio.to_thread(store.campaign, campaign)
     run_ids = [r.id for r in await asyncio.to_thread(store.runs, record.id) if r.visible_status == "complete"]
     progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))

@@ -15,7 +15,7 @@ from drivers.cnc.tables import crc32
 from models.compensation.tables import NineTables, grid_positions, quantise
 from service.clock import SystemClock
 from service.devices.session import DeviceUrls, open_session
-from service.errors import TableMismatch, TableRefused
+from service.errors import TableMismatch, TableRefused, UnsafeToMove
 from service.events import ignore_progress
 from service.runs.columns import load_run
 from service.sequences.recipes import Diagonal
@@ -24,6 +24,7 @@ from service.site import Site, TableLimits, machine_doc, machine_from_doc
 from service.storage.store import Store
 from service.workflows.compensate import Pusher
 from service.workflows.measure import measure
+from service.workflows.recover import recover
 from service.workflows.verify import decide, figures
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]
@@ -142,3 +143,38 @@ async def test_a_table_with_the_wrong_sign_is_rolled_back_by_itself(start_sims, 
         assert (now.active_bank, now.bank_crc[now.active_bank]) == (base.active_bank, base.bank_crc[base.active_bank])
         assert store.pushes()[-1].state == "ROLLED_BACK"
         assert crc32(await session.controller.read_bank(now.active_bank)) == now.bank_crc[now.active_bank]
+
+
+@pytest.mark.parametrize("state", ["PROBATION", "ACTIVATING"])
+async def test_a_push_cut_short_before_its_verification_is_taken_back_at_the_next_start(start_sims, tmp_path, state):
+    sims = start_sims("--speed", "60")
+    async with bench(sims, tmp_path) as (site, store, session):
+        base = await session.controller.comp_status()
+        await Pusher(session.controller, store, site).push(linear_tables(site, np.full((3, 3), 1e-5)), lsb_nm=100, solution_id=None, doc={})
+        push = store.pushes()[-1]
+        assert push.state == "PROBATION"
+        with pytest.raises(UnsafeToMove, match="under way"):  # as long as its process lives
+            await recover(session.controller, store, site)
+        dead = push.doc | {"owner": push.doc["owner"] | {"start": "another boot/1"}}
+        store.update_push(push.id, state, dead)
+        said = await recover(session.controller, store, site)
+        assert "made active again" in said
+        now = await session.controller.comp_status()
+        assert (now.active_bank, now.bank_crc[now.active_bank]) == (base.active_bank, base.bank_crc[base.active_bank])
+        assert store.pushes()[-1].state == "ROLLED_BACK"
+        assert await recover(session.controller, store, site) is None
+
+
+async def test_a_push_cut_short_before_activation_changes_nothing(start_sims, tmp_path):
+    sims = start_sims("--speed", "60")
+    async with bench(sims, tmp_path) as (site, store, session):
+        with pytest.raises(TableMismatch):
+            await Pusher(Noisy(session.controller), store, site).push(
+                linear_tables(site, np.full((3, 3), 1e-5)), lsb_nm=100, solution_id=None, doc={}
+            )
+        push = store.pushes()[-1]
+        store.update_push(push.id, push.state, push.doc | {"owner": push.doc["owner"] | {"start": "another boot/1"}})
+        gen = (await session.controller.comp_status()).gen
+        assert "before its table became active" in await recover(session.controller, store, site)
+        assert (await session.controller.comp_status()).gen == gen
+        assert store.pushes()[-1].state == "ABORTED"
