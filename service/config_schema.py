@@ -110,7 +110,6 @@ class Limits(_Section):
 class Verify(_Section):
     """Limits of the scheduled check: above one of them the machine does not pass."""
 
-    volumetric_rms_um: Positive = Field(default=10.0, description="rms volumetric error over the grid, rigid motion removed")
     body_diagonal_um: Positive = Field(default=20.0, description="range of the deviation along the worst body diagonal")
     helix_rms_um: Positive = Field(default=5.0, description="rms of the ball-bar residual on the check helix")
 
@@ -136,7 +135,9 @@ class Mqtt(_Section):
 class Web(_Section):
     """Where the web page is served."""
 
-    host: str = Field(default="127.0.0.1", min_length=1, description="127.0.0.1: this computer only; 0.0.0.0: everybody on the network")
+    host: str = Field(
+        default="127.0.0.1", min_length=1, description="only this computer (127.0.0.1, ::1 or localhost): the page has no users yet"
+    )
     port: int = Field(default=8080, ge=0, le=65535, description="0: any free port")
 
 

@@ -10,6 +10,7 @@ from service.cli.exchange import export_campaign, import_campaign
 from service.cli.measure import correct, measure
 from service.cli.serve import serve
 from service.cli.show import runs, show
+from service.cli.solve import solve
 from service.cli.system import SIM_SETTINGS, sim, version
 
 app = typer.Typer(
@@ -23,6 +24,7 @@ app = typer.Typer(
 
 app.command("demo")(demo)
 app.command("measure")(measure)
+app.command("solve")(solve)
 app.command("correct")(correct)
 app.command("serve")(serve)
 app.command("check-config")(check_config)

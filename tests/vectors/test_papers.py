@@ -88,3 +88,16 @@ def test_squareness_contrasts_are_free_of_scale_errors(shared):
     assert found.theta_xy == pytest.approx(s["theta_obtuse"]["txy"], abs=1e-12)
     assert found.theta_xz == pytest.approx(s["theta_obtuse"]["txz"], abs=1e-12)
     assert found.theta_yz == pytest.approx(s["theta_obtuse"]["tyz"], abs=1e-12)
+
+
+def test_what_the_linear_model_cannot_follow_widens_its_uncertainty_but_not_the_prior():
+    p = helix_points(np.zeros(3), 175.0, turns=5, n=600)
+    true = np.zeros((600, 3))
+    true[:, 1] = 4e-3 * np.sin(2 * np.pi * p[:, 0] / 120.0 + 0.7)  # EYX, two waves within the helix
+    rng = np.random.default_rng(3)
+    reading = np.linalg.norm(p + true, axis=1) - 175.0 + rng.normal(0, 5e-4, 600)
+    fit = fit_helix(p, reading, np.zeros(3), 175.0, sigma_mm=5e-4).estimate
+    white = fit_helix(p, rng.normal(0, 5e-4, 600), np.zeros(3), 175.0, sigma_mm=5e-4).estimate
+    assert fit.u("C0Y") > 3 * white.u("C0Y")
+    assert abs(fit.value("C0Y")) < 3 * fit.u("C0Y")
+    assert fit.u("bar_length") == pytest.approx(0.0015, rel=0.01)
