@@ -82,7 +82,7 @@ class TableMismatch(AbbeError):
     code = "CMP-002"
 
 
-class VerificationFailed(AbbeError):
-    """The machine was not better with the new table; the old one is active again."""
+class StillActive(AbbeError):
+    """An unverified table is still active: the controller could not be switched back. Every later command tries again first."""
 
     code = "CMP-003"

@@ -31,6 +31,7 @@ class Site:
     urls: DeviceUrls
     limits: TableLimits = field(default_factory=TableLimits)
     max_feed_mm_min: float = 6000.0
+    temperature_c: tuple[float, float] = (18.0, 24.0)
 
 
 def machine_from_doc(doc: dict[str, Any]) -> Machine:
@@ -80,4 +81,5 @@ def site_of(config: MachineFile) -> Site:
         DeviceUrls(devices.cnc, devices.ballbar, devices.laser, devices.fixture),
         TableLimits(limits.table_value_um * 1e-3, limits.table_change_um * 1e-3, limits.table_step_um * 1e-3),
         limits.feed_mm_min,
+        limits.temperature_c,
     )

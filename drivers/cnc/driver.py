@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.api import CompStatus, ControllerStatus, DeviceInfo, Point
+from drivers.api import CompStatus, ControllerStatus, DeviceInfo, Point, TableFormat
 from drivers.cnc import registers as reg
 from drivers.cnc.banks import Banks
 from drivers.cnc.motion import Motion
@@ -40,6 +40,10 @@ class ModbusController:
             Canary registers or map version are not the protocol's.
         """
         return await self._session.identify()
+
+    async def table_format(self) -> TableFormat:
+        """Read in which unit and how large this controller stores tables."""
+        return await self._session.table_format()
 
     async def status(self) -> ControllerStatus:
         """Read the controller's coherent status block."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from drivers.api import ControllerStatus, DeviceInfo
+from drivers.api import ControllerStatus, DeviceInfo, TableFormat
 from drivers.cnc import registers as reg
 from drivers.errors import Rebooted
 from drivers.links.identity import check_identity
@@ -75,6 +75,11 @@ class ControllerSession:
             await self.check_boot()
         self._last_us = status.ctrl_us
         return status
+
+    async def table_format(self) -> TableFormat:
+        """Read in which unit and how large this controller stores tables."""
+        counts = await self._identity()
+        return TableFormat(counts["TABLE_LSB_NM"], counts["BANK_SIZE"])
 
     async def _identity(self) -> dict[str, int]:
         words = await self.link.read(reg.IDENTITY.base, reg.IDENTITY.count)

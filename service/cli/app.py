@@ -12,6 +12,7 @@ from service.cli.serve import serve
 from service.cli.show import runs, show
 from service.cli.solve import solve
 from service.cli.system import SIM_SETTINGS, sim, version
+from service.cli.table import accept_table
 
 app = typer.Typer(
     name="abbe",
@@ -27,6 +28,7 @@ app.command("measure")(measure)
 app.command("solve")(solve)
 app.command("correct")(correct)
 app.command("serve")(serve)
+app.command("accept-table")(accept_table)
 app.command("check-config")(check_config)
 app.command("runs")(runs)
 app.command("show")(show)

@@ -75,14 +75,16 @@ def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
     imported = record.start_doc.get("imported")
     if imported is not None:
         return dict(imported) | {"columns": unpack_columns(chunks)}  # the key stands in "imported" too, so its place is kept
-    document = {"format": FORMAT, "campaign": record.campaign, "run_id": record.label, "test": record.test, "role": record.role}
+    document: Doc = {"format": FORMAT, "campaign": record.campaign, "run_id": record.label, "test": record.test, "role": record.role}
     try:
         columns = _measured(record, chunks)
-        return document | {"machine": record.start_doc["machine"], "setup": record.start_doc["setup"], "columns": columns}
+        document |= {"machine": record.start_doc["machine"], "setup": record.start_doc["setup"], "columns": columns}
     except (KeyError, TypeError) as err:
         raise StoreError(
             f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
         ) from None
+    # which compensation table was active: a solution is only meaningful together with it, so it travels with the run
+    return document | ({"table": record.start_doc["table"]} if "table" in record.start_doc else {})
 
 
 def pack_columns(columns: Doc) -> list[dict[str, Any]]:

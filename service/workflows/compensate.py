@@ -1,7 +1,8 @@
-"""Solution to table to controller: check limits, stage to the inactive bank, read back twice, seal, activate by compare-and-swap, confirm.
+"""A table's way into the controller: stage to the inactive bank, read back twice, seal, activate by compare-and-swap, confirm.
 
-At no instant is a table active that was not verified: the active bank is never written, and activation names the CRC and generation that
-were read back. Every state is a row of the push journal before the action it permits.
+The active bank is never written, and activation names the CRC and generation that were read back. From the moment in which activation may
+have happened, whatever goes wrong takes the old table back; what cannot be taken back at once is journaled and tried again before anything
+else. Every state is a row of the push journal before the action it permits.
 """
 
 from __future__ import annotations
@@ -10,20 +11,19 @@ import secrets
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-
 from drivers.api import CompStatus, Controller
-from drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
-from drivers.cnc.tables import TableImage, crc32, encode
+from drivers.cnc.tables import crc32, encode
+from drivers.links.shielded import run_to_end
 from models.compensation.tables import NineTables
-from models.machine import AXES
-from service.errors import TableMismatch, TableRefused
-from service.site import Site, TableLimits
+from service.errors import StillActive, TableMismatch, TableRefused
+from service.site import Site
 from service.storage.owner import this_process
 from service.storage.store import Store
+from service.workflows.tables import check_limits, compare_bytes, compare_meaning, table_image, tables_from_image
+from service.workflows.takeback import LEASE_MS, Ending, release_quietly, take_back
 
-KIND_NINE = 1
-LEASE_MS = 60_000
+STILL_ACTIVE = "the unverified table is STILL ACTIVE"
+MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,93 +39,37 @@ class Pushed:
     log: tuple[str, ...]
 
 
-def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
-    """Nine tables as the controller stores them: for each input axis X, Y, Z, for each output X, Y, Z, corrections in LSB (cnc.md).
+@dataclass(frozen=True, slots=True)
+class Base:
+    """The table in force before a push."""
 
-    Raises
-    ------
-    TableRefused
-        A grid is not equidistant, or a value does not fit the controller's 16 bits.
-    """
-    start, step, counts, values = [], [], [], []
-    for a in range(3):
-        grid = tables.position_mm[a]
-        pitch = np.diff(grid)
-        if np.ptp(pitch) > 1e-6:
-            raise TableRefused(
-                f"table of {AXES[a]}: the grid is not equidistant", "resample it on the controller's grid; nothing was written"
-            )
-        start.append(float(grid[0]))
-        step.append(float(pitch[0]))
-        counts.append(int(grid.size))
-        for i in range(3):
-            values += [int(v) for v in np.round(tables.correction_mm[a][:, i] * 1e6 / lsb_nm)]
-    if max(map(abs, values)) > 32767:
-        raise TableRefused("a correction does not fit the controller's 16-bit entries", "check the solution; nothing was written")
-    sx, sy, sz = start
-    px, py, pz = step
-    nx, ny, nz = counts
-    return TableImage(KIND_NINE, table_id, lsb_nm, (sx, sy, sz), (px, py, pz), (nx, ny, nz), tuple(values))
+    status: CompStatus
+    image: bytes
+
+    @property
+    def crc(self) -> int:
+        """CRC-32 of the active bank as the controller sealed it."""
+        return self.status.bank_crc[self.status.active_bank]
+
+    @property
+    def tables(self) -> NineTables | None:
+        """The corrections in force; None for no correction."""
+        return tables_from_image(self.image)
 
 
-def check_limits(tables: NineTables, active: NineTables | None, limits: TableLimits) -> None:
-    """Refuse, never clamp: value, change against the active table, step between neighbours, zero at the reference (reliability.md 3.3).
-
-    Raises
-    ------
-    TableRefused
-        Which table, where, how much over which limit. Nothing has been written.
-    """
-    for a in range(3):
-        for i in range(3):
-            values = tables.correction_mm[a][:, i]
-            before = np.zeros_like(values)
-            if active is not None:
-                before = np.interp(tables.position_mm[a], active.position_mm[a], active.correction_mm[a][:, i])
-            name = f"table of {AXES[i]} over {AXES[a]}"
-            if not np.isfinite(values).all():
-                raise TableRefused(f"{name}: holds values that are no numbers", "check the solution; nothing was written")
-            checks = (
-                ("value", np.abs(values), limits.value_mm, "table_value_um"),
-                ("change against the active table", np.abs(values - before), limits.change_mm, "table_change_um"),
-                ("step between neighbours", np.abs(np.diff(values)), limits.step_mm, "table_step_um"),
-            )
-            for what, size, limit, key in checks:
-                k = int(np.argmax(size))
-                if size[k] > limit:
-                    at = tables.position_mm[a][k]
-                    raise TableRefused(
-                        f"{name}: {what} {size[k] * 1e3:.1f} µm at {at:.1f} mm exceeds the limit of {limit * 1e3:.1f} µm",
-                        f"check the measurement; if the machine is really so, raise {key} under [limits]. Nothing was written",
-                    )
-            if abs(values[0]) > 5e-7:
-                raise TableRefused(f"{name}: not zero at its reference", "shift the table; nothing was written")
-
-
-def tables_from_image(image: bytes) -> NineTables | None:
-    """Tables in a bank image by the independent decoder; None for an image without correction (kind 0).
+async def read_base(controller: Controller) -> Base:
+    """Read the active bank and prove it against its CRC.
 
     Raises
     ------
     TableMismatch
-        The bank holds a kind of table that this version cannot read.
+        The bytes do not have the CRC the controller states.
     """
-    try:
-        curves = read_axis_tables(image)
-    except UnreadableImage as error:
-        raise TableMismatch(
-            f"a bank holds no table that can be read: {error}", "look at the controller's banks; nothing was activated"
-        ) from None
-    if not curves:
-        return None
-    positions, corrections = [], []
-    for a in AXES:
-        positions.append(np.array([p for p, _ in curves[(a, "X")]]))
-        corrections.append(np.column_stack([[c for _, c in curves[(a, i)]] for i in AXES]))
-    none = tuple(np.full_like(c, np.nan) for c in corrections)
-    return NineTables(
-        (positions[0], positions[1], positions[2]), (corrections[0], corrections[1], corrections[2]), (none[0], none[1], none[2])
-    )
+    status = await controller.comp_status()
+    base = Base(status, await controller.read_bank(status.active_bank))
+    if crc32(base.image) != base.crc:
+        raise TableMismatch("the active table does not have the CRC the controller states", "read the tables again; nothing was written")
+    return base
 
 
 class Pusher:
@@ -139,107 +83,128 @@ class Pusher:
         self._log: list[str] = []
         self._push_id = 0
         self._journal: dict[str, Any] = {}
+        self._started = False
 
-    async def push(self, tables: NineTables, *, lsb_nm: int, solution_id: int | None, doc: dict[str, Any]) -> Pushed:
+    async def push(self, tables: NineTables, *, base: Base, solution_id: int | None, doc: dict[str, Any]) -> Pushed:
         """Bring tables to the controller and make them active.
+
+        Parameters
+        ----------
+        tables : NineTables
+            Absolute corrections, in the controller's unit (`models.compensation.tables.quantise`).
+        base : Base
+            The table in force, as `read_base` gave it: nothing is activated if another one is in force by then.
 
         Raises
         ------
         TableRefused
             A limit is broken; nothing was written.
         TableMismatch
-            What the controller holds is not what was sent; it was not activated.
+            What the controller holds is not what was sent; it is not active.
+        StillActive
+            Something went wrong after activation and the old table could not be made active again.
         """
-        base = await self._c.comp_status()
-        base_image = await self._c.read_bank(base.active_bank)
-        if crc32(base_image) != base.bank_crc[base.active_bank]:
-            raise TableMismatch(
-                "the active table does not have the CRC the controller states", "read the tables again; nothing was written"
-            )
-        check_limits(tables, tables_from_image(base_image), self._site.limits)
-        image = encode(table_image(tables, lsb_nm, secrets.randbits(31)))
-        target = 1 - base.active_bank
+        form = await self._c.table_format()
+        check_limits(tables, base.tables, self._site.limits)
+        image = encode(table_image(tables, form.lsb_nm, secrets.randbits(31)))
+        if len(image) > 2 * form.bank_registers:
+            raise TableRefused(f"the tables need {len(image) // 2} registers, a bank has {form.bank_registers}", "use a coarser grid")
+        target = 1 - base.status.active_bank
+        table_id = await self._open_journal(base, target, image, solution_id, doc)
+        try:
+            await self._c.lease(self._owner, LEASE_MS)
+            try:
+                await self._stage(target, image, tables, form.lsb_nm)
+                await self._activate(base, target, crc32(image))
+            finally:
+                await release_quietly(self._c, self._owner)
+        except BaseException as error:
+            await self.back_out(error)
+            raise
+        return Pushed(self._push_id, table_id, target, crc32(image), base.status.active_bank, base.crc, tuple(self._log))
+
+    async def _open_journal(self, base: Base, target: int, image: bytes, solution_id: int | None, doc: dict[str, Any]) -> int:
         machine_id = await self._store.write(self._store.add_machine, self._site.name, self._site.doc)
         table_id = await self._store.write(self._store.add_table, machine_id, solution_id, image, crc32(image), doc)
-        self._journal = {"base_bank": base.active_bank, "base_crc": base.bank_crc[base.active_bank], "base_image_hex": base_image.hex()}
-        self._journal |= {
-            "target_bank": target,
-            "crc": crc32(image),
-            "boot_id": base.boot_id,
-            "gen": base.gen,
-            "owner": asdict(this_process()),
-        }
+        self._journal = {"base_bank": base.status.active_bank, "base_crc": base.crc, "base_image_hex": base.image.hex()}
+        self._journal |= {"target_bank": target, "crc": crc32(image), "boot_id": base.status.boot_id, "owner": asdict(this_process())}
         self._push_id = await self._store.write(self._store.add_push, machine_id, table_id, "STAGING", self._journal)
-        self._note(f"base: bank {base.active_bank}, CRC {base.bank_crc[base.active_bank]:08X}; target: bank {target}")
-        await self._c.lease(self._owner, LEASE_MS)
-        try:
-            await self._stage(target, image, tables, lsb_nm)
-            await self._activate(base, target, crc32(image))
-        finally:
-            await self._c.release(self._owner)
-        return Pushed(self._push_id, table_id, target, crc32(image), base.active_bank, base.bank_crc[base.active_bank], tuple(self._log))
+        self._note(f"base: bank {base.status.active_bank}, CRC {base.crc:08X}; target: bank {target}")
+        return table_id
 
     async def _stage(self, target: int, image: bytes, tables: NineTables, lsb_nm: int) -> None:
         """Write, read back, compare bytes; read again and compare meaning through the independent decoder; seal; compare the CRC."""
         await self._c.write_bank(target, image)
-        first = await self._c.read_bank(target, len(image))
-        compare_bytes(image, first)
-        second = await self._c.read_bank(target, len(image))
-        compare_meaning(tables, tables_from_image(second), lsb_nm)
+        compare_bytes(image, await self._c.read_bank(target, len(image)))
+        compare_meaning(tables, tables_from_image(await self._c.read_bank(target, len(image))), lsb_nm)
         await self._c.seal(target, self._owner)
         sealed = (await self._c.comp_status()).bank_crc[target]
         if sealed != crc32(image):
-            await self._state("ABORTED", {"why": "sealed CRC differs"})
-            raise TableMismatch(
-                f"bank {target} was sealed with CRC {sealed:08X}, sent {crc32(image):08X}", "it was not activated; push again"
-            )
+            raise TableMismatch(f"bank {target} was sealed with CRC {sealed:08X}, sent {crc32(image):08X}", "it is not active; push again")
         self._note(f"bank {target} read back twice, sealed with CRC {sealed:08X}")
 
-    async def _activate(self, base: CompStatus, target: int, crc: int) -> None:
+    async def _activate(self, base: Base, target: int, crc: int) -> None:
         now = await self._c.comp_status()
-        if (now.boot_id, now.active_bank, now.bank_crc[base.active_bank]) != (
-            base.boot_id,
-            base.active_bank,
-            base.bank_crc[base.active_bank],
-        ):
-            await self._state("ABORTED", {"why": "the active table changed during the push"})
-            raise TableMismatch(
-                "somebody changed the active table, or the controller restarted, during the push", "look at it, then push again"
-            )
+        active = now.active_bank
+        if (now.boot_id, active, now.bank_crc[active]) != (base.status.boot_id, base.status.active_bank, base.crc):
+            raise TableMismatch("the active table changed, or the controller restarted, during the push", "look at it, then push again")
         await self._state("ACTIVATING", {"expect_crc": crc, "expect_gen": now.gen})
+        self._started = True
         await self._c.activate(target, expect_crc=crc, expect_gen=now.gen, owner=self._owner)
-        active = await self._c.comp_status()
-        image = await self._c.read_bank(target)
-        if active.active_bank != target or active.bank_crc[target] != crc or crc32(image) != crc:
-            await self._state("OPERATOR", {"why": "active table is not the one sent"})
-            raise TableMismatch(
-                "the controller's active table is not the one that was sent", "look at the controller before moving the machine"
-            )
+        await self._confirm(target, crc)
         await self._state("PROBATION", {})
         self._note(f"bank {target} active and read back again: CRC {crc:08X}")
 
-    async def roll_back(self, pushed: Pushed, why: str) -> None:
-        """Make the previous bank active again, by compare-and-swap on its own CRC.
+    async def _confirm(self, target: int, crc: int) -> None:
+        now = await self._c.comp_status()
+        if (now.active_bank, now.bank_crc[target]) != (target, crc) or crc32(await self._c.read_bank(target)) != crc:
+            raise TableMismatch(
+                "the controller's active table is not the one that was sent", "look at the controller before moving the machine"
+            )
+
+    async def keep(self) -> None:
+        """The new table was verified: check that it is still the one in force, and close the journal.
 
         Raises
         ------
         TableMismatch
-            The previous bank is no longer what it was; nothing was switched.
+            Somebody changed the active table during the verification.
         """
-        now = await self._c.comp_status()
-        if now.bank_crc[pushed.previous_bank] != pushed.previous_crc:
-            await self._state("OPERATOR", {"why": "the previous table is gone"})
-            raise TableMismatch("the previous table is no longer in its bank", "restore it from the push journal by hand")
-        await self._c.lease(self._owner, LEASE_MS)
-        try:
-            await self._c.activate(pushed.previous_bank, expect_crc=pushed.previous_crc, expect_gen=now.gen, owner=self._owner)
-        finally:
-            await self._c.release(self._owner)
-        await self._state("ROLLED_BACK", {"why": why})
-
-    async def keep(self) -> None:
-        """The new table was verified: close the journal."""
+        await self._confirm(int(self._journal["target_bank"]), int(self._journal["crc"]))
         await self._state("VERIFIED", {})
+
+    async def go_back(self, why: str) -> None:
+        """The new table is not better: make the old one active again, also when the caller is cancelled meanwhile.
+
+        Raises
+        ------
+        StillActive, TableMismatch
+            It could not be done (now), or a person must look.
+        """
+        ending = await run_to_end(take_back(self._c, self._store, self._push_id, self._journal, why))
+        self._complain(ending, why, None)
+
+    async def back_out(self, error: BaseException) -> None:
+        """Something stopped the push or its verification: nothing unverified stays active. The caller raises ``error`` again.
+
+        Raises
+        ------
+        StillActive, TableMismatch
+            Instead of ``error`` (and naming it), when the old table could not be made active again. A cancellation is never replaced.
+        """
+        why = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        if not self._started:  # activation was never asked for: the old table is in force
+            await run_to_end(self._state("ABORTED", {"why": why}))
+            return
+        ending = await run_to_end(take_back(self._c, self._store, self._push_id, self._journal, why))
+        if isinstance(error, Exception):
+            self._complain(ending, str(error), error)
+
+    def _complain(self, ending: Ending, why: str, cause: Exception | None) -> None:
+        if ending == "ROLLBACK_PENDING":
+            raise StillActive(f"{why}; {STILL_ACTIVE}", MAKE_READY) from cause
+        if ending == "OPERATOR":
+            raise TableMismatch(f"{why}; the controller holds a table that the journal does not know", "look at the controller") from cause
 
     async def _state(self, state: str, doc: dict[str, Any]) -> None:
         self._journal |= doc
@@ -247,40 +212,3 @@ class Pusher:
 
     def _note(self, text: str) -> None:
         self._log.append(text)
-
-
-def compare_bytes(sent: bytes, held: bytes) -> None:
-    """First read-back: every byte.
-
-    Raises
-    ------
-    TableMismatch
-        The first register that differs.
-    """
-    if sent != held:
-        at = next((k for k in range(min(len(sent), len(held))) if sent[k] != held[k]), min(len(sent), len(held)))
-        raise TableMismatch(
-            f"read-back differs from what was sent at register {at // 2}", "the table was not activated; check the link, push again"
-        )
-
-
-def compare_meaning(wanted: NineTables, held: NineTables | None, lsb_nm: int) -> None:
-    """Second read-back: what an independent decoder makes of the bytes must be the wanted correction, axis by axis, within half a unit.
-
-    Raises
-    ------
-    TableMismatch
-        Which table differs: this catches a wrong sign, a swapped axis, or a wrong unit in the encoder.
-    """
-    for a in range(3):
-        for i in range(3):
-            name = f"{AXES[i]} over {AXES[a]}"
-            if held is None or held.correction_mm[a].shape != wanted.correction_mm[a].shape:
-                raise TableMismatch(f"table {name} is not in the controller's bank", "it was not activated")
-            off_grid = np.abs(held.position_mm[a] - wanted.position_mm[a]).max()
-            off_value = np.abs(held.correction_mm[a][:, i] - wanted.correction_mm[a][:, i]).max()
-            if off_grid > 1e-5 or off_value > 0.51e-6 * lsb_nm:
-                raise TableMismatch(
-                    f"table {name} means something else to an independent decoder (off by {off_value * 1e3:.2f} µm)",
-                    "it was not activated; the encoder is wrong",
-                )

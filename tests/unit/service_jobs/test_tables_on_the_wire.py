@@ -9,7 +9,7 @@ from drivers.cnc.tables import encode
 from models.compensation.tables import NineTables
 from service.errors import TableMismatch, TableRefused
 from service.site import TableLimits
-from service.workflows.compensate import check_limits, compare_bytes, compare_meaning, table_image, tables_from_image
+from service.workflows.tables import added, check_limits, compare_bytes, compare_meaning, table_image, tables_from_image
 
 
 def tables(scale: float = 1.0) -> NineTables:
@@ -105,3 +105,23 @@ def test_a_table_with_nan_or_off_zero_is_refused():
     shifted.correction_mm[0][:, 0] += 0.01
     with pytest.raises(TableRefused, match="not zero at its reference"):
         check_limits(shifted, None, TableLimits())
+
+
+def test_a_change_adds_to_what_is_active_on_its_own_grid():
+    active = NineTables(
+        (np.array([0.0, 600.0]), np.array([0.0, 500.0]), np.array([-50.0, 400.0])), (np.ones((2, 3)),) * 3, (np.ones((2, 3)),) * 3
+    )
+    active.correction_mm[0][:] = [[0.0, 0.0, 0.0], [6e-3, 0.0, -6e-3]]
+    total = added(active, tables())
+    assert total.position_mm == tables().position_mm or all(
+        (a == b).all() for a, b in zip(total.position_mm, tables().position_mm, strict=True)
+    )
+    assert total.correction_mm[0][:, 0] == pytest.approx([0.0, 3e-3, 6e-3, 9e-3])
+    assert total.correction_mm[0][:, 2] == pytest.approx([0.0, 1e-3, 2e-3, 3e-3])
+    assert added(None, tables()).correction_mm[2] == pytest.approx(tables().correction_mm[2])
+
+
+def test_the_three_tables_of_an_axis_are_limited_together():
+    check_limits(tables(), None, TableLimits(value_mm=0.04))
+    with pytest.raises(TableRefused, match="together"):
+        check_limits(tables(), None, TableLimits(value_mm=0.037))

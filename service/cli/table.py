@@ -1,0 +1,34 @@
+"""`abbe accept-table`: a person vouches for the table that is active in the controller."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def accept_table(
+    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
+    yes: Annotated[bool, typer.Option("--yes", help="I have looked at the controller: its active table is right.")] = False,
+) -> None:
+    """After an interrupted push that Abbe could not clear up: say that the active table is right, so that work can go on."""
+    from service.config import load_machine
+    from service.devices.session import DeviceUrls, open_session
+    from service.errors import ConfigError
+    from service.site import site_of
+    from service.storage.store import Store
+    from service.workflows.recover import accept
+
+    if not yes:
+        raise ConfigError("nothing was accepted", "look at the controller's active table, then add --yes")
+    loaded = load_machine(machine)
+    site = site_of(loaded.machine)
+
+    async def work(store: Store) -> str:
+        async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
+            return await accept(session.controller, store, site)
+
+    with Store.open(loaded.database_url) as store:
+        typer.echo(asyncio.run(work(store)))

@@ -1,0 +1,161 @@
+"""Nine tables as bytes and back: encoding, limits that refuse, comparison of what was sent with what is held, adding to what is active."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
+from drivers.cnc.tables import TableImage
+from models.compensation.tables import NineTables
+from models.machine import AXES
+from service.errors import TableMismatch, TableRefused
+from service.site import TableLimits
+
+KIND_NINE = 1
+
+
+def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
+    """Nine tables as the controller stores them: for each input axis X, Y, Z, for each output X, Y, Z, corrections in LSB (cnc.md).
+
+    Raises
+    ------
+    TableRefused
+        A grid is not equidistant, or a value does not fit the controller's 16 bits.
+    """
+    start, step, counts, values = [], [], [], []
+    for a in range(3):
+        grid = tables.position_mm[a]
+        pitch = np.diff(grid)
+        if np.ptp(pitch) > 1e-6:
+            raise TableRefused(
+                f"table of {AXES[a]}: the grid is not equidistant", "resample it on the controller's grid; nothing was written"
+            )
+        start.append(float(grid[0]))
+        step.append(float(pitch[0]))
+        counts.append(int(grid.size))
+        for i in range(3):
+            values += [int(v) for v in np.round(tables.correction_mm[a][:, i] * 1e6 / lsb_nm)]
+    if max(map(abs, values)) > 32767:
+        raise TableRefused("a correction does not fit the controller's 16-bit entries", "check the solution; nothing was written")
+    sx, sy, sz = start
+    px, py, pz = step
+    nx, ny, nz = counts
+    return TableImage(KIND_NINE, table_id, lsb_nm, (sx, sy, sz), (px, py, pz), (nx, ny, nz), tuple(values))
+
+
+def check_limits(tables: NineTables, active: NineTables | None, limits: TableLimits) -> None:
+    """Refuse, never clamp: value, change against the active table, step between neighbours, zero at the reference (reliability.md 3.3).
+
+    Raises
+    ------
+    TableRefused
+        Which table, where, how much over which limit. Nothing has been written.
+    """
+    for a in range(3):
+        for i in range(3):
+            values = tables.correction_mm[a][:, i]
+            before = np.zeros_like(values)
+            if active is not None:
+                before = np.interp(tables.position_mm[a], active.position_mm[a], active.correction_mm[a][:, i])
+            name = f"table of {AXES[i]} over {AXES[a]}"
+            if not np.isfinite(values).all():
+                raise TableRefused(f"{name}: holds values that are no numbers", "check the solution; nothing was written")
+            checks = (
+                ("value", np.abs(values), limits.value_mm, "table_value_um"),
+                ("change against the active table", np.abs(values - before), limits.change_mm, "table_change_um"),
+                ("step between neighbours", np.abs(np.diff(values)), limits.step_mm, "table_step_um"),
+            )
+            for what, size, limit, key in checks:
+                k = int(np.argmax(size))
+                if size[k] > limit:
+                    at = tables.position_mm[a][k]
+                    raise TableRefused(
+                        f"{name}: {what} {size[k] * 1e3:.1f} µm at {at:.1f} mm exceeds the limit of {limit * 1e3:.1f} µm",
+                        f"check the measurement; if the machine is really so, raise {key} under [limits]. Nothing was written",
+                    )
+            if abs(values[0]) > 5e-7:
+                raise TableRefused(f"{name}: not zero at its reference", "shift the table; nothing was written")
+    for i in range(3):
+        total = sum(float(np.abs(tables.correction_mm[a][:, i]).max()) for a in range(3))
+        if total > limits.value_mm:
+            raise TableRefused(
+                f"the three tables of {AXES[i]} together reach {total * 1e3:.1f} µm, the limit is {limits.value_mm * 1e3:.1f} µm",
+                "check the measurement; if the machine is really so, raise table_value_um under [limits]. Nothing was written",
+            )
+
+
+def tables_from_image(image: bytes) -> NineTables | None:
+    """Tables in a bank image by the independent decoder; None for an image without correction (kind 0).
+
+    Raises
+    ------
+    TableMismatch
+        The bank holds a kind of table that this version cannot read.
+    """
+    try:
+        curves = read_axis_tables(image)
+    except UnreadableImage as error:
+        raise TableMismatch(
+            f"a bank holds no table that can be read: {error}", "look at the controller's banks; nothing was activated"
+        ) from None
+    if not curves:
+        return None
+    positions, corrections = [], []
+    for a in AXES:
+        positions.append(np.array([p for p, _ in curves[(a, "X")]]))
+        corrections.append(np.column_stack([[c for _, c in curves[(a, i)]] for i in AXES]))
+    none = tuple(np.full_like(c, np.nan) for c in corrections)
+    return NineTables(
+        (positions[0], positions[1], positions[2]), (corrections[0], corrections[1], corrections[2]), (none[0], none[1], none[2])
+    )
+
+
+def compare_bytes(sent: bytes, held: bytes) -> None:
+    """First read-back: every byte.
+
+    Raises
+    ------
+    TableMismatch
+        The first register that differs.
+    """
+    if sent != held:
+        at = next((k for k in range(min(len(sent), len(held))) if sent[k] != held[k]), min(len(sent), len(held)))
+        raise TableMismatch(
+            f"read-back differs from what was sent at register {at // 2}", "the table was not activated; check the link, push again"
+        )
+
+
+def compare_meaning(wanted: NineTables, held: NineTables | None, lsb_nm: int) -> None:
+    """Second read-back: what an independent decoder makes of the bytes must be the wanted correction, axis by axis, within half a unit.
+
+    Raises
+    ------
+    TableMismatch
+        Which table differs: this catches a wrong sign, a swapped axis, or a wrong unit in the encoder.
+    """
+    for a in range(3):
+        for i in range(3):
+            name = f"{AXES[i]} over {AXES[a]}"
+            if held is None or held.correction_mm[a].shape != wanted.correction_mm[a].shape:
+                raise TableMismatch(f"table {name} is not in the controller's bank", "it was not activated")
+            off_grid = np.abs(held.position_mm[a] - wanted.position_mm[a]).max()
+            off_value = np.abs(held.correction_mm[a][:, i] - wanted.correction_mm[a][:, i]).max()
+            if off_grid > 1e-5 or off_value > 0.51e-6 * lsb_nm:
+                raise TableMismatch(
+                    f"table {name} means something else to an independent decoder (off by {off_value * 1e3:.2f} µm)",
+                    "it was not activated; the encoder is wrong",
+                )
+
+
+def added(active: NineTables | None, change: NineTables) -> NineTables:
+    """The absolute tables that follow from a change measured while ``active`` was in force, on the grid of the change.
+
+    A machine that is measured with a table shows what the table has left: what to write is the old correction plus the new one.
+    """
+    if active is None:
+        return change
+    curves = []
+    for a in range(3):
+        old = [np.interp(change.position_mm[a], active.position_mm[a], active.correction_mm[a][:, i]) for i in range(3)]
+        curves.append(change.correction_mm[a] + np.column_stack(old) - np.array([v[0] for v in old]))
+    return NineTables(change.position_mm, (curves[0], curves[1], curves[2]), change.u_mm)
