@@ -113,15 +113,14 @@ def test_a_change_adds_to_what_is_active_on_its_own_grid():
     )
     active.correction_mm[0][:] = [[0.0, 0.0, 0.0], [6e-3, 0.0, -6e-3]]
     total = added(active, tables())
-    assert total.position_mm == tables().position_mm or all(
-        (a == b).all() for a, b in zip(total.position_mm, tables().position_mm, strict=True)
-    )
+    for got, want in zip(total.position_mm, tables().position_mm, strict=True):
+        assert (got == want).all()
     assert total.correction_mm[0][:, 0] == pytest.approx([0.0, 3e-3, 6e-3, 9e-3])
     assert total.correction_mm[0][:, 2] == pytest.approx([0.0, 1e-3, 2e-3, 3e-3])
     assert added(None, tables()).correction_mm[2] == pytest.approx(tables().correction_mm[2])
 
 
 def test_the_three_tables_of_an_axis_are_limited_together():
-    check_limits(tables(), None, TableLimits(value_mm=0.04))
+    check_limits(tables(), None, TableLimits(value_mm=0.06))
     with pytest.raises(TableRefused, match="together"):
-        check_limits(tables(), None, TableLimits(value_mm=0.037))
+        check_limits(tables(), None, TableLimits(value_mm=0.05))  # each alone stays below 0.04
