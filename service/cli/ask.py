@@ -3,33 +3,43 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 
 from service.errors import ConfigError
 
 
 async def console_ask(text: str) -> None:
-    """Print what to do and wait for Enter.
+    """Print what to do and wait for Enter. What was typed before the question is thrown away: nobody confirms what he has not read.
 
     Raises
     ------
     ConfigError
         Nobody is at the console (standard input is closed or not a terminal).
     """
+    import termios  # here, because a computer without terminals still plans and reads
+
     if not sys.stdin.isatty():
         raise ConfigError(f"nobody is at the console to: {text}", "run this from a terminal, or configure a remote fixture")
+    # The descriptor itself: Python's buffer would keep a second line of one paste for the next question, out of reach of tcflush.
+    line = sys.stdin.fileno()
+    termios.tcflush(line, termios.TCIFLUSH)
     sys.stderr.write(f"\n>> {text}\n   press Enter when done: ")
     sys.stderr.flush()
     loop = asyncio.get_running_loop()
-    entered: asyncio.Future[str] = loop.create_future()
+    entered: asyncio.Future[bytes] = loop.create_future()
 
     def ready() -> None:
-        if not entered.done():
-            entered.set_result(sys.stdin.readline())
+        if entered.done():
+            return
+        try:
+            entered.set_result(os.read(line, 4096))
+        except OSError:
+            entered.set_result(b"")  # the terminal has gone
 
-    loop.add_reader(sys.stdin, ready)
+    loop.add_reader(line, ready)
     try:
-        if await entered == "":
+        if await entered == b"":
             raise ConfigError("standard input was closed", "start again from a terminal")
     finally:
-        loop.remove_reader(sys.stdin)
+        loop.remove_reader(line)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-import signal
 import sys
 import tempfile
 from contextlib import contextmanager
@@ -18,7 +16,6 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from service.events import ProgressSink
     from service.workflows.demo import DemoResult
 
 DEFAULT_FOLDER = "abbe-demo"
@@ -34,14 +31,16 @@ def demo(
     from rich.console import Console
 
     from service.cli.progress import display
+    from service.cli.running import run_job
     from service.report.html import render_report
+    from service.workflows.demo import run_demo
     from service.workflows.demo_report import demo_json, demo_report
 
     folder = keep or Path(DEFAULT_FOLDER)
     folder.mkdir(parents=True, exist_ok=True)
     log = Console(stderr=True)
     with display() as sink, work_folder(folder, keep) as work:
-        result = run_until_signal(seed, speed, work, sink)
+        result = run_job(run_demo(seed, speed, work, sink))
     report = folder / "report.html"
     report.write_text(render_report(demo_report(result)), encoding="utf-8")
     if as_json:
@@ -63,32 +62,6 @@ def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
     if (folder / "abbe.sqlite3").exists():
         raise AbbeError(f"{folder} already holds a demonstration", "name another folder with --keep, or delete it")
     yield folder.resolve()
-
-
-def run_until_signal(seed: int, speed: float, folder: Path, sink: ProgressSink) -> DemoResult:
-    """Run the demonstration; SIGTERM cancels it like Ctrl-C does, so that the machine stops and the simulators end."""
-    from service.workflows.demo import run_demo
-
-    async def main() -> DemoResult:
-        loop = asyncio.get_running_loop()
-        task = asyncio.current_task()
-        assert task is not None
-        terminated = False
-
-        def stop() -> None:
-            nonlocal terminated
-            terminated = True
-            task.cancel()
-
-        loop.add_signal_handler(signal.SIGTERM, stop)
-        try:
-            return await run_demo(seed, speed, folder, sink)
-        except asyncio.CancelledError:
-            if terminated:
-                raise SystemExit(143) from None
-            raise
-
-    return asyncio.run(main())
 
 
 def print_result(out: Console, result: DemoResult) -> None:

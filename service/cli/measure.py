@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from models.machine import Machine
+    from service.devices.session import Session
     from service.sequences.check import DryRun
     from service.sequences.steps import CampaignPlan
+    from service.site import Site
+    from service.storage.store import Store
 
 MachineArgument = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")]
 RECIPES = "identification, verification, quick-check"
@@ -27,10 +32,9 @@ def measure(
     path: Annotated[bool, typer.Option("--path", help="With --dry-run: every commanded position, as CSV.")] = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample."""
-    from service.cli.ask import console_ask
+    from service.cli.running import run_job
     from service.clock import SystemClock
     from service.config import load_machine
-    from service.devices.session import open_session
     from service.sequences.check import dry_run_campaign
     from service.site import site_of
     from service.storage.store import Store
@@ -48,11 +52,11 @@ def measure(
         from service.cli.progress import display
 
         with display() as sink:
-            async with open_session(site.urls, console_ask) as session:
+            async with ready_session(store, site) as session:
                 await workflow.measure(session, store, site, plan, progress=sink)
 
     with Store.open(loaded.database_url) as store:
-        asyncio.run(work(store))
+        run_job(work(store))
     typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
 
 
@@ -61,11 +65,10 @@ def correct(
     campaign: Annotated[str, typer.Argument(help="Identification campaign in the store.")],
     before: Annotated[str, typer.Option(help="Verification campaign measured with the present table; default: it is measured now.")] = "",
 ) -> None:
-    """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better."""
-    from service.cli.ask import console_ask
+    """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
+    from service.cli.running import run_job
     from service.clock import SystemClock
     from service.config import load_machine
-    from service.devices.session import open_session
     from service.sequences.campaigns import verification
     from service.site import site_of
     from service.storage.store import Store
@@ -81,7 +84,7 @@ def correct(
 
         store.campaign(campaign)
         with display() as sink:
-            async with open_session(site.urls, console_ask) as session:
+            async with ready_session(store, site) as session:
                 if before:
                     ids = [r.id for r in store.runs(before) if r.visible_status == "complete"]
                 else:
@@ -90,8 +93,23 @@ def correct(
                 return await work_correct(session, store, site, campaign, await load_runs(store, ids), progress=sink)
 
     with Store.open(loaded.database_url) as store:
-        found = asyncio.run(work(store))
+        found = run_job(work(store))
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
+    raise typer.Exit(0 if found.decision.keep else 1)
+
+
+@asynccontextmanager
+async def ready_session(store: Store, site: Site) -> AsyncIterator[Session]:
+    """The machine's devices, after what an interrupted push may have left active was taken back: nothing is measured with it."""
+    from service.cli.ask import console_ask
+    from service.devices.session import open_session
+    from service.workflows.recover import recover
+
+    async with open_session(site.urls, console_ask) as session:
+        said = await recover(session.controller, store, site)
+        if said is not None:
+            typer.echo(said, err=True)
+        yield session
 
 
 def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int, name: str) -> CampaignPlan:

@@ -25,7 +25,7 @@ def _hemisphere(machine: Machine, rel: tuple[float, float, float], share: float)
 
 
 def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identify") -> CampaignPlan:
-    """Five helices, six lines, eight step diagonals: about 40 minutes of machine time for a 600 x 500 x 450 mm machine."""
+    """Five helices, six lines, eight step diagonals: about 22 minutes of machine time for a 600 x 500 x 450 mm machine."""
     recipes: list[Recipe] = []
     places = [(0.5, 0.5, 0.3), (0.32, 0.36, 0.2), (0.68, 0.64, 0.2), (0.32, 0.64, 0.25), (0.68, 0.36, 0.25)]
     for k, rel in enumerate(places):

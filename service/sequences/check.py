@@ -9,10 +9,23 @@ from itertools import pairwise
 
 from models.machine import AXES, Machine
 from service.errors import StrokeError
-from service.sequences.steps import CampaignPlan, MountBar, MountLaser, MoveTo, Point, ReadLaser, RecordPath, Step, TestPlan, ZeroLaser
+from service.sequences.steps import (
+    MAX_PATH_POINTS,
+    CampaignPlan,
+    MountBar,
+    MountLaser,
+    MoveTo,
+    Point,
+    ReadLaser,
+    RecordPath,
+    Step,
+    TestPlan,
+    Unmount,
+    ZeroLaser,
+)
 
 MOUNT_S = 0.0
-"""A person's mounting time is not machine time; it is not counted."""
+"""A person's time for mounting and clearing away is not machine time; it is not counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,18 +60,24 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
             return length / feed * 60.0, points[-1]
         case ReadLaser(_, settle):
             return settle + 0.1, here
-        case MountBar() | MountLaser() | ZeroLaser():
+        case MountBar() | MountLaser() | Unmount() | ZeroLaser():
             return MOUNT_S, here
 
 
-def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> DryRun:
-    """Check a test against the strokes and say how long it takes.
+def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
+    """Lowest and highest commanded position of each axis; refuses what the strokes or the controller's path memory do not hold.
 
     Raises
     ------
     StrokeError
-        A commanded position leaves the strokes: which test, which axis, by how much.
+        Which test, which axis, by how much; or how many points.
     """
+    for step in plan.steps:
+        if isinstance(step, RecordPath) and len(step.points_mm) > MAX_PATH_POINTS:
+            raise StrokeError(
+                f"test {plan.label}: the path has {len(step.points_mm)} points, the controller holds {MAX_PATH_POINTS}",
+                "use a longer chord, fewer turns or a smaller radius; nothing has moved",
+            )
     lo, hi = [math.inf] * 3, [-math.inf] * 3
     for p in positions(plan.steps):
         for a in range(3):
@@ -70,6 +89,18 @@ def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> 
                     "move the centre, shorten the radius or correct stroke_mm in the machine file; nothing has moved",
                 )
             lo[a], hi[a] = min(lo[a], p[a]), max(hi[a], p[a])
+    return (lo[0], lo[1], lo[2]), (hi[0], hi[1], hi[2])
+
+
+def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> DryRun:
+    """Check a test against the strokes and say how long it takes.
+
+    Raises
+    ------
+    StrokeError
+        As `check_positions`.
+    """
+    lowest, highest = check_positions(machine, plan)
     seconds, length, readings, here = 0.0, 0.0, 0, start_mm
     for step in plan.steps:
         dt, after = step_seconds(step, here)
@@ -80,7 +111,7 @@ def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> 
             length += math.dist(here, step.target_mm)
         readings += isinstance(step, ReadLaser)
         seconds, here = seconds + dt, after
-    return DryRun(plan.label, plan.test, seconds, length, (lo[0], lo[1], lo[2]), (hi[0], hi[1], hi[2]), readings)
+    return DryRun(plan.label, plan.test, seconds, length, lowest, highest, readings)
 
 
 def dry_run_campaign(machine: Machine, plan: CampaignPlan, max_feed_mm_min: float = math.inf) -> tuple[DryRun, ...]:

@@ -1,6 +1,7 @@
 """Recipes: a few numbers that say which test; `plan` turns each into steps.
 
-Every sequence approaches its first position in the direction of its first motion, so that lost motion is in a known state at the start.
+Every sequence approaches its first position in the direction of its first motion, each axis for itself, so that lost motion is in a known
+state at the start; an axis that begins at the very end of its stroke cannot. Whoever mounts something has it taken away again at the end.
 """
 
 from __future__ import annotations
@@ -14,11 +15,25 @@ from numpy.typing import NDArray
 from models.machine import Machine
 from models.paths.helix import Law, helix_points
 from models.paths.lines import diagonal_ends, step_diagonal, straight_line
-from service.sequences.steps import MountBar, MountLaser, MoveTo, Point, ReadLaser, RecordPath, Step, TestPlan, ZeroLaser
+from service.sequences.steps import (
+    MAX_PATH_POINTS,
+    MountBar,
+    MountLaser,
+    MoveTo,
+    Point,
+    ReadLaser,
+    RecordPath,
+    Step,
+    TestPlan,
+    Unmount,
+    ZeroLaser,
+)
 
 Array = NDArray[np.float64]
 RAPID_MM_MIN = 6000.0
 APPROACH_MM = 1.0
+BAR_APPROACH_MM = 0.5
+"""With the bar hung in: far more than any lost motion, and the bar stays within its stroke of 1 mm either way."""
 CLEARANCE_MM = 10.0
 """Laser lines keep this distance from the ends of the strokes, so that the approach stays inside them."""
 
@@ -31,7 +46,13 @@ def as_point(v: Array) -> Point:
 
 @dataclass(frozen=True, slots=True)
 class Helix:
-    """Hemispherical helix of the ball-bar test (math.md 4.3): continuous, constant feed, pole to equator or (direction -1) back."""
+    """Hemispherical helix of the ball-bar test (math.md 4.3): continuous, constant feed, pole to equator or (direction -1) back.
+
+    ``chord_mm`` is the wanted mean distance of the path's points; a long path gets longer chords, so that the controller can hold it. The
+    polyline then runs chord^2 / (8 radius) inside the sphere, and by the area law radius / (4 n) beside the pole: with 750 mm, 1.3 and
+    23 um. That costs no accuracy: columns and solvers take the commanded position on the polyline, not on the sphere.
+    ``mount`` and ``unmount`` are false where two helices in a row share one set-up: the second does not mount, the first leaves the bar.
+    """
 
     label: str
     setup_id: str
@@ -46,17 +67,21 @@ class Helix:
     rate_hz: int = 100
     chord_mm: float = 1.0
     mount: bool = True
+    unmount: bool = True
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: to the centre, mount, out to the path's start, record the path."""
+        """Steps: to the centre, mount, out to the path's start, record the path, clear away."""
         length = 2 * np.pi * self.radius_mm * self.turns
-        n = max(64, int(length / self.chord_mm))
+        n = min(max(64, int(length / self.chord_mm)), MAX_PATH_POINTS)
         points = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=n, law=self.law, axis=self.axis)
         path = tuple(as_point(p) for p in (points if self.direction > 0 else points[::-1]))
         steps: list[Step] = []
         if self.mount:
             steps += [MoveTo(self.centre_mm, RAPID_MM_MIN), MountBar(self.radius_mm)]
-        steps += [MoveTo(path[0], RAPID_MM_MIN), RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction)]
+        steps += [MoveTo(_before(path, machine), RAPID_MM_MIN), MoveTo(path[0], self.feed_mm_min)]
+        steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction))
+        if self.unmount:
+            steps.append(Unmount())
         setup = {
             "setup_id": self.setup_id,
             "centre_mm": list(self.centre_mm),
@@ -83,7 +108,7 @@ class Diagonal:
     settle_s: float = 0.3
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: approach, mount, zero, and one reading after every move."""
+        """Steps: approach, mount, zero, one reading after every move, clear away."""
         box = machine.stroke_mm + np.array([CLEARANCE_MM, -CLEARANCE_MM])
         start, end = diagonal_ends(box, self.diagonal)
         sequential = bool(self.order)
@@ -113,7 +138,7 @@ class Linear:
     settle_s: float = 0.3
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: approach, mount, zero, and one reading after every move."""
+        """Steps: approach, mount, zero, one reading after every move, clear away."""
         start = machine.stroke_mm[:, 0] + self.at * machine.length_mm
         end = start.copy()
         start[self.axis], end[self.axis] = machine.stroke_mm[self.axis] + np.array([CLEARANCE_MM, -CLEARANCE_MM])
@@ -122,6 +147,14 @@ class Linear:
 
 
 Recipe = Helix | Diagonal | Linear
+
+
+def _before(path: tuple[Point, ...], machine: Machine) -> Point:
+    """Where to come from: beside the path's start, against the first motion of each axis, inside the strokes."""
+    points = np.array(path)
+    steps = np.diff(points, axis=0)
+    first = np.array([next((np.sign(s) for s in steps[:, a] if s), 0.0) for a in range(3)])
+    return as_point(np.clip(points[0] - BAR_APPROACH_MM * first, machine.stroke_mm[:, 0], machine.stroke_mm[:, 1]))
 
 
 def _laser_plan(recipe: Diagonal | Linear, test: str, setup: dict[str, Any], points: Array, start: Array, end: Array) -> TestPlan:
@@ -135,5 +168,6 @@ def _laser_plan(recipe: Diagonal | Linear, test: str, setup: dict[str, Any], poi
         if p != path[k - 1]:
             steps.append(MoveTo(p, recipe.feed_mm_min))
         steps.append(ReadLaser(1 if k < half else -1, recipe.settle_s))
+    steps.append(Unmount())
     setup |= {"start_mm": list(path[0]), "end_mm": list(as_point(end)), "nominal_beam": [float(v) for v in beam]}
     return TestPlan(recipe.label, test, recipe.role, setup, tuple(steps))

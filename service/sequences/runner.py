@@ -5,16 +5,14 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 
 from drivers.api import BarBatch, Controller, ControllerStatus, Point
-from drivers.errors import DriverError
-from drivers.links.shielded import run_to_end
 from service.devices.session import Session
 from service.errors import MeasurementFault, UnsafeToMove
 from service.runs.recorder import Recorder
 from service.sequences.check import step_seconds
-from service.sequences.steps import MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, Step, TestPlan, ZeroLaser
+from service.sequences.guard import motion_guard
+from service.sequences.steps import MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, Step, TestPlan, Unmount, ZeroLaser
 
 ESTOP, DOOR, ALARM, REMOTE, REFERENCED, DRIVES, HOLD, PATH, PROGRAM = 0, 1, 2, 3, 4, 5, 8, 9, 11
 FORBIDDEN = (
@@ -30,7 +28,9 @@ BAD_IN_A_ROW = 25
 SYNC, BAD_BITS = 0b1000, 0b10101
 COMPENSATED = 3
 
-Tick = Callable[[float], None]
+BY_HAND = MountBar | MountLaser | Unmount
+Tick = Callable[[float, float], None]
+"""Called after each step: planned machine seconds done so far in the test, and wall seconds that this step waited for a person."""
 
 
 def check_interlocks(status: ControllerStatus) -> None:
@@ -49,27 +49,8 @@ def check_interlocks(status: ControllerStatus) -> None:
             raise UnsafeToMove(text, "make the machine ready, then start again")
 
 
-@asynccontextmanager
-async def motion_guard(controller: Controller) -> AsyncIterator[None]:
-    """Whatever ends this block early also stops the axes: abort is sent although the task is being cancelled."""
-    try:
-        yield
-    except BaseException:
-        await run_to_end(_stop(controller))
-        raise
-
-
-async def _stop(controller: Controller) -> None:
-    try:
-        async with asyncio.timeout(2.0):
-            await controller.abort()
-            await controller.resume()  # the abort level is taken back; nothing is queued any more
-    except (DriverError, TimeoutError):
-        return  # the link is gone: the controller's own watchdog is all that is left, and the first error is what the person must read
-
-
 class Runner:
-    """Runs tests on one session. ``tick(seconds)`` is called after each step with the planned machine seconds done so far in the test."""
+    """Runs tests on one session."""
 
     def __init__(self, session: Session) -> None:
         self._s = session
@@ -84,16 +65,17 @@ class Runner:
         """
         result: dict[str, int] = {}
         here: Point | None = None
-        done = 0.0
+        done, clock = 0.0, asyncio.get_running_loop().time
         async with motion_guard(self._s.controller):
             check_interlocks(await self._s.controller.status())
             for step in plan.steps:
                 if isinstance(step, MoveTo) and here == step.target_mm:
                     continue
                 seconds, after = step_seconds(step, here)
+                began = clock()
                 result |= await self._step(step, here, recorder)
                 done, here = done + seconds, after
-                tick(done)
+                tick(done, clock() - began if isinstance(step, BY_HAND) else 0.0)
         return result
 
     async def _step(self, step: Step, here: Point | None, recorder: Recorder) -> dict[str, int]:
@@ -104,6 +86,8 @@ class Runner:
                 await self._s.need_fixture().mount_ballbar(radius)
             case MountLaser(beam):
                 await self._s.need_fixture().mount_laser(beam)
+            case Unmount():
+                await self._s.need_fixture().unmount()
             case ZeroLaser():
                 laser = self._s.need_laser()
                 await laser.clear_beam()
@@ -150,7 +134,8 @@ class Runner:
         controller = self._s.controller
         await controller.load_path(step.points_mm)
         finished = asyncio.Event()
-        async with self._s.need_ballbar().stream(step.rate_hz) as batches:
+        # The guard stands inside the stream: closing the stream of a mute box takes seconds, and the axes must not run on so long.
+        async with self._s.need_ballbar().stream(step.rate_hz) as batches, motion_guard(controller):
             try:
                 async with asyncio.TaskGroup() as group:
                     group.create_task(_pump(batches, recorder, finished))

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 Point = tuple[float, float, float]
+MAX_PATH_POINTS = 8192
+"""Points of the controller's path memory (docs/protocols/cnc.md, FIFO_SIZE)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,11 @@ class MountLaser:
 
 
 @dataclass(frozen=True, slots=True)
+class Unmount:
+    """Bar and mirror are taken away, before anything moves fast again. Left out when the test fails: a person is there anyway."""
+
+
+@dataclass(frozen=True, slots=True)
 class ZeroLaser:
     """The laser's displacement is zeroed here."""
 
@@ -53,7 +60,7 @@ class RecordPath:
     direction: int
 
 
-Step = MoveTo | MountBar | MountLaser | ZeroLaser | ReadLaser | RecordPath
+Step = MoveTo | MountBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
@@ -16,7 +15,8 @@ from service.errors import AbbeError
 from service.events import Progress, ProgressSink, ignore_progress
 from service.runs.recorder import recording
 from service.sequences.check import dry_run_campaign
-from service.sequences.runner import Runner
+from service.sequences.guard import warnings_of
+from service.sequences.runner import Runner, Tick
 from service.sequences.steps import CampaignPlan, RecordPath, TestPlan
 from service.site import Site
 from service.storage.store import Store
@@ -24,7 +24,10 @@ from service.storage.store import Store
 
 @dataclass
 class Meter:
-    """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA."""
+    """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA.
+
+    The time in which the job waited for a person (``waited_s``) says nothing about the machine and does not count.
+    """
 
     stage: str
     total_s: float
@@ -32,14 +35,16 @@ class Meter:
     clock: Clock
     done_s: float = 0.0
     start_s: float = field(default=0.0)
+    waited_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Start the stopwatch."""
         self.start_s = self.clock.monotonic_s()
 
-    def at(self, done_s: float, message: str) -> None:
-        """Report how far the job is."""
-        elapsed = self.clock.monotonic_s() - self.start_s
+    def at(self, done_s: float, message: str, waited_s: float = 0.0) -> None:
+        """Report how far the job is, and how long the last step waited for a person."""
+        self.waited_s += waited_s
+        elapsed = self.clock.monotonic_s() - self.start_s - self.waited_s
         eta = elapsed / done_s * (self.total_s - done_s) if done_s > 0.02 * self.total_s else None
         self.sink(Progress(self.stage, done_s, self.total_s, eta, message))
 
@@ -87,8 +92,8 @@ async def measure(
     for test, expected in zip(plan.tests, dry, strict=True):
         base = meter.done_s
 
-        def tick(seconds: float, base: float = base, label: str = test.label) -> None:
-            meter.at(base + seconds, label)
+        def tick(seconds: float, waited_s: float, base: float = base, label: str = test.label) -> None:
+            meter.at(base + seconds, label, waited_s)
 
         run_ids.append(await measure_test(session, store, site, (campaign_id, ctrl0_us), test, tick, clock))
         meter.done_s = base + expected.duration_s
@@ -102,7 +107,7 @@ async def measure_test(
     site: Site,
     campaign: tuple[int, int],
     test: TestPlan,
-    tick: Callable[[float], None],
+    tick: Tick,
     clock: Clock,
 ) -> int:
     """One test as one run; whatever ends it early is written into the run before it is raised again."""
@@ -118,6 +123,12 @@ async def measure_test(
         status, reason = "complete", ""
     except (AbbeError, DriverError) as error:
         status, reason = "failed", f"{error.code}: {error}"
+        raise
+    except Exception as error:
+        status, reason = "failed", repr(error)  # a defect: what it was must not get lost behind "stopped"
+        raise
+    except BaseException as error:
+        reason = "; ".join(["stopped", *warnings_of(error)])
         raise
     finally:
         end |= {"gaps": gaps, "ended_utc": clock.utc().isoformat()}

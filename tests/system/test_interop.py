@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivers.registry import open_ballbar
+from tests.scenarios.world import simulators_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
 
@@ -33,8 +34,10 @@ def ready(tmp_path: Path):
 @pytest.mark.parametrize("device", ["cnc", "laser"])
 def test_mbpoll_reads_the_canary_registers(ready, require, device):
     require("mbpoll", shutil.which("mbpoll") is not None, "mbpoll is not installed")
-    port = re.search(r":(\d+)\?", ready[device]).group(1)
+    assert_canaries(re.search(r":(\d+)\?", ready[device]).group(1))
 
+
+def assert_canaries(port: str) -> None:
     def poll(kind: str, register: int) -> str:
         words = ["mbpoll", "-m", "tcp", "-p", port, "-a", "1", "-t", kind, "-B", "-0", "-r", str(register), "-c", "1", "-1", "127.0.0.1"]
         found = subprocess.run(words, capture_output=True, text=True, timeout=20, check=True).stdout
@@ -43,6 +46,29 @@ def test_mbpoll_reads_the_canary_registers(ready, require, device):
     assert int(poll("4:int", 0)) == 0x01020304
     assert float(poll("4:float", 2)) == 1234.5
     assert float(poll("3:float", 2)) == 1234.5  # the same as input register
+
+
+def test_mbpoll_reads_a_running_demonstration(require, tmp_path):
+    require("mbpoll", shutil.which("mbpoll") is not None, "mbpoll is not installed")
+    folder = tmp_path / "kept"
+    words = [sys.executable, "-c", "from service.cli import main; main()", "demo", "--speed", "1", "--keep", str(folder)]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as demo:
+        try:
+            address = wait_for(lambda: cnc_port(folder / "machine.toml"), 30, "the demonstration's machine file")
+            assert_canaries(address)
+            assert demo.poll() is None
+        finally:
+            demo.terminate()
+            _, err = demo.communicate(timeout=20)
+    assert demo.returncode == 143, err
+    assert "Traceback" not in err
+    assert simulators_of(folder) == []
+
+
+def cnc_port(machine_file: Path) -> str | None:
+    """Port of the controller, once the machine file names it."""
+    found = re.search(r'^cnc = "\S+:(\d+)\?', machine_file.read_text(), re.MULTILINE) if machine_file.exists() else None
+    return found.group(1) if found else None
 
 
 async def test_socat_between_driver_and_pty_shows_the_documented_frames(ready, require, tmp_path):

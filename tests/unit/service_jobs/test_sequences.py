@@ -12,7 +12,7 @@ from service.errors import StrokeError
 from service.sequences.campaigns import identification, quick_check, verification
 from service.sequences.check import dry_run, dry_run_campaign, positions
 from service.sequences.recipes import Diagonal, Helix, Linear
-from service.sequences.steps import MoveTo, ReadLaser, RecordPath, ZeroLaser
+from service.sequences.steps import MAX_PATH_POINTS, MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, TestPlan, Unmount, ZeroLaser
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 
@@ -58,8 +58,42 @@ def test_laser_lines_approach_their_start_in_the_direction_of_the_first_motion()
         assert sum(isinstance(s, ZeroLaser) for s in plan.steps) == 1
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_helix_too_approaches_its_start_in_the_direction_of_the_first_motion(direction, axis):
+    plan = Helix("h", "A", "identify", (300.0, 250.0, 200.0), 150.0, direction=direction, axis=axis).plan(MACHINE)
+    _, approach, start = (s.target_mm for s in plan.steps if isinstance(s, MoveTo))
+    path = np.array(next(s for s in plan.steps if isinstance(s, RecordPath)).points_mm)
+    assert start == tuple(path[0])
+    for a in range(3):
+        first = next(np.sign(d) for d in np.diff(path[:, a]) if d)
+        assert np.sign(start[a] - approach[a]) == first
+    assert abs(math.dist(approach, (300.0, 250.0, 200.0)) - 150.0) < 0.7  # the bar hangs in it already: its stroke is 1 mm
+
+
+def test_an_approach_ends_at_the_stroke():
+    plan = Helix("h", "A", "identify", (300.0, 250.0, 300.0), 149.9).plan(MACHINE)
+    assert [s.target_mm for s in plan.steps if isinstance(s, MoveTo)][1] == (299.5, 249.5, 450.0)
+    dry_run(MACHINE, plan)
+
+
+def test_whatever_is_mounted_is_taken_away_before_the_next_test():
+    for campaign in (identification(MACHINE), verification(MACHINE), quick_check(MACHINE)):
+        for test in campaign.tests:
+            assert sum(isinstance(s, MountBar | MountLaser) for s in test.steps) == 1
+            assert isinstance(test.steps[-1], Unmount)
+            assert sum(isinstance(s, Unmount) for s in test.steps) == 1
+
+
+def test_two_helices_in_one_set_up_mount_once_and_clear_away_once():
+    out = Helix("out", "A", "identify", (300.0, 250.0, 100.0), 150.0, unmount=False).plan(MACHINE)
+    back = Helix("back", "A", "identify", (300.0, 250.0, 100.0), 150.0, direction=-1, mount=False).plan(MACHINE)
+    kinds = [type(s) for s in out.steps + back.steps]
+    assert kinds == [MoveTo, MountBar, MoveTo, MoveTo, RecordPath, MoveTo, MoveTo, RecordPath, Unmount]
+
+
 @pytest.mark.parametrize("chain", ["w-X-Y-b-Z-t", "w-b-X-Y-Z-t", "w-Z-b-X-Y-t"])
-@pytest.mark.parametrize("stroke", [(600, 500, 450), (812.8, 495, 508), (250, 300, 200)])
+@pytest.mark.parametrize("stroke", [(600, 500, 450), (812.8, 495, 508), (250, 300, 200), (1500, 1200, 800), (3000, 2000, 1000)])
 def test_shipped_campaigns_fit_into_any_machine(chain, stroke):
     m = Machine(chain, np.array([[-100.0, s - 100.0] for s in stroke]))
     for plan in (identification(m), verification(m), quick_check(m)):
@@ -91,9 +125,27 @@ def test_a_feed_over_the_limit_is_refused():
 def test_dry_run_times_a_path_and_counts_its_readings():
     plan = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=1, feed_mm_min=1500.0, rate_hz=50, mount=False).plan(MACHINE)
     run = dry_run(MACHINE, plan)
-    path = list(positions(plan.steps))[1:]
+    path = list(positions(plan.steps))  # the approach included
     length = sum(math.dist(a, b) for a, b in pairwise(path))
     assert run.path_mm == pytest.approx(length)
     assert run.duration_s == pytest.approx(length / 1500 * 60)
-    assert run.readings == int(run.duration_s * 50)
+    recorded = next(s for s in plan.steps if isinstance(s, RecordPath)).points_mm
+    assert run.readings == int(sum(math.dist(a, b) for a, b in pairwise(recorded)) / 1500 * 60 * 50)
     assert sum(isinstance(s, ReadLaser) for s in plan.steps) == 0
+
+
+def test_a_long_helix_gets_longer_chords_and_fits_into_the_controllers_path_memory():
+    big = Machine("w-X-Y-b-Z-t", np.array([[0.0, 3000.0], [0.0, 2000.0], [0.0, 1000.0]]))
+    plan = Helix("h", "A", "identify", (1500.0, 1000.0, 200.0), 750.0).plan(big)
+    path = np.array(next(s for s in plan.steps if isinstance(s, RecordPath)).points_mm)
+    assert len(path) == MAX_PATH_POINTS
+    middles = np.linalg.norm((path[1:] + path[:-1]) / 2 - np.array([1500.0, 1000.0, 200.0]), axis=1)
+    assert 750.0 - middles.min() < 0.025  # beside the pole, where the area law strides farthest
+    assert 750.0 - middles[200:].min() < 2e-3
+    dry_run(big, plan)
+
+
+def test_a_path_the_controller_cannot_hold_is_refused_before_anything_moves():
+    points = tuple((x, 0.0, 0.0) for x in np.linspace(0.0, 600.0, MAX_PATH_POINTS + 1))
+    with pytest.raises(StrokeError, match="test long: the path has 8193 points, the controller holds 8192"):
+        dry_run(MACHINE, TestPlan("long", "ballbar_helix", "identify", {}, (RecordPath(points, 2000.0, 100, 1),)))

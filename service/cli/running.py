@@ -1,0 +1,74 @@
+"""Running a job that moves axes: whatever asks this process to end, the job is cancelled first, so that the axes stop."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import signal
+import sys
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+Handler = Callable[[int, FrameType | None], None]
+
+
+def run_job(job: Coroutine[Any, Any, T]) -> T:
+    """Run a job to its end; Ctrl-C, SIGTERM and a closed terminal cancel it, and its clean-up runs before the process ends.
+
+    Parameters
+    ----------
+    job : coroutine
+        Motion guards and clean-up inside it do the stopping.
+
+    Returns
+    -------
+    T
+        What the job returned.
+
+    Raises
+    ------
+    SystemExit
+        After a signal, with 128 + its number: 130 Ctrl-C, 143 SIGTERM, 129 terminal closed.
+    """
+    received: list[int] = []
+    try:
+        return asyncio.run(_cancelled_by_signal(job, received))
+    except (asyncio.CancelledError, OSError) as error:
+        # A closed terminal also ends the display's last words with EIO; what a device has to say (some are OSErrors) must not get lost.
+        if not received or (isinstance(error, OSError) and error.errno != errno.EIO):
+            raise
+        with suppress(OSError):  # the terminal may be what has gone
+            for text in getattr(error, "__notes__", []):
+                sys.stderr.write(f"stopped: {text}\n")
+        raise SystemExit(128 + received[0]) from None
+
+
+async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int]) -> T:
+    loop, task = asyncio.get_running_loop(), asyncio.current_task()
+    assert task is not None
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        # A second signal cancels once more: what must reach the machine is shielded from it (drivers.links.shielded).
+        received.append(number)
+        loop.call_soon_threadsafe(task.cancel)
+
+    with _handled(stop):
+        return await job
+
+
+@contextmanager
+def _handled(stop: Handler) -> Iterator[None]:
+    before: dict[int, Any] = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is None or (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
+            continue  # whoever started this with nohup wants it to survive the terminal
+        before[number] = signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

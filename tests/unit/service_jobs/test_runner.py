@@ -1,0 +1,178 @@
+"""The runner on devices that misbehave: what stops first, and what a person is told when the stop does not get through."""
+
+import asyncio
+from contextlib import asynccontextmanager
+from types import SimpleNamespace
+
+import pytest
+
+from drivers.errors import LinkDown, ReplyTimeout
+from service.devices.session import Session
+from service.errors import MeasurementFault
+from service.sequences.guard import UNDELIVERED, motion_guard, warnings_of
+from service.sequences.runner import DRIVES, PATH, REFERENCED, REMOTE, Runner
+from service.sequences.steps import MountBar, RecordPath, TestPlan, Unmount
+from service.workflows.measure import Meter, measure_test
+
+READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
+PLAN = TestPlan("h", "ballbar_helix", "identify", {}, (RecordPath(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 100.0, 100, 1), Unmount()))
+
+
+class FakeController:
+    """A path that runs for ever. ``events`` is what happened in which order."""
+
+    def __init__(self, events: list[str], *, deaf: bool = False) -> None:
+        self.events, self.deaf = events, deaf
+
+    async def status(self):
+        return SimpleNamespace(bits=READY | 1 << PATH, path_points_done=0, path_start_us=5, path_end_us=0, ctrl_us=7)
+
+    async def comp_status(self):
+        return SimpleNamespace(active_bank=0, bank_crc=(1, 2), gen=3)
+
+    async def load_path(self, points_mm):
+        self.events.append("loaded")
+
+    async def start_path(self, *, feed_mm_min):
+        self.events.append("started")
+
+    async def abort(self):
+        if self.deaf:
+            raise LinkDown("cnc", "write", "the connection was closed")
+        self.events.append("stopped")
+
+
+class MuteBar:
+    """A box that says nothing any more; closing its stream is an event of its own."""
+
+    def __init__(self, events: list[str]) -> None:
+        self.events = events
+
+    @asynccontextmanager
+    async def stream(self, rate_hz):
+        async def batches():
+            if rate_hz < 0:
+                yield None
+            raise ReplyTimeout("bar", "read samples", "no sample for 1 s", "box switched off?")
+
+        try:
+            yield batches()
+        finally:
+            self.events.append("stream closed")
+
+
+class Fixture:
+    def __init__(self, events: list[str]) -> None:
+        self.events = events
+
+    async def mount_ballbar(self, radius_mm):
+        self.events.append("mounted")
+
+    async def unmount(self):
+        self.events.append("unmounted")
+
+
+def session(events: list[str], *, deaf: bool = False) -> Session:
+    return Session(FakeController(events, deaf=deaf), MuteBar(events), None, Fixture(events))
+
+
+async def test_the_axes_stop_before_the_mute_box_is_talked_to_and_nothing_is_asked():
+    events: list[str] = []
+    with pytest.raises(ReplyTimeout) as caught:
+        await Runner(session(events)).run(PLAN, None, lambda *_: None)
+    assert events[:4] == ["loaded", "started", "stopped", "stream closed"]
+    assert "unmounted" not in events
+    assert UNDELIVERED not in str(caught.value)
+
+
+async def test_a_stop_that_does_not_get_through_is_part_of_the_error():
+    with pytest.raises(ReplyTimeout) as caught:
+        await Runner(session([], deaf=True)).run(PLAN, None, lambda *_: None)
+    assert str(caught.value) == f"bar: read samples: no sample for 1 s; {UNDELIVERED} (box switched off?)"
+
+
+async def test_errors_of_the_job_keep_kind_and_remedy_when_the_stop_fails():
+    with pytest.raises(MeasurementFault) as caught:
+        async with motion_guard(FakeController([], deaf=True)):
+            raise MeasurementFault("feed hold was pressed", "start again")
+    assert (caught.value.detail, caught.value.remedy) == (f"feed hold was pressed; {UNDELIVERED}", "start again")
+
+
+async def test_a_cancelled_job_whose_stop_fails_stays_cancelled_and_says_so():
+    entered = asyncio.Event()
+
+    async def job() -> None:
+        async with motion_guard(FakeController([], deaf=True)):
+            entered.set()
+            await asyncio.Event().wait()
+
+    task = asyncio.create_task(job())
+    await entered.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError) as caught:
+        await task
+    assert warnings_of(caught.value) == [UNDELIVERED]
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def monotonic_s(self) -> float:
+        return self.now_s
+
+
+def test_the_time_a_person_takes_does_not_spoil_the_eta():
+    clock, seen = Clock(), []
+    meter = Meter("job", 100.0, seen.append, clock)
+    clock.now_s = 300.0
+    meter.at(0.0, "mounted", waited_s=300.0)
+    clock.now_s = 310.0
+    meter.at(10.0, "moved")
+    assert seen[-1].eta_s == pytest.approx(90.0)
+
+
+async def test_only_steps_done_by_hand_count_as_waiting():
+    ticks: list[tuple[float, float]] = []
+    plan = TestPlan("m", "ballbar_helix", "identify", {}, (MountBar(150.0), Unmount()))
+    events: list[str] = []
+    await Runner(session(events)).run(plan, None, lambda done, waited: ticks.append((done, waited)))
+    assert events == ["mounted", "unmounted"]
+    assert [done for done, _ in ticks] == [0.0, 0.0]
+    assert all(waited > 0 for _, waited in ticks)
+
+
+class FakeStore:
+    """Remembers how the run ended."""
+
+    def __init__(self) -> None:
+        self.ended: tuple[str, str] | None = None
+
+    async def write(self, call, *args):
+        return call(*args)
+
+    def start_run(self, *_):
+        return 1
+
+    def finish_run(self, _, status, reason, __):
+        self.ended = (status, reason)
+
+
+@pytest.mark.parametrize(
+    ("error", "ended"),
+    [
+        (ValueError("a defect"), ("failed", "ValueError('a defect')")),
+        (MeasurementFault("beam", "free it"), ("failed", "SEQ-003: beam - free it")),
+        (asyncio.CancelledError(), ("aborted", "stopped")),
+    ],
+)
+async def test_a_run_keeps_the_reason_why_it_ended(monkeypatch, error, ended):
+    async def run(*_):
+        raise error
+
+    monkeypatch.setattr(Runner, "run", run)
+    store, clock = FakeStore(), SimpleNamespace(utc=lambda: SimpleNamespace(isoformat=lambda: "now"), monotonic_s=lambda: 1.0)
+    store.append_chunk = None
+    with pytest.raises(type(error)):
+        await measure_test(session([]), store, SimpleNamespace(doc={}), (1, 0), PLAN, lambda *_: None, clock)
+    assert store.ended == ended
