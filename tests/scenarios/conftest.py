@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,28 +45,33 @@ def machine_toml(ready: dict[str, Any], extra: str = "") -> str:
     return "\n".join(lines) + "\n" + extra + "\n"
 
 
-@pytest.fixture
-def start_sims(tmp_path: Path) -> Iterator[Callable[..., Sims]]:
-    """Start simulators; ended after the test."""
-    started: list[Sims] = []
-
-    def start(*args: str, extra: str = "", folder: Path = tmp_path) -> Sims:
-        words = [sys.executable, "-m", "simulators", "--watch-stdin", "--link-dir", str(tmp_path), *args]
-        process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert process.stdout is not None
+@contextmanager
+def simulated(folder: Path, *args: str, extra: str = "") -> Iterator[Sims]:
+    """Simulators with their machine file in a folder; they end with the block."""
+    words = [sys.executable, "-m", "simulators", "--watch-stdin", "--link-dir", str(folder), *args]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
         ready = json.loads(process.stdout.readline())
         path = folder / "machine.toml"
         path.write_text(machine_toml(ready, extra))
-        started.append(Sims(ready, process, path))
-        return started[-1]
+        yield Sims(ready, process, path)
+    finally:
+        process.stdin.close()
+        process.wait(timeout=10)
+        process.stdout.close()
 
-    yield start
-    for sims in started:
-        assert sims.process.stdin is not None
-        assert sims.process.stdout is not None
-        sims.process.stdin.close()
-        sims.process.wait(timeout=10)
-        sims.process.stdout.close()
+
+@pytest.fixture
+def start_sims(tmp_path: Path) -> Iterator[Callable[..., Sims]]:
+    """Start simulators; ended after the test."""
+    with ExitStack() as running:
+
+        def start(*args: str, extra: str = "") -> Sims:
+            return running.enter_context(simulated(tmp_path, *args, extra=extra))
+
+        yield start
 
 
 @pytest.fixture

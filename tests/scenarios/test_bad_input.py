@@ -1,25 +1,12 @@
 """Whatever is wrong: one line with cause and remedy, exit code 2, nothing half-done."""
 
 import json
-import re
 
 import pytest
 
-from tests.scenarios.world import bar_chunks, laser_chunks, position_and_counters, registers, runs_of, wait_for
+from tests.scenarios.world import bar_chunks, laser_chunks, one_line, position_and_counters, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]
-
-
-def one_line(process, code: str | tuple[str, ...], *words: str) -> str:
-    """The process ended with 2 and one line that holds code and words."""
-    _, err = process.communicate(timeout=90)
-    lines = [line for line in err.strip().splitlines() if not re.match(r"^[\w-]+( [\d-]+ [\d:]+)?: ", line) or line.startswith("error")]
-    assert process.returncode == 2, err
-    assert len(lines) == 1, err
-    assert lines[0].startswith(tuple(f"error {c}: " for c in ([code] if isinstance(code, str) else code)))
-    for word in words:
-        assert word in lines[0]
-    return lines[0]
 
 
 def test_missing_machine_file(abbe):
@@ -67,17 +54,6 @@ def test_laser_beam_lost(abbe, start_sims):
     run = runs_of(sims.machine_file.parent)[-1]
     assert (run.status, run.test) == ("failed", "laser_diagonal")
     assert "DRV-006" in run.reason
-
-
-def test_a_table_over_its_limit_is_refused_and_nothing_is_written(abbe, start_sims):
-    """A real identification, a real solution, and a limit that no real machine keeps."""
-    sims = start_sims("--speed", "60", extra="[limits]\ntable_value_um = 1\n")
-    measured = abbe("measure", str(sims.machine_file), "--recipe", "identification", "--name", "june")
-    _, err = measured.communicate(timeout=120)
-    assert measured.returncode == 0, err
-    before = registers(sims, 7, 2), registers(sims, 208, 8)
-    one_line(abbe("correct", str(sims.machine_file), "june"), "CMP-001", "limit of 1.0 µm", "table_value_um", "othing was written")
-    assert (registers(sims, 7, 2), registers(sims, 208, 8)) == before  # generation; active bank, CRC and state of both banks
 
 
 @pytest.mark.parametrize(("fault", "word"), [("estop", "e-stop"), ("door", "door")])

@@ -1,154 +1,75 @@
-"""The whole correction on a simulated machine: what stops it, what turns it back, what it does the second time."""
+"""`abbe correct` as a user runs it, on one identification: refused, killed in the middle, not better. Each time the old table is back."""
 
-import asyncio
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+import re
+import subprocess
 
-import numpy as np
 import pytest
 
-from models.compensation.tables import NineTables
-from service.devices.session import DeviceUrls, Session, open_session
-from service.errors import MeasurementFault, StillActive, TableMismatch, TableRefused
-from service.events import Progress, ignore_progress
-from service.sequences.campaigns import identification, verification
-from service.sequences.steps import CampaignPlan
-from service.site import Site, machine_doc, machine_from_doc
 from service.storage.store import Store
-from service.workflows import correct as workflow
-from service.workflows.correct import correct, load_runs
-from service.workflows.measure import measure
-from service.workflows.recover import recover
+from tests.scenarios.conftest import ABBE, Sims, simulated
+from tests.scenarios.world import one_line, registers, runs_of, wait_for
 
-pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
-RATE_HZ = 50
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 
 
-class Shop:
-    """A machine, its devices and its store, with the steps of the job as short words."""
-
-    def __init__(self, site: Site, store: Store, session: Session) -> None:
-        self.site, self.store, self.session = site, store, session
-
-    async def identify(self, name: str) -> None:
-        full = identification(self.site.machine, rate_hz=RATE_HZ, name=name)
-        tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
-        await measure(self.session, self.store, self.site, CampaignPlan(name, tests), progress=ignore_progress)
-
-    async def check(self, name: str) -> list[dict[str, Any]]:
-        plan = verification(self.site.machine, rate_hz=RATE_HZ, name=name)
-        return await load_runs(self.store, await measure(self.session, self.store, self.site, plan, progress=ignore_progress))
-
-    async def correct(self, name: str, before: list[dict[str, Any]], watch: Callable[[Progress], None] = ignore_progress):
-        return await correct(self.session, self.store, self.site, name, before, rate_hz=RATE_HZ, progress=watch)
-
-    async def active(self) -> tuple[int, int]:
-        now = await self.session.controller.comp_status()
-        return now.active_bank, now.bank_crc[now.active_bank]
-
-    @property
-    def state(self) -> str:
-        return self.store.pushes()[-1].state
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory):
+    """A simulated machine and the campaigns `june` (identification) and `start` (verification), measured once for all tests here."""
+    folder = tmp_path_factory.mktemp("identified")
+    with simulated(folder, "--speed", "60") as sims:
+        for recipe, name in (("identification", "june"), ("verification", "start")):
+            words = [*ABBE, "measure", str(sims.machine_file), "--recipe", recipe, "--name", name]
+            subprocess.run(words, check=True, timeout=120, capture_output=True)
+        yield sims
 
 
-@pytest.fixture
-async def shop(start_sims, tmp_path):
-    sims = start_sims("--speed", "100", "--seed", "2")
-    machine = machine_from_doc(sims.ready["machine"])
-    urls = DeviceUrls(sims.ready["cnc"], sims.ready["ballbar"], sims.ready["laser"], sims.ready["fixture"])
-    site = Site("sim", machine, machine_doc("sim", machine), urls)
-    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        async with open_session(urls) as session:
-            one = Shop(site, store, session)
-            one.ask = sims.ask
-            await one.identify("june")
-            one.before = await one.check("june-before")
-            yield one
+def table(sims: Sims) -> tuple[int, ...]:
+    """Number of the active bank and its CRC, read by hand."""
+    words = registers(sims, 208, 8)
+    return words[0], *words[1 + 2 * words[0] :][:2]
 
 
-def at_verification(action: Callable[[], None]) -> Callable[[Progress], None]:
-    """A progress sink that acts once, in the middle of the verification after a push."""
-    done: list[bool] = []
-
-    def watch(p: Progress) -> None:
-        if p.stage.startswith("verify-after") and p.done > 0.5 * p.total and not done:
-            done.append(True)
-            action()
-
-    return watch
+def verifying(sims: Sims) -> bool:
+    """A new table is active and the measurement that is to prove it has begun."""
+    with Store.open(f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}") as store:
+        pushes = store.pushes()
+    return bool(pushes) and pushes[-1].state == "PROBATION" and runs_of(sims.machine_file.parent)[-1].campaign.startswith("verify-after")
 
 
-def flipped(tables: NineTables) -> NineTables:
-    x, y, z = (-c for c in tables.correction_mm)
-    return replace(tables, correction_mm=(x, y, z))
+def test_a_table_over_its_limit_is_refused_and_nothing_is_written(abbe, identified):
+    """A real identification, a real solution, and a limit that no real machine keeps."""
+    limited = identified.machine_file.with_name("limited.toml")
+    limited.write_text(identified.machine_file.read_text() + "[limits]\ntable_value_um = 1\n")
+    before = registers(identified, 7, 2), registers(identified, 208, 8)
+    process = abbe("correct", str(limited), "june", "--before", "start")
+    one_line(process, "CMP-001", "limit", "1.0 µm", "table_value_um", "othing was written")
+    assert (registers(identified, 7, 2), registers(identified, 208, 8)) == before  # generation; active bank, CRC and state of both banks
 
 
-async def test_whatever_stops_the_verification_takes_the_table_back(shop):
-    base = await shop.active()
-
-    # e-stop: the person reads about the e-stop and that the table is still active; it goes as soon as the machine allows
-    with pytest.raises(StillActive, match=r"(?i)e-stop.*STILL ACTIVE"):
-        await shop.correct("june", shop.before, at_verification(lambda: shop.ask("estop", on=True)))
-    assert shop.state == "ROLLBACK_PENDING"
-    shop.ask("estop", on=False)
-    await shop.session.controller.reset_alarm()
-    assert "made active again" in await recover(shop.session.controller, shop.store, shop.site)
-    assert await shop.active() == base
-
-    # cancelled, as by Ctrl-C
-    task = asyncio.current_task()
-    assert task is not None
-    with pytest.raises(asyncio.CancelledError):
-        await shop.correct("june", shop.before, at_verification(task.cancel))
-    task.uncancel()
-    assert (shop.state, await shop.active()) == ("ROLLED_BACK", base)
-
-    # runs that are no verification are refused before anything is written
-    pushes = len(shop.store.pushes())
-    with pytest.raises(MeasurementFault, match="no verification"):
-        await shop.correct("june", shop.before[:3])
-    warm = replace(shop.site, temperature_c=(30.0, 32.0))
-    with pytest.raises(TableRefused, match="°C"):
-        await correct(shop.session, shop.store, warm, "june", shop.before, rate_hz=RATE_HZ, progress=ignore_progress)
-    assert len(shop.store.pushes()) == pushes
+def test_after_a_kill_during_the_verification_measuring_takes_the_table_back_first_and_says_so(abbe, identified):
+    before = table(identified)
+    process = abbe("correct", str(identified.machine_file), "june", "--before", "start")
+    wait_for(lambda: verifying(identified), 90, "the verification of the new table")
+    process.kill()
+    process.communicate()
+    assert table(identified) != before
+    again = abbe("measure", str(identified.machine_file), "--helix", "300,250,100,60")
+    _, err = again.communicate(timeout=60)
+    assert again.returncode == 0, err
+    assert re.search(r"^push \d+ was not verified .*; the old table was made active again$", err, re.MULTILINE), err
+    assert table(identified) == before
+    doc = runs_of(identified.machine_file.parent)[-1].start_doc
+    assert doc["table"]["crc"] == before[1] << 16 | before[2]  # measured after the way back, not before
 
 
-async def test_a_correction_with_the_wrong_sign_goes_back_and_the_right_one_stays_and_adds_up(shop, monkeypatch):
-    base = await shop.active()
-    honest = workflow.propose
-
-    def wrong(*words: Any) -> workflow.Proposal:
-        p = honest(*words)
-        return replace(p, tables=flipped(p.tables))
-
-    monkeypatch.setattr(workflow, "propose", wrong)
-    found = await shop.correct("june", shop.before)
-    assert found.decision.keep is False
-    assert (shop.state, await shop.active()) == ("ROLLED_BACK", base)
-
-    monkeypatch.setattr(workflow, "propose", honest)
-    first = await shop.correct("june", shop.before)
-    assert first.decision.keep is True
-    assert shop.state == "VERIFIED"
-    assert await shop.active() == (first.bank, first.pushed.crc)
-    assert first.after.worst.value_mm < first.before.worst.value_mm / 2
-
-    # the same campaign again: it was measured with another table, so it says nothing about what to write now
-    with pytest.raises(TableMismatch, match="measured with table"):
-        await shop.correct("june", shop.before)
-
-    # the machine drifts; measured with its table and corrected again, the new table is the old one plus the change
-    shop.ask("drift", axis="X", um_per_m=60.0)
-    await shop.identify("july")
-    before = await shop.check("july-before")
-    second = await shop.correct("july", before)
-    assert second.decision.keep is True
-    assert second.after.worst.value_mm < 0.7 * second.before.worst.value_mm
-    slope = np.polyfit(second.tables.position_mm[0], (second.tables.correction_mm[0] - first.tables.correction_mm[0])[:, 0], 1)[0]
-    assert slope == pytest.approx(-60e-6, abs=8e-6)
-
-    # nothing has changed since: there is nothing to promise
-    await shop.identify("august")
-    with pytest.raises(TableRefused, match="not enough to write"):
-        await shop.correct("august", await shop.check("august-before"))
+def test_a_correction_that_makes_nothing_better_goes_back_and_ends_with_1(abbe, identified):
+    """The machine itself changes while the new table is being verified: last in this file, because it stays so."""
+    before = table(identified)
+    process = abbe("correct", str(identified.machine_file), "june", "--before", "start")
+    wait_for(lambda: verifying(identified), 90, "the verification of the new table")
+    identified.ask("drift", axis="X", um_per_m=400.0)
+    out, err = process.communicate(timeout=90)
+    assert process.returncode == 1, err
+    assert out.startswith("rolled back: ")
+    assert not [line for line in err.splitlines() if line.startswith("error ")]
+    assert table(identified) == before

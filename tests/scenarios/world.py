@@ -112,3 +112,15 @@ def _count(folder: Path, query: str) -> int:
             return int(connection.execute(query).fetchone()[0])
     except sqlite3.OperationalError:  # tables not yet made, or locked for an instant
         return 0
+
+
+def one_line(process: subprocess.Popen[str], code: str, *words: str) -> str:
+    """The process ended with 2 and one line that holds code and words."""
+    _, err = process.communicate(timeout=90)
+    lines = [line for line in err.strip().splitlines() if not re.match(r"^[\w-]+( [\d-]+ [\d:]+)?: ", line) or line.startswith("error")]
+    assert process.returncode == 2, err
+    assert len(lines) == 1, err
+    assert lines[0].startswith(f"error {code}: ")
+    for word in words:
+        assert word in lines[0]
+    return lines[0]
