@@ -14,14 +14,17 @@ from models.arrays import F1, F2
 from models.geometry.chain import design
 from models.machine import AXES, Machine
 from models.solvers.joint import JointSolution
-from models.volumetric import remove_rigid, volume_grid
+from models.volumetric import remove_rigid, rigid_design, volume_grid
 
 
 @dataclass(frozen=True)
 class NineTables:
     """Correction added to the command: ``correction_mm[a][:, i]`` for output i at ``position_mm[a]`` of input axis a.
 
-    ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the reference position.
+    ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the first position, in the frame in which the
+    deviation field has no rigid motion over the volume (docs/conventions.md, "Frame"). The slope of a cross table (Y and Z over X, ...) is
+    partly a rotation of the whole frame, which no measurement of this kind sees, which moves no distance between two points of a part, and
+    which the corrections leave as the model happens to place it: compare tables only after taking the best-fit rotation out.
     """
 
     position_mm: tuple[F1, F1, F1]
@@ -61,13 +64,23 @@ def nine_tables(solution: JointSolution, counts: tuple[int, int, int], *, nodes:
     machine = solution.machine
     grids = grid_positions(machine, counts)
     corrections, uncertainties = [], []
+    rotation = frame_rotation(machine, solution, nodes)
     for a in range(3):
         effect = main_effect(machine, solution, a, grids[a], nodes)
         relative = effect - effect[0]
         corrections.append(-(relative @ solution.coefficients))
-        variance = np.einsum("nik,kl,nil->ni", relative, solution.term_covariance, relative)
+        turned = np.cross(rotation.T, np.eye(3)[a]).T  # slope over axis a that a rotation of the frame gives every output
+        fixed = relative - (grids[a] - grids[a][0])[:, None, None] * turned
+        variance = np.einsum("nik,kl,nil->ni", fixed, solution.term_covariance, fixed)
         uncertainties.append(np.sqrt(np.maximum(variance, 0.0)))
     return NineTables(grids, (corrections[0], corrections[1], corrections[2]), (uncertainties[0], uncertainties[1], uncertainties[2]))
+
+
+def frame_rotation(machine: Machine, solution: JointSolution, nodes: int) -> F2:
+    """Best-fit rotation of the deviation field over the volume per unit of every coefficient, shape (3, terms), rad."""
+    grid = volume_grid(machine.stroke_mm, nodes)
+    full = design(machine, solution.terms, grid).reshape(-1, len(solution.terms))
+    return np.asarray(np.linalg.lstsq(rigid_design(grid).reshape(-1, 6), full, rcond=None)[0][3:])
 
 
 def main_effect(

@@ -6,18 +6,18 @@ tilts, laser zeros and drifts are unknowns with documented priors (`models.solve
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1, F2
+from models.arrays import F1, F2, F3
 from models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from models.geometry.chain import design
 from models.machine import Machine
 from models.solvers.identifiability import Identifiability, analyse, project_out
 from models.solvers.least_squares import Estimate, solve_map
 from models.solvers.observations import RunData, nominal_reading
-from models.solvers.priors import Priors, term_prior_sd
+from models.solvers.priors import Priors, bar_length_sd, term_prior_sd
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class RunFit:
 class JointSolution:
     """Error motions of the machine from all runs together.
 
-    ``estimate`` holds the smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns.
+    ``estimate`` holds the smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns. ``tool_count``: how many
+    different tools the runs used; with one, what only another tool would show stays hidden (math.md 4.6).
     """
 
     machine: Machine
@@ -43,6 +44,7 @@ class JointSolution:
     estimate: Estimate
     identifiability: Identifiability
     runs: tuple[RunFit, ...]
+    tool_count: int = 1
 
     @property
     def coefficients(self) -> F1:
@@ -55,13 +57,18 @@ class JointSolution:
         n = len(self.terms)
         return self.estimate.covariance[:n, :n]
 
-    def deviation_mm(self, axes_mm: F2) -> F2:
-        """Predicted deviation (without lost motion) at commanded positions, shape (n, 3)."""
-        return np.asarray(design(self.machine, self.terms, axes_mm) @ self.coefficients)
+    def deviation_mm(self, axes_mm: F2, tool_mm: F1 | None = None) -> F2:
+        """Predicted deviation (without lost motion) at commanded positions, shape (n, 3); ``tool_mm``: another tool than the machine's."""
+        return np.asarray(design(with_tool(self.machine, tool_mm), self.terms, axes_mm) @ self.coefficients)
 
     def backlash_mm(self) -> dict[str, tuple[float, float]]:
         """Lost motion of each axis and its standard uncertainty, mm."""
         return {a: (self.estimate.value(f"backlash_{a}"), self.estimate.u(f"backlash_{a}")) for a in DIRECTIONS}
+
+
+def with_tool(machine: Machine, tool_mm: F1 | None) -> Machine:
+    """The machine with another tool, for rule G's levers; None: its own."""
+    return machine if tool_mm is None else replace(machine, tool_mm=tool_mm)
 
 
 def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: float = 5.0) -> list[tuple[str, float]]:
@@ -83,12 +90,16 @@ class Setup:
 
 
 def setup_unknowns(runs: tuple[RunData, ...], priors: Priors) -> Setup:
-    """Set-up unknowns of a set of runs: per cup, per bar length, per mirror, per laser run."""
+    """Set-up unknowns of a set of runs: per cup, per bar length, per mirror, per laser run.
+
+    Runs with the same nominal radius share one bar; where they state its length differently, the widest statement is believed.
+    """
     sd: dict[str, float] = {}
     for run in runs:
         if run.kind == "bar":
             sd |= {f"cup_{run.setup}_{a}": priors.cup_mm for a in "xyz"}
-            sd[f"bar_length_{run.radius_mm:g}"] = priors.bar_length_mm
+            bar = f"bar_length_{run.radius_mm:g}"
+            sd[bar] = max(sd.get(bar, 0.0), bar_length_sd(run.u_length_mm, run.length_calibrated, priors))
         else:
             if _bent(run):
                 sd |= {f"tilt_{run.setup}_{k}": priors.tilt_rad for k in "12"}
@@ -119,9 +130,14 @@ def bar_normals(run: RunData) -> F2:
     return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
+def run_field(machine: Machine, terms: tuple[Term, ...], run: RunData) -> F3:
+    """Design of the deviation along a run, with the run's own tool, shape (n, 3, terms)."""
+    return design(with_tool(machine, run.tool_mm), terms, run.axes_mm)
+
+
 def run_design(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup) -> F2:
     """Linearised reading per unit of every unknown of the campaign, shape (n, terms + 3 + set-up)."""
-    field = design(machine, terms, run.axes_mm)
+    field = run_field(machine, terms, run)
     lost = -0.5 * run.sign
     out = np.zeros((run.deviation_mm.size, len(setup.names)))
     at = {name: i for i, name in enumerate(setup.names)}
@@ -150,7 +166,7 @@ def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setu
     assert run.radius_mm is not None
     at = {name: i for i, name in enumerate(setup.names)}
     n_terms = len(terms)
-    tip = run.axes_mm - run.centre_mm + design(machine, terms, run.axes_mm) @ theta[:n_terms]
+    tip = run.axes_mm - run.centre_mm + run_field(machine, terms, run) @ theta[:n_terms]
     tip = tip - 0.5 * run.sign * theta[n_terms : n_terms + 3]
     rest = theta[n_terms + 3 :]
     tip = tip - np.array([rest[at[f"cup_{run.setup}_{a}"]] for a in "xyz"])
@@ -187,21 +203,29 @@ def solve_joint(
     setup = setup_unknowns(runs, priors)
     names = tuple(t.name for t in terms) + tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
     prior = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
-    blocks = [run_design(machine, terms, run, setup) for run in runs]
-    a = np.concatenate(blocks)
+    a = np.concatenate([run_design(machine, terms, run, setup) for run in runs])
     sigma = np.concatenate([np.hypot(sigma_mm[r.kind] / np.sqrt(r.weight_n), floor_mm[r.kind]) for r in runs])
     y = np.concatenate([r.deviation_mm for r in runs])
+
+    def reading(theta: F1) -> F1:
+        return np.concatenate([predict(machine, terms, r, setup, theta) for r in runs])
+
     estimate = solve_map(names, a, y - np.concatenate([nominal_reading(r) for r in runs]), sigma, prior)
     for _ in range(2):  # the ball-bar is slightly non-linear: 0.01 um at 60 um of offset
-        theta = estimate.theta
-        predicted = np.concatenate([predict(machine, terms, r, setup, theta) for r in runs])
-        estimate = solve_map(names, a, y - predicted + a @ theta, sigma, prior)
-    theta = estimate.theta
-    residual = y - np.concatenate([predict(machine, terms, r, setup, theta) for r in runs])
-    n_terms = len(terms)
-    seen = project_out(a[:, :n_terms] / sigma[:, None], a[:, n_terms:] / sigma[:, None])
-    rank = analyse(names[:n_terms], seen, prior[:n_terms])
-    return JointSolution(machine, terms, estimate, rank, _fits(runs, residual, sigma))
+        estimate = solve_map(names, a, y - reading(estimate.theta) + a @ estimate.theta, sigma, prior)
+    residual = y - reading(estimate.theta)
+    rank = _rank(names[: len(terms)], a / sigma[:, None], prior[: len(terms)])
+    return JointSolution(machine, terms, estimate, rank, _fits(runs, residual, sigma), _tools(machine, runs))
+
+
+def _rank(names: tuple[str, ...], whitened: F2, typical: F1) -> Identifiability:
+    """What the runs see of the first ``len(names)`` unknowns when all others are free."""
+    n = len(names)
+    return analyse(names, project_out(whitened[:, :n], whitened[:, n:]), typical)
+
+
+def _tools(machine: Machine, runs: tuple[RunData, ...]) -> int:
+    return len({tuple(np.round(with_tool(machine, r.tool_mm).tool_mm, 6)) for r in runs})
 
 
 def _fits(runs: tuple[RunData, ...], residual: F1, sigma: F1) -> tuple[RunFit, ...]:

@@ -69,33 +69,40 @@ def solve_map(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> 
     ValueError
         Shapes disagree, a value is not finite, or a sigma is not positive.
     """
-    if a.shape != (y.size, len(names)) or sigma.shape != y.shape or prior_sd.shape != (len(names),):
-        raise ValueError(f"least squares: design {a.shape}, observations {y.shape}, names {len(names)} do not fit together")
-    if not (np.isfinite(a).all() and np.isfinite(y).all() and (sigma > 0).all()):
-        raise ValueError("least squares: design and observations must be finite and every sigma positive")
+    _check(names, a, y, sigma, prior_sd)
     w = 1.0 / sigma
-    scale = np.where(np.isfinite(prior_sd), prior_sd, _column_scale(a))
-    b = a * scale * w[:, None]
-    z = y * w
-    ridge = np.where(np.isfinite(prior_sd), 1.0, 0.0)
-    stacked = np.concatenate([b, np.diag(ridge)])
-    q, r, pivot = linalg.qr(stacked, mode="economic", pivoting=True)
-    keep = np.abs(np.diag(r)) > 1e-12 * abs(r[0, 0])
-    if not keep.all():
-        raise ValueError(f"least squares: no prior and no data for a combination with {names[int(pivot[np.flatnonzero(~keep)[0]])]}")
-    rhs = q.T @ np.concatenate([z, np.zeros(len(names))])
-    x = np.empty(len(names))
-    x[pivot] = linalg.solve_triangular(r, rhs)
-    r_inv = np.empty((len(names), len(names)))
-    r_inv[pivot] = linalg.solve_triangular(r, np.eye(len(names)))
-    cov = r_inv @ r_inv.T
+    known = np.isfinite(prior_sd)
+    scale = np.where(known, prior_sd, _column_scale(a))
+    ridge = np.where(known, 1.0, 0.0)
+    x, cov = _solve_whitened(names, a * scale * w[:, None], y * w, ridge)
     residual = y - a @ (x * scale)
-    share = np.where(np.isfinite(prior_sd), 1.0 - np.diag(cov), 1.0)
+    share = np.where(known, 1.0 - np.diag(cov), 1.0)
     effective = float(len(names) - (np.diag(cov) * ridge).sum())
     chi2 = float(((residual * w) ** 2).sum())
     dof = max(float(y.size) - effective, 1.0)
     factor = max(1.0, chi2 / dof)
     return Estimate(names, x * scale, cov * np.outer(scale, scale) * factor, residual, chi2, dof, factor, np.clip(share, 0.0, 1.0))
+
+
+def _check(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> None:
+    if a.shape != (y.size, len(names)) or sigma.shape != y.shape or prior_sd.shape != (len(names),):
+        raise ValueError(f"least squares: design {a.shape}, observations {y.shape}, names {len(names)} do not fit together")
+    if not (np.isfinite(a).all() and np.isfinite(y).all() and (sigma > 0).all()):
+        raise ValueError("least squares: design and observations must be finite and every sigma positive")
+
+
+def _solve_whitened(names: tuple[str, ...], b: F2, z: F1, ridge: F1) -> tuple[F1, F2]:
+    """Minimum of |b x - z|^2 + |ridge x|^2 by QR of the stacked system, and the inverse of its normal matrix."""
+    q, r, pivot = linalg.qr(np.concatenate([b, np.diag(ridge)]), mode="economic", pivoting=True)
+    keep = np.abs(np.diag(r)) > 1e-12 * abs(r[0, 0])
+    if not keep.all():
+        raise ValueError(f"least squares: no prior and no data for a combination with {names[int(pivot[np.flatnonzero(~keep)[0]])]}")
+    n = len(names)
+    x = np.empty(n)
+    x[pivot] = linalg.solve_triangular(r, q.T @ np.concatenate([z, np.zeros(n)]))
+    r_inv = np.empty((n, n))
+    r_inv[pivot] = linalg.solve_triangular(r, np.eye(n))
+    return x, r_inv @ r_inv.T
 
 
 def _column_scale(a: F2) -> F1:

@@ -32,6 +32,12 @@ class RunData:
     weight_n : array, shape (n,)
         How many raw readings each value is the mean of.
     centre_mm, radius_mm : bar set-up. beam : laser set-up, nominal unit vector.
+    u_length_mm : float, optional
+        Stated standard uncertainty of the bar's calibrated length.
+    length_calibrated : bool, optional
+        Whether the bar's length was calibrated at all; None: the run does not say (`models.solvers.priors.bar_length_sd`).
+    tool_mm : array, shape (3,), optional
+        Spindle reference to functional point in this run; None: the machine's own.
     """
 
     label: str
@@ -45,6 +51,9 @@ class RunData:
     centre_mm: F1 | None = None
     radius_mm: float | None = None
     beam: F1 | None = None
+    u_length_mm: float | None = None
+    length_calibrated: bool | None = None
+    tool_mm: F1 | None = None
 
     def __post_init__(self) -> None:
         """Refuse what no solver could use, naming the run."""
@@ -59,13 +68,18 @@ class RunData:
             raise ValueError(f"run {self.label}: a ball-bar run needs centre_mm and radius_mm")
         if self.kind == "laser" and self.beam is None:
             raise ValueError(f"run {self.label}: a laser run needs its nominal beam")
+        if self.tool_mm is not None and (self.tool_mm.shape != (3,) or not np.isfinite(self.tool_mm).all()):
+            raise ValueError(f"run {self.label}: tool_mm must be three finite numbers")
+        if self.u_length_mm is not None and not (np.isfinite(self.u_length_mm) and self.u_length_mm >= 0):
+            raise ValueError(f"run {self.label}: u_length_mm must be a number of 0 or more")
 
 
 def block_average(run: RunData, blocks: int) -> RunData:
-    """The run with at most ``blocks`` values, each the mean of consecutive readings moving in one direction.
+    """The run with about ``blocks`` values, each the mean of up to ceil(n / blocks) consecutive readings moving in one direction.
 
-    What is averaged is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies
-    inside it; blocks never span a reversal, because lost motion would be averaged away there.
+    Blocks never span a reversal, because lost motion would be averaged away there: every reversal may add one value to ``blocks``. What is
+    averaged is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside it. A
+    run of at most ``blocks`` readings is returned as it is.
     """
     n = run.deviation_mm.size
     size = max(1, int(np.ceil(n / blocks)))

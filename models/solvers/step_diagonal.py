@@ -53,6 +53,23 @@ def wang_four(q: dict[str, F2], inc_mm: F1) -> F3:
     return _cumulate(raw)
 
 
+def u_wang_four(inc_mm: F1, n: int, u_reading_mm: float, u_scale: float = 0.0) -> F3:
+    """Standard uncertainty of `wang_four` from reading noise and wavelength alone, shape (3, 3, n + 1), mm.
+
+    One interval: R / (2 X) sigma_q with sigma_q = sqrt(2) sigma of a reading (math.md 5.1); the intervals of an axis share no reading, so
+    k of them cumulate to sqrt(k). ``u_scale``, the relative uncertainty of the laser's wavelength, lengthens only E[a, a]. Mirror tilts
+    (5.4), angular errors (5.2) and drift are biases of the method and NOT in it.
+    """
+    r = float(np.linalg.norm(inc_mm))
+    steps = np.arange(n + 1)
+    out = np.empty((3, 3, n + 1))
+    for i in range(3):
+        noise = r / (2 * inc_mm[i]) * np.sqrt(2.0 * steps) * u_reading_mm
+        out[i] = noise
+        out[i, i] = np.hypot(noise, u_scale * inc_mm[i] * steps)
+    return out
+
+
 def closure_mm(q: dict[str, F2]) -> F2:
     """ppp - npp - pnp - ppn per axis and interval, shape (3, n): zero for pure translations, visible for mirror tilt (math.md 5.1, 5.4)."""
     return q["ppp"] - q["npp"] - q["pnp"] - q["ppn"]

@@ -29,20 +29,28 @@ def run_data(run: dict[str, Any], *, blocks: int = BLOCKS) -> RunData:
     if int(valid.sum()) < 10:
         raise MeasurementFault(f"run {label}: only {int(valid.sum())} valid readings of {len(axes)}", "measure it again")
     deviation = np.asarray(columns["deviation_mm"], dtype=np.float64)[valid]
-    common = {
+    common: dict[str, Any] = {
         "axes_mm": axes[valid],
         "deviation_mm": deviation,
         "sign": sign[valid],
         "t_s": np.asarray(columns["t_s"], dtype=np.float64)[valid],
         "weight_n": np.ones(int(valid.sum())),
+        "tool_mm": _tool(setup),
     }
     if run["test"] in ("ballbar_helix", "ballbar_circle"):
         centre = np.asarray(setup["centre_mm"], dtype=np.float64)
+        common |= {"u_length_mm": setup.get("u_length_mm"), "length_calibrated": setup.get("length_calibrated")}
         bar = RunData(label, setup["setup_id"], "bar", **common, centre_mm=centre, radius_mm=float(setup["radius_mm"]))
         return block_average(bar, blocks)
     if run["test"] in ("laser_diagonal", "laser_linear"):
         return RunData(label, setup["setup_id"], "laser", **common, beam=_beam(run))
     raise MeasurementFault(f"run {label}: test {run['test']!r} is not one this solver knows")
+
+
+def _tool(setup: dict[str, Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+    """Tool of this run if its set-up names one, else None (the machine's own)."""
+    tool = setup.get("tool_mm")
+    return None if tool is None else np.asarray(tool, dtype=np.float64)
 
 
 def _beam(run: dict[str, Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from models.compensation.summary import mean_linear
-from models.solvers.helix import HelixSolution, fit_helix
+from models.compensation.summary import SCALE_NOTE, mean_linear
+from models.solvers.helix import HelixSolution, fit_run
 from models.solvers.joint import JointSolution, bar_normals, implausible, setup_unknowns, solve_joint
 from models.solvers.observations import RunData, nominal_reading
-from models.solvers.priors import Priors
-from models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, wang_four
+from models.solvers.priors import U_WAVELENGTH, Priors
+from models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
 from service.errors import InstrumentsDisagree, NotObservable
 from service.runs.observations import bar_noise_mm, run_data
 from service.site import Site
@@ -24,6 +24,14 @@ FLOOR_MM = 3e-4
 """What smooth functions of this order do not follow: neither instrument is trusted below it."""
 SEEN_SHARE = 0.2
 """A parameter whose data explain less than this share of its prior variance is listed as not seen."""
+HELIX_NOTE = (
+    "Ten-parameter figures describe the machine about that sphere only, from that run alone; over the volume the joint solution is the one "
+    "to use."
+)
+STEP_NOTE = (
+    "Step-diagonal figures are the paper's, for comparison: their uncertainty holds reading noise and the laser's wavelength only. Tilt of "
+    "the mirrors and angular errors of the axes bias them and are not in it; the joint solution knows both and is the one to use."
+)
 
 
 @dataclass(frozen=True)
@@ -58,10 +66,7 @@ def solve_runs(site: Site, runs: list[dict[str, Any]]) -> Solved:
         floor_mm={"bar": FLOOR_MM, "laser": FLOOR_MM},
     )
     check_instruments(joint, data)
-    helices = {}
-    for run in data:
-        if run.kind == "bar" and run.centre_mm is not None and run.radius_mm is not None:
-            helices[run.label] = fit_helix(run.axes_mm, run.deviation_mm, run.centre_mm, run.radius_mm, sigma_mm=max(noise, 1e-4))
+    helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.kind == "bar"}
     return Solved(joint, helices, step_diagonals(used), noise)
 
 
@@ -84,28 +89,36 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> None:
 
 
 def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """The papers' step-diagonal figures per step order: end errors of the nine curves (um), closure (um), squareness contrasts (urad)."""
-    out: dict[str, dict[str, float]] = {}
+    """The papers' step-diagonal figures per step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
+
+    End errors of the nine curves (um), largest closure (um; its u is that of one closure), squareness contrasts (urad).
+    """
+    out = {}
     for order in ("XYZ", "ZYX"):
         found = {r["setup"]["diagonal"]: r for r in runs if r["test"] == "laser_diagonal" and r["setup"].get("order", "") == order}
         if set(found) != set(ORDER):
             continue
-        n = int(found["ppp"]["setup"]["steps"])
-        out_only = {k: np.asarray(r["columns"]["deviation_mm"][: 3 * n + 1]) for k, r in found.items()}
-        inc = np.abs(np.asarray(found["ppp"]["setup"]["increment_mm"]))
-        q = increments(out_only, order)
-        curves = wang_four(q, inc)
-        contrast = squareness_contrast({k: float(v[-1]) for k, v in out_only.items()}, inc * n, LASER_SIGMA_MM * np.sqrt(2.0))
-        figures = {f"E{'XYZ'[i]}{'XYZ'[a]}_end_um": float(curves[i, a, -1]) * 1e3 for a in range(3) for i in range(3)}
-        figures["closure_max_um"] = float(np.abs(closure_mm(q)).max()) * 1e3
-        figures |= {
-            "theta_xy_urad": contrast.theta_xy * 1e6,
-            "theta_xz_urad": contrast.theta_xz * 1e6,
-            "theta_yz_urad": contrast.theta_yz * 1e6,
-        }
-        figures |= {"u_theta_xy_urad": contrast.u_xy * 1e6, "u_theta_xz_urad": contrast.u_xz * 1e6, "u_theta_yz_urad": contrast.u_yz * 1e6}
-        out[order] = figures
+        out[order] = _step_figures(found, order)
     return out
+
+
+def _step_figures(found: dict[str, dict[str, Any]], order: str) -> dict[str, float]:
+    n = int(found["ppp"]["setup"]["steps"])
+    out_only = {k: np.asarray(r["columns"]["deviation_mm"][: 3 * n + 1]) for k, r in found.items()}
+    inc = np.abs(np.asarray(found["ppp"]["setup"]["increment_mm"]))
+    q = increments(out_only, order)
+    curves, u = wang_four(q, inc), u_wang_four(inc, n, LASER_SIGMA_MM, U_WAVELENGTH)
+    figures: dict[str, float] = {}
+    for i, a in ((i, a) for a in range(3) for i in range(3)):
+        key = f"E{'XYZ'[i]}{'XYZ'[a]}_end_um"
+        figures |= {key: float(curves[i, a, -1]) * 1e3, f"u_{key}": float(u[i, a, -1]) * 1e3}
+    figures["closure_max_um"] = float(np.abs(closure_mm(q)).max()) * 1e3
+    figures["u_closure_max_um"] = float(np.sqrt(8.0)) * LASER_SIGMA_MM * 1e3  # four differences of two readings
+    contrast = squareness_contrast({k: float(v[-1]) for k, v in out_only.items()}, inc * n, LASER_SIGMA_MM * np.sqrt(2.0))
+    for name in ("xy", "xz", "yz"):
+        figures[f"theta_{name}_urad"] = getattr(contrast, f"theta_{name}") * 1e6
+        figures[f"u_theta_{name}_urad"] = getattr(contrast, f"u_{name}") * 1e6
+    return figures
 
 
 def not_observable(joint: JointSolution) -> list[str]:
@@ -119,7 +132,7 @@ def not_observable(joint: JointSolution) -> list[str]:
     names = [t.name for t, s in zip(joint.terms, joint.estimate.data_share, strict=False) if s < SEEN_SHARE]
     if names:
         texts.append(f"{len(names)} coefficients rest on their prior, the data hardly speak of them: {', '.join(names)}")
-    if groups:
+    if groups and joint.tool_count == 1:
         texts.append("all runs used one tool length: what is named above may act differently with another tool")
     return texts
 
@@ -128,7 +141,8 @@ def _apart(motions: tuple[str, ...], orders: list[int]) -> str:
     span = f"order {orders[0]}" if orders[0] == orders[-1] else f"orders {orders[0]} to {orders[-1]}"
     if len(motions) == 1:
         return f"{motions[0]} ({span}) leaves no trace in these runs"
-    return f"{', '.join(motions[:-1])} and {motions[-1]} cannot be told apart ({span}, {len(orders)} combinations)"
+    count = f"{len(orders)} combination{'s' if len(orders) > 1 else ''}"
+    return f"{', '.join(motions[:-1])} and {motions[-1]} cannot be told apart ({span}, {count})"
 
 
 def solution_doc(solved: Solved) -> dict[str, Any]:
@@ -140,6 +154,7 @@ def solution_doc(solved: Solved) -> dict[str, Any]:
         "abbe": version("abbe"),
         "parameters": {n: {"value": e.value(n), "u": e.u(n), "data_share": float(s)} for n, s in zip(e.names, e.data_share, strict=True)},
         "mean_over_volume": {p.name: {"value": p.value, "u": p.u} for p in mean_linear(joint)},
+        "mean_over_volume_note": f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
         "rank": {"rank": joint.identifiability.rank, "of": joint.identifiability.n_parameters},
         "not_observable": not_observable(joint),
         "variance_factor": e.variance_factor,
@@ -151,7 +166,9 @@ def solution_doc(solved: Solved) -> dict[str, Any]:
             label: {n: {"value": h.estimate.value(n), "u": h.estimate.u(n)} for n in h.estimate.names}
             for label, h in solved.helices.items()
         },
+        "ten_parameter_helix_note": HELIX_NOTE,
         "step_diagonals": solved.step_totals,
+        "step_diagonals_note": STEP_NOTE,
     }
 
 
@@ -160,6 +177,6 @@ def helix_misfit(solved: Solved, run: dict[str, Any]) -> float:
     data = run_data(run)
     n = bar_normals(data)
     lost = -0.5 * data.sign * np.array([v for v, _ in solved.joint.backlash_mm().values()])
-    y = data.deviation_mm - nominal_reading(data) - np.einsum("ni,ni->n", n, solved.joint.deviation_mm(data.axes_mm) + lost)
+    y = data.deviation_mm - nominal_reading(data) - np.einsum("ni,ni->n", n, solved.joint.deviation_mm(data.axes_mm, data.tool_mm) + lost)
     a = np.concatenate([n, np.ones((len(n), 1))], axis=1)
     return float(np.sqrt(np.mean((y - a @ np.linalg.lstsq(a, y, rcond=None)[0]) ** 2)))

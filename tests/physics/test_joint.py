@@ -5,86 +5,12 @@ import pytest
 
 from models.compensation.summary import mean_linear
 from models.compensation.tables import nine_tables, predict_residual, quantise
-from models.geometry.chain import exact_deviation_mm, travel_sign
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.joint import JointSolution, perpendicular, solve_joint
-from models.solvers.observations import RunData, block_average, nominal_reading
+from models.paths.lines import diagonal_ends, straight_line
+from models.solvers.joint import JointSolution, solve_joint
+from models.solvers.observations import block_average, nominal_reading
 from models.verification import diagonal_figure, helix_figure
 from models.volumetric import field_figures, remove_rigid, rigid_design, volume_grid
-
-MACHINE = Machine(
-    "w-X-Y-b-Z-t",
-    np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]),
-    np.array([[300.0, 250.0, -150.0], [300.0, 250.0, -250.0], [0.0, 320.0, 260.0]]),
-    np.array([0.0, 0.0, -120.0]),
-)
-
-
-class Truth:
-    """A seeded machine: sines and a bump, not polynomials; finite rotations."""
-
-    def __init__(self, seed: int) -> None:
-        self.rng = rng = np.random.default_rng(seed)
-        self.wave = rng.uniform(0.7, 2.5, (3, 6, 3))
-        self.phase = rng.uniform(0, 2 * np.pi, (3, 6, 3))
-        self.size = rng.normal(0, 1.0, (3, 6, 3)) * np.r_[[2e-3] * 3, [6e-6] * 3][None, :, None]
-        self.slope = np.zeros((3, 6))
-        self.slope[[0, 1, 2], [0, 1, 2]] = rng.normal(0, 40e-6, 3)
-        self.square = rng.normal(0, 25e-6, 3)
-        self.backlash = rng.uniform(1e-3, 5e-3, 3)
-
-    def motions(self, p: np.ndarray) -> np.ndarray:
-        out = np.empty((len(p), 3, 6))
-        for a in range(3):
-            u = p[:, a] / MACHINE.length_mm[a]
-            out[:, a] = (self.size[a] * np.sin(2 * np.pi * u[:, None, None] / self.wave[a] + self.phase[a])).sum(-1)
-            out[:, a] += self.slope[a] * p[:, a, None]
-        out[:, 1, 0] -= self.square[0] * p[:, 1]
-        out[:, 2, 0] += self.square[1] * p[:, 2]
-        out[:, 2, 1] -= self.square[2] * p[:, 2]
-        return out
-
-    def deviation(self, p: np.ndarray, sign: np.ndarray | None = None) -> np.ndarray:
-        d = exact_deviation_mm(MACHINE, p, self.motions(p))
-        return d if sign is None else d - 0.5 * sign * self.backlash
-
-    def bar(self, label: str, centre: np.ndarray, radius: float, length_mm: float = 1.5e-3) -> RunData:
-        p = helix_points(centre, radius, turns=5, n=int(radius * 20), law="area", axis=2)
-        sign = travel_sign(p)
-        offset = self.deviation(centre[None])[0] + self.rng.normal(0, 10e-3, 3)
-        reading = np.linalg.norm(p + self.deviation(p, sign) - centre - offset, axis=1) - radius + length_mm
-        reading += self.rng.normal(0, 4e-4, len(p))
-        n = len(p)
-        return RunData(label, label, "bar", p, reading, sign, np.arange(n) * 0.03, np.ones(n), centre, radius)
-
-    def laser(self, label: str, p: np.ndarray) -> RunData:
-        beam = (p[len(p) // 2] - p[0]) / np.linalg.norm(p[len(p) // 2] - p[0])
-        tilt = self.rng.normal(0, 150e-6, 2) @ perpendicular(beam)
-        sign = travel_sign(p)
-        moved = p + self.deviation(p, sign)
-        m = beam + tilt
-        reading = (moved - moved[0]) @ m / (m @ beam) - (p - p[0]) @ beam + self.rng.normal(0, 2.4e-4, len(p))
-        return RunData(label, label, "laser", p, reading, sign, np.arange(len(p)) * 1.0, np.ones(len(p)), beam=beam)
-
-    def campaign(self) -> tuple[RunData, ...]:
-        places = [(300, 250, 135, 200), (192, 180, 90, 165), (408, 320, 90, 165), (192, 320, 112, 165), (408, 180, 112, 165)]
-        runs = [block_average(self.bar(f"h{k}", np.array(c[:3], float), c[3]), 300) for k, c in enumerate(places)]
-        box = MACHINE.stroke_mm + np.array([10.0, -10.0])
-        for a in range(3):
-            for at in (0.15, 0.85):
-                start = MACHINE.stroke_mm[:, 0] + at * MACHINE.length_mm
-                end = start.copy()
-                start[a], end[a] = box[a]
-                runs.append(self.laser(f"l{a}{at}", straight_line(start, end, 25)))
-        for order in ("XYZ", "ZYX"):
-            runs += [self.laser(f"d{d}{order}", step_diagonal(*diagonal_ends(box, d), 12, order)) for d in DIAGONALS]
-        return tuple(runs)
-
-
-SIGMA = {"bar": 4e-4, "laser": 3e-4}
-FLOOR = {"bar": 3e-4, "laser": 3e-4}
+from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 
 @pytest.fixture(scope="module", params=[1, 2, 3])
@@ -99,7 +25,7 @@ def test_the_identified_field_is_the_true_one_within_its_own_uncertainty(solved)
     gap = remove_rigid(grid, truth.deviation(grid) - s.deviation_mm(grid))
     rms = np.sqrt(np.mean(np.sum(gap**2, axis=1)))
     stated = predict_residual(s, nine_tables(s, (13, 11, 10))).u_model_mm
-    assert rms < 2.0 * stated
+    assert 0.2 < rms / stated < 1.0  # 0.36 to 0.75 over ten seeds (tests/physics/test_coverage.py): the priors are wider than this machine
     assert rms < 4e-3
 
 
@@ -115,13 +41,6 @@ def test_scale_squareness_and_lost_motion_are_covered_by_their_uncertainties(sol
     for error, p in zip(gap, mean_linear(s), strict=True):
         assert abs(error) < 3 * p.u
         assert p.u < 2e-6
-
-
-def linear_parameters(grid: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """EXX, EYY, EZZ slopes and C0Y, B0Z, A0Z of a deviation field."""
-    centred = grid - grid.mean(axis=0)
-    m = deviation.T @ centred / np.sum(centred**2, axis=0)  # [output, input]
-    return np.array([m[0, 0], m[1, 1], m[2, 2], -m[0, 1] - m[1, 0], m[0, 2] + m[2, 0], -m[1, 2] - m[2, 1]])
 
 
 def test_nine_tables_come_close_to_the_best_nine_there_are(solved):

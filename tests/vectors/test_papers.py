@@ -6,10 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.geometry.bases import smooth_terms
+from models.geometry.chain import travel_sign
+from models.machine import Machine
 from models.paths.helix import helix_points
+from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from models.solvers.helix import fit_helix, helix_design
-from models.solvers.identifiability import analyse
-from models.solvers.step_diagonal import closure_mm, increments, squareness_contrast, wang_eq7, wang_four
+from models.solvers.identifiability import analyse, project_out
+from models.solvers.joint import run_design, setup_unknowns
+from models.solvers.observations import RunData
+from models.solvers.priors import Priors
+from models.solvers.step_diagonal import closure_mm, increments, squareness_contrast, u_wang_four, wang_eq7, wang_four
 
 
 def load(shared: Path, name: str) -> dict:
@@ -101,3 +108,68 @@ def test_what_the_linear_model_cannot_follow_widens_its_uncertainty_but_not_the_
     assert fit.u("C0Y") > 3 * white.u("C0Y")
     assert abs(fit.value("C0Y")) < 3 * fit.u("C0Y")
     assert fit.u("bar_length") == pytest.approx(0.0015, rel=0.01)
+
+
+FXYZ = Machine("w-b-X-Y-Z-t", np.array([[0.0, 800.0], [0.0, 500.0], [0.0, 400.0]]))
+"""Bed, X, Y, Z towards the tool: chain of math.md 5.5, tool 0."""
+
+
+def laser(label: str, p: np.ndarray) -> RunData:
+    n, beam = len(p), (p[-1] - p[0]) / np.linalg.norm(p[-1] - p[0])
+    return RunData(label, label, "laser", p, np.zeros(n), travel_sign(p), np.arange(n) * 1.0, np.ones(n), beam=beam)
+
+
+def diagonals(orders: tuple[str, ...]) -> list[RunData]:
+    ends = {d: diagonal_ends(FXYZ.stroke_mm, d) for d in DIAGONALS}
+    return [laser(f"{d}{o}", step_diagonal(*ends[d], 10, o, back=False)) for o in orders for d in DIAGONALS]
+
+
+def edges(sides: tuple[int, ...], axes: str = "XYZ") -> list[RunData]:
+    out = []
+    for side in sides:
+        for letter in axes:
+            a = "XYZ".index(letter)
+            start = FXYZ.stroke_mm[:, side].copy()
+            end = start.copy()
+            start[a], end[a] = FXYZ.stroke_mm[a]
+            out.append(laser(f"{letter}{side}", straight_line(start, end, 11, back=False)))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("experiment", "runs", "tilts"),
+    [
+        ("ideal mirror", diagonals(("XYZ",)), False),
+        ("8 tilt unknowns", diagonals(("XYZ",)), True),
+        ("8 tilt + linear laser X", diagonals(("XYZ",)) + edges((0,), "X"), True),
+        ("8 tilt + linear laser X,Y", diagonals(("XYZ",)) + edges((0,), "XY"), True),
+        ("8 tilt + linear laser X,Y,Z", diagonals(("XYZ",)) + edges((0,)), True),
+        ("two orders XYZ,ZYX, 16 tilt", diagonals(("XYZ", "ZYX")), True),
+        ("two orders + linear X,Y,Z, 16 tilt", diagonals(("XYZ", "ZYX")) + edges((0,)), True),
+        ("two orders + linear XYZ on 2 edges, 16 tilt", diagonals(("XYZ", "ZYX")) + edges((0, 1)), True),
+    ],
+)
+def test_ranks_of_laser_experiments_are_those_of_the_independent_table(shared, experiment, runs, tilts):
+    reference = load(shared, "wang_step_diagonal.json")["ranks"][experiment]
+    setup = setup_unknowns(tuple(runs), Priors())
+    for degree in (1, 2, 3):
+        terms = smooth_terms(degree)
+        a = np.concatenate([run_design(FXYZ, terms, r, setup) for r in runs])
+        first = len(terms) + 3
+        nuisance = [
+            first + k for k, n in enumerate(setup.names) if tilts and n.startswith("tilt_")
+        ]  # the table knows neither zero nor drift
+        found = analyse(tuple(t.name for t in terms), project_out(a[:, : len(terms)], a[:, nuisance]))
+        assert found.rank == reference[degree - 1][0]
+
+
+def test_stated_noise_of_the_nine_curves_is_the_scatter_of_repeats():
+    rng = np.random.default_rng(11)
+    inc, n, sigma = np.array([80.0, 50.0, 40.0]), 10, 3e-4
+    curves = [wang_four(increments({d: rng.normal(0, sigma, 3 * n + 1) for d in DIAGONALS}), inc) for _ in range(1500)]
+    stated = u_wang_four(inc, n, sigma)
+    assert np.std(curves, axis=0)[:, :, 1:] == pytest.approx(stated[:, :, 1:], rel=0.1)
+    assert (stated[:, :, 0] == 0.0).all()
+    with_scale = u_wang_four(inc, n, sigma, 1e-6)
+    assert with_scale[0, 0, -1] == pytest.approx(np.hypot(stated[0, 0, -1], 8e-4))
+    assert with_scale[0, 1, -1] == stated[0, 1, -1]
