@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from models.compensation.summary import mean_linear
+from models.compensation.summary import SCALE_NOTE, mean_linear
 from models.compensation.tables import NineTables
 from models.solvers.joint import JointSolution
 from service.report.model import (
@@ -21,7 +21,7 @@ from service.report.model import (
     SummaryRow,
     TableCurve,
 )
-from service.workflows.correct import LSB_NM, Correction
+from service.workflows.correct import Correction
 from service.workflows.demo import DemoResult
 from service.workflows.solve import not_observable
 from service.workflows.verify import Figures, figure_rows
@@ -86,7 +86,8 @@ def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
     e = joint.estimate
     rows = []
     for p in mean_linear(joint):
-        unit, note = ("µm/m", "scale error, mean over the volume") if p.name[0] == "E" else ("µrad", "squareness, mean over the volume")
+        scale = p.name[0] == "E"
+        unit, note = ("µm/m", f"scale error, mean over the volume, {SCALE_NOTE}") if scale else ("µrad", "squareness, mean over the volume")
         rows.append(ParameterRow(p.name, p.value * 1e6, p.u * 1e6, unit, note))
     rows += [
         ParameterRow(f"backlash {a}", v * 1e3, u * 1e3, "µm", "lost motion, not compensated") for a, (v, u) in joint.backlash_mm().items()
@@ -166,7 +167,7 @@ def demo_report(result: DemoResult) -> DemoReport:
         runs=_runs(c),
         residuals=[ResidualSeries(r.label, "reading", list(range(r.residual_mm.size)), (r.residual_mm * 1e3).tolist()) for r in joint.runs],
         tables=_tables(c.tables),
-        table_lsb_um=LSB_NM * 1e-3,
+        table_lsb_um=c.lsb_nm * 1e-3,
         arrows_before=_arrows(result.truth_before),
         arrows_after=_arrows(result.truth_after),
         diagonals_before=_curves(c.before),
