@@ -1,0 +1,154 @@
+"""The whole correction on a simulated machine: what stops it, what turns it back, what it does the second time."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models.compensation.tables import NineTables
+from service.devices.session import DeviceUrls, Session, open_session
+from service.errors import MeasurementFault, StillActive, TableMismatch, TableRefused
+from service.events import Progress, ignore_progress
+from service.sequences.campaigns import identification, verification
+from service.sequences.steps import CampaignPlan
+from service.site import Site, machine_doc, machine_from_doc
+from service.storage.store import Store
+from service.workflows import correct as workflow
+from service.workflows.correct import correct, load_runs
+from service.workflows.measure import measure
+from service.workflows.recover import recover
+
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
+RATE_HZ = 50
+
+
+class Shop:
+    """A machine, its devices and its store, with the steps of the job as short words."""
+
+    def __init__(self, site: Site, store: Store, session: Session) -> None:
+        self.site, self.store, self.session = site, store, session
+
+    async def identify(self, name: str) -> None:
+        full = identification(self.site.machine, rate_hz=RATE_HZ, name=name)
+        tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
+        await measure(self.session, self.store, self.site, CampaignPlan(name, tests), progress=ignore_progress)
+
+    async def check(self, name: str) -> list[dict[str, Any]]:
+        plan = verification(self.site.machine, rate_hz=RATE_HZ, name=name)
+        return await load_runs(self.store, await measure(self.session, self.store, self.site, plan, progress=ignore_progress))
+
+    async def correct(self, name: str, before: list[dict[str, Any]], watch: Callable[[Progress], None] = ignore_progress):
+        return await correct(self.session, self.store, self.site, name, before, rate_hz=RATE_HZ, progress=watch)
+
+    async def active(self) -> tuple[int, int]:
+        now = await self.session.controller.comp_status()
+        return now.active_bank, now.bank_crc[now.active_bank]
+
+    @property
+    def state(self) -> str:
+        return self.store.pushes()[-1].state
+
+
+@pytest.fixture
+async def shop(start_sims, tmp_path):
+    sims = start_sims("--speed", "100", "--seed", "2")
+    machine = machine_from_doc(sims.ready["machine"])
+    urls = DeviceUrls(sims.ready["cnc"], sims.ready["ballbar"], sims.ready["laser"], sims.ready["fixture"])
+    site = Site("sim", machine, machine_doc("sim", machine), urls)
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        async with open_session(urls) as session:
+            one = Shop(site, store, session)
+            one.ask = sims.ask
+            await one.identify("june")
+            one.before = await one.check("june-before")
+            yield one
+
+
+def at_verification(action: Callable[[], None]) -> Callable[[Progress], None]:
+    """A progress sink that acts once, in the middle of the verification after a push."""
+    done: list[bool] = []
+
+    def watch(p: Progress) -> None:
+        if p.stage.startswith("verify-after") and p.done > 0.5 * p.total and not done:
+            done.append(True)
+            action()
+
+    return watch
+
+
+def flipped(tables: NineTables) -> NineTables:
+    x, y, z = (-c for c in tables.correction_mm)
+    return replace(tables, correction_mm=(x, y, z))
+
+
+async def test_whatever_stops_the_verification_takes_the_table_back(shop):
+    base = await shop.active()
+
+    # e-stop: the person reads about the e-stop and that the table is still active; it goes as soon as the machine allows
+    with pytest.raises(StillActive, match=r"(?i)e-stop.*STILL ACTIVE"):
+        await shop.correct("june", shop.before, at_verification(lambda: shop.ask("estop", on=True)))
+    assert shop.state == "ROLLBACK_PENDING"
+    shop.ask("estop", on=False)
+    await shop.session.controller.reset_alarm()
+    assert "made active again" in await recover(shop.session.controller, shop.store, shop.site)
+    assert await shop.active() == base
+
+    # cancelled, as by Ctrl-C
+    task = asyncio.current_task()
+    assert task is not None
+    with pytest.raises(asyncio.CancelledError):
+        await shop.correct("june", shop.before, at_verification(task.cancel))
+    task.uncancel()
+    assert (shop.state, await shop.active()) == ("ROLLED_BACK", base)
+
+    # runs that are no verification are refused before anything is written
+    pushes = len(shop.store.pushes())
+    with pytest.raises(MeasurementFault, match="no verification"):
+        await shop.correct("june", shop.before[:3])
+    warm = replace(shop.site, temperature_c=(30.0, 32.0))
+    with pytest.raises(TableRefused, match="°C"):
+        await correct(shop.session, shop.store, warm, "june", shop.before, rate_hz=RATE_HZ, progress=ignore_progress)
+    assert len(shop.store.pushes()) == pushes
+
+
+async def test_a_correction_with_the_wrong_sign_goes_back_and_the_right_one_stays_and_adds_up(shop, monkeypatch):
+    base = await shop.active()
+    honest = workflow.propose
+
+    def wrong(*words: Any) -> workflow.Proposal:
+        p = honest(*words)
+        return replace(p, tables=flipped(p.tables))
+
+    monkeypatch.setattr(workflow, "propose", wrong)
+    found = await shop.correct("june", shop.before)
+    assert found.decision.keep is False
+    assert (shop.state, await shop.active()) == ("ROLLED_BACK", base)
+
+    monkeypatch.setattr(workflow, "propose", honest)
+    first = await shop.correct("june", shop.before)
+    assert first.decision.keep is True
+    assert shop.state == "VERIFIED"
+    assert await shop.active() == (first.bank, first.pushed.crc)
+    assert first.after.worst.value_mm < first.before.worst.value_mm / 2
+
+    # the same campaign again: it was measured with another table, so it says nothing about what to write now
+    with pytest.raises(TableMismatch, match="measured with table"):
+        await shop.correct("june", shop.before)
+
+    # the machine drifts; measured with its table and corrected again, the new table is the old one plus the change
+    shop.ask("drift", axis="X", um_per_m=60.0)
+    await shop.identify("july")
+    before = await shop.check("july-before")
+    second = await shop.correct("july", before)
+    assert second.decision.keep is True
+    assert second.after.worst.value_mm < 0.7 * second.before.worst.value_mm
+    slope = np.polyfit(second.tables.position_mm[0], (second.tables.correction_mm[0] - first.tables.correction_mm[0])[:, 0], 1)[0]
+    assert slope == pytest.approx(-60e-6, abs=8e-6)
+
+    # nothing has changed since: there is nothing to promise
+    await shop.identify("august")
+    with pytest.raises(TableRefused, match="not enough to write"):
+        await shop.correct("august", await shop.check("august-before"))
