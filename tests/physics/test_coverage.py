@@ -33,7 +33,7 @@ def test_the_stated_model_uncertainty_is_one_to_three_times_the_true_error(solve
 def test_lost_motion_is_covered_and_its_uncertainty_is_not_absurdly_wide(solved):
     z = np.array([[(s.backlash_mm()[a][0] - t.backlash[k]) / s.backlash_mm()[a][1] for k, a in enumerate("XYZ")] for t, s in solved])
     assert np.abs(z).max() < 2.0  # seen: 0.9
-    assert 0.15 < np.sqrt(np.mean(z**2)) < 1.2  # seen: 0.35, what one pass in either direction tells is shared with smooth errors
+    assert 0.15 < np.sqrt(np.mean(z**2)) < 1.2  # seen: 0.31, what one pass in either direction tells is shared with smooth errors
 
 
 def test_scale_and_squareness_over_the_volume_are_covered_on_both_sides(solved):
