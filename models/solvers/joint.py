@@ -16,7 +16,7 @@ from models.geometry.chain import design
 from models.machine import Machine
 from models.solvers.identifiability import Identifiability, analyse, project_out
 from models.solvers.least_squares import Estimate, solve_map
-from models.solvers.observations import RunData, nominal_reading
+from models.solvers.observations import RunData
 from models.solvers.priors import Priors, bar_length_sd, term_prior_sd
 
 
@@ -198,11 +198,9 @@ def solve_joint(
     """
     if not runs:
         raise ValueError("joint solution: no runs")
-    priors = priors or Priors()
-    terms = smooth_terms(order)
+    terms, priors = smooth_terms(order), priors or Priors()
     setup = setup_unknowns(runs, priors)
-    names = tuple(t.name for t in terms) + tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
-    prior = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+    names, prior = _unknowns(machine, terms, setup, priors)
     a = np.concatenate([run_design(machine, terms, run, setup) for run in runs])
     sigma = np.concatenate([np.hypot(sigma_mm[r.kind] / np.sqrt(r.weight_n), floor_mm[r.kind]) for r in runs])
     y = np.concatenate([r.deviation_mm for r in runs])
@@ -210,12 +208,16 @@ def solve_joint(
     def reading(theta: F1) -> F1:
         return np.concatenate([predict(machine, terms, r, setup, theta) for r in runs])
 
-    estimate = solve_map(names, a, y - np.concatenate([nominal_reading(r) for r in runs]), sigma, prior)
+    estimate = solve_map(names, a, y - reading(np.zeros(len(names))), sigma, prior)
     for _ in range(2):  # the ball-bar is slightly non-linear: 0.01 um at 60 um of offset
         estimate = solve_map(names, a, y - reading(estimate.theta) + a @ estimate.theta, sigma, prior)
-    residual = y - reading(estimate.theta)
     rank = _rank(names[: len(terms)], a / sigma[:, None], prior[: len(terms)])
-    return JointSolution(machine, terms, estimate, rank, _fits(runs, residual, sigma), _tools(machine, runs))
+    return JointSolution(machine, terms, estimate, rank, _fits(runs, y - reading(estimate.theta), sigma), _tools(machine, runs))
+
+
+def _unknowns(machine: Machine, terms: tuple[Term, ...], setup: Setup, priors: Priors) -> tuple[tuple[str, ...], F1]:
+    names = tuple(t.name for t in terms) + tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
+    return names, np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
 
 
 def _rank(names: tuple[str, ...], whitened: F2, typical: F1) -> Identifiability:
