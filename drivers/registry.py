@@ -27,11 +27,7 @@ async def open_ballbar(url: str) -> BallBar:
     if not isinstance(parsed, SerialUrl | SocketUrl):
         raise _wrong_scheme(url, "a ball-bar", "serial:// or socket://")
     ballbar = SerialBallBar(ByteLink(parsed))
-    try:
-        await ballbar.identify()
-    except BaseException:
-        await ballbar.close()
-        raise
+    await _identify_or_close(ballbar)
     return ballbar
 
 
@@ -48,11 +44,7 @@ async def open_laser(url: str) -> DisplacementMeter:
         The wire.
     """
     laser = ModbusLaser(await _modbus(url, "a laser"))
-    try:
-        await laser.identify()
-    except BaseException:
-        await laser.close()
-        raise
+    await _identify_or_close(laser)
     return laser
 
 
@@ -69,11 +61,7 @@ async def open_controller(url: str) -> Controller:
         The wire.
     """
     controller = ModbusController(await _modbus(url, "a controller"))
-    try:
-        await controller.identify()
-    except BaseException:
-        await controller.close()
-        raise
+    await _identify_or_close(controller)
     return controller
 
 
@@ -113,3 +101,12 @@ async def _modbus(url: str, what: str) -> ModbusLink:
 
 def _wrong_scheme(url: str, what: str, schemes: str) -> BadUrl:
     return BadUrl(ascii(url), "read device URL", f"this is not the URL of {what}", f"write {schemes}")
+
+
+async def _identify_or_close(device: BallBar | DisplacementMeter | Controller) -> None:
+    """Ask who is there; whatever goes wrong, or a cancellation, leaves no open link behind."""
+    try:
+        await device.identify()
+    except BaseException:
+        await device.close()
+        raise

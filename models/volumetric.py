@@ -44,9 +44,3 @@ def field_figures(points_mm: F2, deviation_mm: F2) -> FieldFigures:
     """Rms and maximum length of the deviation vectors after removing the best-fit rigid motion."""
     length: F1 = np.linalg.norm(remove_rigid(points_mm, deviation_mm), axis=1)
     return FieldFigures(float(np.sqrt(np.mean(length**2))), float(length.max()))
-
-
-def diagonal_deviation(start_mm: F1, end_mm: F1, deviation_mm: F2) -> F1:
-    """Deviation along a diagonal relative to its first point, shape (n,): (d_k - d_0) . unit vector."""
-    u = (np.asarray(end_mm) - np.asarray(start_mm)) / np.linalg.norm(np.asarray(end_mm) - np.asarray(start_mm))
-    return np.asarray((deviation_mm - deviation_mm[0]) @ u)

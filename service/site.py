@@ -69,10 +69,7 @@ def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[s
 
 def site_of(config: MachineFile) -> Site:
     """What the machine file says, in the units and types of the workflows."""
-    doc: dict[str, Any] = {"name": config.name, "chain": config.chain, "vertical_axis": config.vertical_axis}
-    doc["stroke_mm"] = {a: list(getattr(config.stroke_mm, a)) for a in AXES}
-    doc["pivots_mm"] = {a: list(getattr(config.pivots_mm, a)) for a in AXES}
-    doc["tool_mm"] = list(config.tool_mm)
+    doc = config.machine_doc()
     devices, limits = config.devices, config.limits
     return Site(
         config.name,

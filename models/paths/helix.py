@@ -45,15 +45,3 @@ def helix_points(
     out[:, a] = np.sin(phi) * np.cos(theta)
     out[:, b] = np.sin(phi) * np.sin(theta)
     return np.asarray(centre_mm) + radius_mm * out
-
-
-def path_length_mm(points_mm: F2) -> F1:
-    """Arc length from the first point to each point of a polyline, shape (n,)."""
-    step = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(step)])
-
-
-def along_path(points_mm: F2, s_mm: F1) -> F2:
-    """Points of the polyline at given arc lengths (clamped to its ends), shape (len(s), 3)."""
-    length = path_length_mm(points_mm)
-    return np.column_stack([np.interp(s_mm, length, points_mm[:, a]) for a in range(3)])

@@ -11,7 +11,6 @@ from drivers.api import BallBar, Controller, DisplacementMeter, Fixture
 from service.errors import ConfigError
 
 Ask = Callable[[str], Awaitable[None]]
-KINDS = ("cnc", "ballbar", "laser", "fixture")
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,11 +58,6 @@ class Svg:
             else:
                 self.dot(part[0], 1.2, style.replace("s-", "f-"))
 
-    def polygon(self, points: Sequence[XY], style: str) -> None:
-        """Closed, filled shape."""
-        if points and _finite(*points):
-            self._body.append(f'<polygon points="{_points(points)}" class="{_attr(style)}"/>')
-
     def rect(self, corner: XY, size: XY, style: str, tip: str = "") -> None:
         """Rectangle; ``tip`` is shown when the pointer rests on it."""
         if _finite(corner, size):

@@ -124,6 +124,7 @@ async def test_registry(peer):
     await fixture.unmount()
     await fixture.close()
     await fixture.close()
+    assert [asked["op"] for asked in peer.asked][-1] == "unmount"
 
 
 async def test_nobody_there(peer):
