@@ -8,10 +8,12 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
+BENCH_VENV := .venv-bench
+BENCH_READY := $(BENCH_VENV)/.ready
 COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint fmt lock clean
+.PHONY: help demo test lint fmt bench lock clean
 
 help: ## list what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -33,13 +35,18 @@ fmt: $(DEV_READY) ## sort imports and format
 	$(BIN)/ruff check --fix-only --quiet
 	$(BIN)/ruff format
 
+bench: $(BENCH_READY) ## speed and memory of the fast paths against other libraries (own environment, .venv-bench)
+	@ABBE_TEST_REQUIRE=numba $(BENCH_VENV)/bin/python -m pytest tests/unit/test_kernel.py tests/unit/test_kernel_threads.py tests/unit/test_bench_case.py
+	@$(BENCH_VENV)/bin/python -m tests.bench $(ARGS)
+
 lock: ## pin the dependencies of pyproject.toml anew (ARGS=--upgrade for newer versions)
 	@command -v uv >/dev/null || { echo "make lock needs uv, a Python package resolver: install it from your package source, then try again."; exit 1; }
 	$(COMPILE) $(ARGS) pyproject.toml -o requirements.lock
 	$(COMPILE) $(ARGS) --extra dev -c requirements.lock pyproject.toml -o requirements-dev.lock
+	$(COMPILE) $(ARGS) --extra bench -c requirements-dev.lock pyproject.toml -o requirements-bench.lock
 
 clean: ## remove caches and build products (.venv stays)
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(BENCH_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find service drivers models simulators tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
@@ -60,3 +67,10 @@ $(DEV_READY): requirements-dev.lock requirements.lock | $(BIN)/python
 	@$(PIP) --require-hashes -r requirements-dev.lock
 	@$(PIP) --no-deps --no-build-isolation -e .
 	@touch $(RUN_READY) $@
+
+# The libraries that we compare with are no business of the product's environment.
+$(BENCH_READY): requirements-bench.lock | $(BIN)/python
+	@echo "setting up $(BENCH_VENV) from requirements-bench.lock, about a minute"
+	@$(BIN)/python -m venv $(BENCH_VENV)
+	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements-bench.lock
+	@touch $@

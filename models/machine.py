@@ -92,16 +92,26 @@ def lever_masks(chain: str) -> F3:
     return mask
 
 
-def levers_mm(machine: Machine, axes_mm: F2) -> F3:
+def levers_mm(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> F3:
     """Lever arms r_j of rule G at commanded positions.
 
     Parameters
     ----------
     axes_mm : array, shape (n, 3)
+    tool_mm : array, shape (3,) or (n, 3), optional
+        Tool in place of ``machine.tool_mm``: one for all positions or one per position.
 
     Returns
     -------
     array, shape (n, 3 carriages, 3)
+
+    Raises
+    ------
+    ValueError
+        ``tool_mm`` has another shape.
     """
     travel: F3 = np.asarray(axes_mm, dtype=np.float64)[:, None, :] * lever_masks(machine.chain)[None]
-    return travel + machine.tool_mm - machine.pivots_mm[None]
+    tool = machine.tool_mm if tool_mm is None else np.asarray(tool_mm, dtype=np.float64)
+    if tool.shape not in ((3,), (travel.shape[0], 3)):
+        raise ValueError(f"tool_mm: expected shape (3,) or ({travel.shape[0]}, 3), got {tool.shape}")
+    return travel + (tool[:, None, :] if tool.ndim == 2 else tool) - machine.pivots_mm[None]

@@ -81,7 +81,7 @@ def load_machine(path: Path | str) -> Loaded:
         File, key, and what is expected there.
     """
     path = Path(path)
-    from_file = _read(path)
+    from_file = read_toml(path)
     from_environment = _overrides()
     merged = _merged(from_file, from_environment)
     try:
@@ -94,7 +94,14 @@ def load_machine(path: Path | str) -> Loaded:
     return Loaded(path, machine, origins)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a machine file.
+
+    Raises
+    ------
+    ConfigError
+        It is missing, unreadable, not UTF-8 or not TOML; the message says which.
+    """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -105,6 +112,10 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"machine file {path} is not UTF-8 text", "save it as UTF-8") from None
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not valid TOML: {err}", "correct this line") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: nested too deeply", "correct the file") from None
+    except ValueError:
+        raise ConfigError(f"{path}: an integer has thousands of digits", "correct the file") from None
 
 
 def _overrides() -> dict[str, Any]:

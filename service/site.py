@@ -50,8 +50,8 @@ def machine_from_doc(doc: dict[str, Any]) -> Machine:
     return Machine(
         doc["chain"],
         stroke,
-        np.array([pivots.get(a, (0.0, 0.0, 0.0)) for a in AXES], dtype=np.float64),
-        np.array(doc.get("tool_mm", (0.0, 0.0, 0.0)), dtype=np.float64),
+        np.array([pivots.get(a) or (0.0, 0.0, 0.0) for a in AXES], dtype=np.float64),
+        np.array(doc.get("tool_mm") or (0.0, 0.0, 0.0), dtype=np.float64),
     )
 
 

@@ -1,7 +1,7 @@
 """Scale errors and squareness as the whole volume sees them: slopes of the main effects, with their uncertainty.
 
 The coefficients of the model are stated at the carriages' pivots, where one tool length often cannot separate them from angles. Their mean
-effect over the volume - which is what one-axis tables correct - is known far better, and is what people mean by "the" squareness.
+effect over the volume - most of what one-axis tables correct - is known far better, and is what people mean by "the" squareness.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.arrays import F1
-from models.compensation.tables import main_effect
+from models.compensation.additive import main_effect
 from models.machine import AXES
 from models.solvers.joint import JointSolution
 from models.solvers.priors import U_WAVELENGTH
@@ -43,7 +43,7 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
         first, last = (float(v) for v in solution.machine.stroke_mm[a])
         p = np.linspace(first, last, positions)
         weight = (p - p.mean()) / np.sum((p - p.mean()) ** 2)
-        slopes[a] = np.einsum("p,pik->ik", weight, main_effect(solution.machine, solution, a, p, nodes))
+        slopes[a] = np.einsum("p,pik->ik", weight, main_effect(solution, a, p, nodes))
     found = [_parameter(solution, f"E{AXES[a]}{AXES[a]}", slopes[a][a], U_WAVELENGTH) for a in range(3)]
     found += [_parameter(solution, name, sign * (slopes[a][b] + slopes[b][a])) for name, a, b, sign in SQUARENESS]
     return tuple(found)

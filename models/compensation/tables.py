@@ -1,7 +1,7 @@
 """Nine one-axis tables: correction of each axis as a function of each axis, on the controller's grid.
 
-The best nine tables for a deviation field are its main effects: the mean over the other two axes (least squares on a product grid). What
-angles do at a distance that depends on two axes at once is left over; a 3-D grid (another kind of table) would take it.
+The best nine tables for a deviation field are its best sum of functions of one axis (`models.compensation.additive`). What angles do at a
+distance that depends on two axes at once is left over; a 3-D grid (another kind of table) would take it.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.arrays import F1, F2
+from models.compensation.additive import additive_design
 from models.geometry.chain import design
 from models.machine import AXES, Machine
 from models.solvers.joint import JointSolution
@@ -59,14 +60,13 @@ def nine_tables(solution: JointSolution, counts: tuple[int, int, int], *, nodes:
     counts : (int, int, int)
         Grid points of X, Y, Z.
     nodes : int
-        Nodes per axis of the average over the other two axes.
+        Nodes per axis of the volume over which the tables are fitted.
     """
     machine = solution.machine
     grids = grid_positions(machine, counts)
     corrections, uncertainties = [], []
     rotation = frame_rotation(machine, solution, nodes)
-    for a in range(3):
-        effect = main_effect(machine, solution, a, grids[a], nodes)
+    for a, effect in enumerate(additive_design(solution, grids, nodes)):
         relative = effect - effect[0]
         corrections.append(-(relative @ solution.coefficients))
         turned = np.cross(rotation.T, np.eye(3)[a]).T  # slope over axis a that a rotation of the frame gives every output
@@ -81,25 +81,6 @@ def frame_rotation(machine: Machine, solution: JointSolution, nodes: int) -> F2:
     grid = volume_grid(machine.stroke_mm, nodes)
     full = design(machine, solution.terms, grid).reshape(-1, len(solution.terms))
     return np.asarray(np.linalg.lstsq(rigid_design(grid).reshape(-1, 6), full, rcond=None)[0][3:])
-
-
-def main_effect(
-    machine: Machine, solution: JointSolution, axis: int, positions_mm: F1, nodes: int
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Design of the mean deviation over the other two axes, shape (len(positions), 3, terms)."""
-    box = machine.stroke_mm.copy()
-    others = [b for b in range(3) if b != axis]
-    plane = np.stack(np.meshgrid(*[_cell_centres(box[b], nodes) for b in others], indexing="ij"), axis=-1).reshape(-1, 2)
-    points = np.empty((positions_mm.size, plane.shape[0], 3))
-    points[:, :, axis] = positions_mm[:, None]
-    points[:, :, others] = plane[None]
-    full = design(machine, solution.terms, points.reshape(-1, 3))
-    return np.asarray(full.reshape(positions_mm.size, plane.shape[0], 3, -1).mean(axis=1))
-
-
-def _cell_centres(stroke_mm: F1, nodes: int) -> F1:
-    step = (stroke_mm[1] - stroke_mm[0]) / nodes
-    return np.asarray(stroke_mm[0] + step * (np.arange(nodes) + 0.5))
 
 
 def quantise(tables: NineTables, lsb_mm: float) -> NineTables:

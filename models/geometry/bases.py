@@ -9,24 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import legendre
 
-from models.arrays import F1, F2
+from models.arrays import F2
+from models.functions.legendre import legendre_values
+from models.functions.motions import ROTATIONS, motion_names
+from models.machine import AXES as DIRECTIONS
 
-DIRECTIONS = ("X", "Y", "Z")
-ROTATIONS = ("A", "B", "C")
-
-
-def motion_names(axis: str) -> tuple[str, ...]:
-    """ISO 230-1 names of the six error motions of an axis, translations first: EXX EYX EZX EAX EBX ECX for X."""
-    return tuple(f"E{c}{axis}" for c in DIRECTIONS + ROTATIONS)
-
-
-def legendre_values(x_mm: F1, stroke_mm: F1, order: int) -> F2:
-    """Legendre polynomials P0..P_order over the stroke, shape (n, order + 1); the end value is held outside the stroke."""
-    lo, hi = float(stroke_mm[0]), float(stroke_mm[1])
-    u = np.clip(2.0 * (np.asarray(x_mm, dtype=np.float64) - lo) / (hi - lo) - 1.0, -1.0, 1.0)
-    return np.asarray(legendre.legvander(u, order), dtype=np.float64)
+__all__ = ["DIRECTIONS", "ROTATIONS", "Term", "legendre_values", "motion_names", "smooth_terms", "term_values"]
 
 
 @dataclass(frozen=True, slots=True)

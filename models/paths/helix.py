@@ -32,10 +32,22 @@ def helix_points(
 
     Returns
     -------
-    array, shape (n, 3), mm. For ``axis`` 1: O + R (sin f cos t, cos f, sin f sin t).
+    array, shape (n, 3), mm, in the frame of ``centre_mm``. For ``axis`` 1: O + R (sin f cos t, cos f, sin f sin t).
+
+    Raises
+    ------
+    ValueError
+        n < 2, radius not positive, turns not finite, span outside (0, pi/2], unknown law, axis not 0, 1 or 2, or a centre that is not three
+        finite numbers. Fewer than three turns are drawn, though they determine little (math.md 4.5).
     """
-    if n < 2 or radius_mm <= 0 or not 0 < span_rad <= np.pi / 2:
-        raise ValueError("helix: n must be 2 or more, radius positive, span within (0, pi/2]")
+    if n < 2 or not 0 < radius_mm < np.inf or not np.isfinite(turns) or not 0 < span_rad <= np.pi / 2:
+        raise ValueError("helix: n must be 2 or more, radius positive, turns a number, span within (0, pi/2]")
+    if law not in ("angle", "area"):
+        raise ValueError(f"helix: law {law!r} must be 'angle' or 'area'")
+    if axis not in (0, 1, 2):
+        raise ValueError(f"helix: axis {axis} must be 0, 1 or 2")
+    if np.shape(centre_mm) != (3,) or not np.isfinite(centre_mm).all():
+        raise ValueError(f"helix: the centre must be three finite numbers, got {centre_mm!r}")
     k = np.linspace(0.0, 1.0, n)
     phi = span_rad * k if law == "angle" else np.arccos(1.0 - k * (1.0 - np.cos(span_rad)))
     theta = 2 * np.pi * turns * k
@@ -45,3 +57,23 @@ def helix_points(
     out[:, a] = np.sin(phi) * np.cos(theta)
     out[:, b] = np.sin(phi) * np.sin(theta)
     return np.asarray(centre_mm) + radius_mm * out
+
+
+def helix_points_likely_code(centre_mm: F1, radius_mm: float, *, turns: float) -> F2:
+    """The 63 points that the paper's own program probably made: t = 0, 0.1, .. 6.2, colatitude t / 4, longitude ``turns`` t (math.md 4.3).
+
+    ``t = 0:0.1:2*pi`` has exactly the 63 samples of the paper and stops 0.021 rad of colatitude above the equator; it cannot be proved.
+
+    Parameters, result: as `helix_points` with ``axis`` 1, shape (63, 3), mm.
+
+    Raises
+    ------
+    ValueError
+        Radius not positive, or turns not finite.
+    """
+    if not 0 < radius_mm < np.inf or not np.isfinite(turns):
+        raise ValueError("helix: radius must be positive and turns a number")
+    t = 0.1 * np.arange(63)
+    phi, theta = t / 4.0, turns * t
+    unit = np.stack([np.sin(phi) * np.cos(theta), np.cos(phi), np.sin(phi) * np.sin(theta)], axis=1)
+    return np.asarray(np.asarray(centre_mm) + radius_mm * unit)

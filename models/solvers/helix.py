@@ -22,16 +22,45 @@ from models.solvers.priors import Priors, bar_length_sd
 Unknowns = Literal["six", "nine", "ten"]
 LINEAR = ("EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z")
 SETUP = ("offset_x", "offset_y", "offset_z", "bar_length")
+CONDITION_LIMIT = 45.0
+"""Angle law, nine or ten unknowns, 63 to 1000 points: three turns of a full hemisphere have 28 to 32, two turns 58 to 68, one over 1900.
+
+By the area law two turns stay near 30 and no warning comes: only the recipe's demand for three turns stops those."""
 LOST = ("backlash_X", "backlash_Y", "backlash_Z")
 
 
 @dataclass(frozen=True)
 class HelixSolution:
-    """Estimate, what it was seen from, and the rank of the data alone."""
+    """Estimate, what it was seen from, and the rank of the data alone.
+
+    Attributes
+    ----------
+    estimate : Estimate
+        Six parameters (mm/mm, rad; ISO signs, workpiece coordinates), set-up (mm), and with `fit_run` lost motion (mm).
+    identifiability : Identifiability
+        Of the readings without any prior, columns of unit length.
+    unknowns : "six" | "nine" | "ten"
+        What was fitted beside the machine.
+    """
 
     estimate: Estimate
     identifiability: Identifiability
     unknowns: Unknowns
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest singular value that counts; inf where the readings show nothing."""
+        return self.identifiability.condition
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One line if the condition exceeds `CONDITION_LIMIT`: small noise then makes large parameters (math.md 4.5, "require N >= 3")."""
+        if self.condition <= CONDITION_LIMIT:
+            return ()
+        return (
+            f"the fit is badly conditioned: {self.condition:.0f}, the limit is {CONDITION_LIMIT:.0f}. Set-up, scales and squareness can "
+            "hardly be told apart: the path has fewer than 3 turns or too small a part of the hemisphere (math.md 4.5)",
+        )
 
 
 def linear_field(points_mm: F2) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
@@ -87,9 +116,19 @@ def fit_helix(
     Raises
     ------
     ValueError
-        Fewer readings than unknowns, or shapes disagree.
+        Fewer readings than unknowns, shapes disagree, or ``unknowns`` is none of the three.
+
+    Returns
+    -------
+    HelixSolution
+        Its ``warnings`` name a badly conditioned fit, e.g. of fewer than three turns.
     """
-    count = {"six": 6, "nine": 9, "ten": 10}[unknowns]
+    counts = {"six": 6, "nine": 9, "ten": 10}
+    if unknowns not in counts:
+        raise ValueError(f"helix: unknowns {unknowns!r} must be 'six', 'nine' or 'ten'")
+    if np.ndim(points_mm) != 2 or np.shape(points_mm) != (np.size(deviation_mm), 3) or np.ndim(deviation_mm) != 1:
+        raise ValueError(f"helix: points of shape {np.shape(points_mm)} do not fit readings of shape {np.shape(deviation_mm)}")
+    count = counts[unknowns]
     names = (LINEAR + SETUP)[:count]
     prior = np.array([np.inf] * 9 + [u_length_mm])[:count]
     task = _Task(names, points_mm - centre_mm, radius_mm, helix_design(points_mm, centre_mm, unknowns), prior)

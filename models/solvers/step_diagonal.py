@@ -6,6 +6,7 @@ as perfectly square to the beams; `models.solvers.joint` treats the tilts as unk
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,17 +17,54 @@ from models.paths.lines import DIAGONALS
 ORDER = ("ppp", "npp", "pnp", "ppn")
 
 
-def increments(readings_mm: dict[str, F1], order: str = "XYZ") -> dict[str, F2]:
-    """Normalised step readings q_s(a, j) of math.md 5.1, per diagonal, shape (3 axes, n intervals).
+def checked_increments(inc_mm: F1, what: str = "increments") -> F1:
+    """The three increments (or travels), mm, as floats.
 
-    ``readings_mm``: outward readings of each diagonal (deviation since the first record), shape (3 n + 1,), stepping in ``order``.
-    q = sign of the axis x reading step, intervals counted from the axis' small end (reversed where the diagonal runs it down).
+    Raises
+    ------
+    ValueError
+        They are not three finite numbers above zero.
     """
+    inc = np.asarray(inc_mm, dtype=np.float64)
+    if inc.shape != (3,) or not np.isfinite(inc).all() or not (inc > 0).all():
+        raise ValueError(f"step diagonal: {what} X, Y, Z must be three positive numbers, got {inc_mm!r}")
+    return inc
+
+
+def increments(readings_mm: dict[str, F1], order: str = "XYZ") -> dict[str, F2]:
+    """Normalised step readings q_s(a, j): sign of the axis times reading step, intervals counted from the axis' small end (math.md 5.1).
+
+    The paper omits this normalisation: where a diagonal runs an axis down, sign and sequence of its intervals are reversed.
+
+    Parameters
+    ----------
+    readings_mm : dict of arrays (3 n + 1,)
+        Outward readings of each diagonal, mm: displayed minus nominal displacement since the first record, positive = farther.
+    order : str
+        Step order, X, Y and Z once each.
+
+    Returns
+    -------
+    dict of arrays (3 axes, n)
+        Under the same names, mm.
+
+    Raises
+    ------
+    ValueError
+        Unknown ``order``, no diagonal, a diagonal other than ppp, npp, pnp, ppn, or records that are not 3 n + 1 with n of 1 or more.
+    """
+    if sorted(order) != ["X", "Y", "Z"]:
+        raise ValueError(f"step diagonal: order {order!r} must name X, Y and Z once each")
+    if not readings_mm:
+        raise ValueError("step diagonal: no diagonal was given")
     out = {}
     for name, values in readings_mm.items():
-        step = np.diff(np.asarray(values, dtype=np.float64))
-        if step.size % 3:
-            raise ValueError(f"step diagonal {name}: {step.size + 1} records are not 3 n + 1")
+        if name not in DIAGONALS:
+            raise ValueError(f"step diagonal {name!r}: must be one of {', '.join(DIAGONALS)}")
+        records = np.asarray(values, dtype=np.float64)
+        if records.ndim != 1 or records.size < 4 or records.size % 3 != 1:
+            raise ValueError(f"step diagonal {name}: records of shape {records.shape} are not (3 n + 1,) with n of 1 or more")
+        step = np.diff(records)
         q = np.empty((3, step.size // 3))
         for k, letter in enumerate(order):
             a = "XYZ".index(letter)
@@ -37,8 +75,51 @@ def increments(readings_mm: dict[str, F1], order: str = "XYZ") -> dict[str, F2]:
     return out
 
 
+def project_eq6(e_mm: F3, inc_mm: F1) -> dict[str, F2]:
+    """What the four diagonals read of given displacement errors, eq (4) to (6), normalised like `increments`: shape (3 axes, n) each, mm.
+
+    Parameters
+    ----------
+    e_mm : array, shape (3, 3, n)
+        E[i, a, j]: displacement error in direction i of interval j of axis a.
+    inc_mm : array, shape (3,)
+        Increments X, Y, Z.
+
+    Raises
+    ------
+    ValueError
+        Increments not positive.
+    """
+    inc_mm = checked_increments(inc_mm)
+    n = inc_mm / np.linalg.norm(inc_mm)
+    return {name: np.einsum("i,iaj->aj", np.array(DIAGONALS[name]) * n, e_mm) for name in ORDER}
+
+
 def wang_eq7(q: dict[str, F2], inc_mm: F1) -> F3:
-    """Displacement errors by the printed formula (7), shape (3, 3, n + 1), mm: E[i, a, k] in direction i after k steps of axis a."""
+    """Displacement errors by the printed formulas (7) and (8), three of four diagonals (Wang; math.md 5.1).
+
+    The coefficients of (4) to (8) are lost in the print and rebuilt in math.md 5.1. Angular errors and mirror tilt enter as false errors
+    (`models.wang.angular`, `models.wang.mirror.tilt_bias_eq7`).
+
+    Parameters
+    ----------
+    q : dict of arrays (3 axes, n)
+        Normalised step readings of ppp, npp, pnp, ppn by `increments`, mm.
+    inc_mm : array, shape (3,)
+        Increments X, Y, Z, mm, positive.
+
+    Returns
+    -------
+    array, shape (3, 3, n + 1), mm
+        E[i, a, k]: error in direction i after k steps of axis a, from the axis' small end; actual minus nominal, machine coordinates.
+
+    Raises
+    ------
+    ValueError
+        Increments not positive, a diagonal missing, or their shapes differ.
+    """
+    inc_mm = checked_increments(inc_mm)
+    _all_four(q)
     r = float(np.linalg.norm(inc_mm))
     p = q["ppp"]
     raw = np.stack([(p - q[ORDER[i + 1]]) * r / (2 * inc_mm[i]) for i in range(3)])
@@ -46,7 +127,12 @@ def wang_eq7(q: dict[str, F2], inc_mm: F1) -> F3:
 
 
 def wang_four(q: dict[str, F2], inc_mm: F1) -> F3:
-    """The same by least squares over all four diagonals (variance halved), shape (3, 3, n + 1), mm."""
+    """The same by least squares over all four diagonals: half the variance of (7) (math.md 5.1, not in the paper).
+
+    Parameters, result (shape (3, 3, n + 1), mm), errors: as `wang_eq7`. Uncertainty from noise: `u_wang_four`.
+    """
+    inc_mm = checked_increments(inc_mm)
+    _all_four(q)
     r = float(np.linalg.norm(inc_mm))
     signs = np.array([DIAGONALS[s] for s in ORDER], dtype=np.float64)
     raw = np.stack([sum(signs[k, i] * q[s] for k, s in enumerate(ORDER)) * r / (4 * inc_mm[i]) for i in range(3)])
@@ -59,7 +145,13 @@ def u_wang_four(inc_mm: F1, n: int, u_reading_mm: float, u_scale: float = 0.0) -
     One interval: R / (2 X) sigma_q with sigma_q = sqrt(2) sigma of a reading (math.md 5.1); the intervals of an axis share no reading, so
     k of them cumulate to sqrt(k). ``u_scale``, the relative uncertainty of the laser's wavelength, lengthens only E[a, a]. Mirror tilts
     (5.4), angular errors (5.2) and drift are biases of the method and NOT in it.
+
+    Raises
+    ------
+    ValueError
+        Increments not positive.
     """
+    inc_mm = checked_increments(inc_mm)
     r = float(np.linalg.norm(inc_mm))
     steps = np.arange(n + 1)
     out = np.empty((3, 3, n + 1))
@@ -70,14 +162,51 @@ def u_wang_four(inc_mm: F1, n: int, u_reading_mm: float, u_scale: float = 0.0) -
     return out
 
 
+def demeaned(q: dict[str, F2]) -> dict[str, F2]:
+    """Step readings with the mean of every series (axis and diagonal) taken out: the paper's remedy for mirror tilt (IV.C; math.md 5.4).
+
+    It removes the tilt and with it all twelve slopes: what `wang_eq7` then returns has no scale and no squareness left, which the paper
+    does not say. ``q`` and the result: dict of arrays (3 axes, n), mm, normalised by `increments`.
+    """
+    return {name: np.asarray(values - values.mean(axis=1, keepdims=True)) for name, values in q.items()}
+
+
 def closure_mm(q: dict[str, F2]) -> F2:
-    """ppp - npp - pnp - ppn per axis and interval, shape (3, n): zero for pure translations, visible for mirror tilt (math.md 5.1, 5.4)."""
-    return q["ppp"] - q["npp"] - q["pnp"] - q["ppn"]
+    """ppp - npp - pnp - ppn per axis and interval: what the redundant fourth diagonal tells (math.md 5.1, 5.2, 5.4; not in the paper).
+
+    Zero for pure translations, visible for mirror tilt; angular errors show with one step's size only.
+
+    Parameters
+    ----------
+    q : dict of arrays (3 axes, n)
+        Normalised step readings by `increments`, mm.
+
+    Returns
+    -------
+    array, shape (3 axes, n), mm, signed as written.
+
+    Raises
+    ------
+    ValueError
+        A diagonal is missing, or their shapes differ.
+    """
+    _all_four(q)
+    return np.asarray(q["ppp"] - q["npp"] - q["pnp"] - q["ppn"])
+
+
+def _all_four(values: Mapping[str, F2 | float]) -> None:
+    if missing := [name for name in ORDER if name not in values]:
+        raise ValueError(f"step diagonal: {', '.join(missing)} missing, all four diagonals are needed")
+    if len(shapes := {np.shape(values[name]) for name in ORDER}) > 1:
+        raise ValueError(f"step diagonal: the four diagonals have unlike shapes {sorted(shapes)}")
 
 
 @dataclass(frozen=True, slots=True)
 class SquarenessContrast:
-    """Obtuse-positive squareness from the diagonals' end values, free of the scale errors (math.md 5.3), rad, with uncertainties."""
+    """Obtuse-positive squareness from the diagonals' end values, free of scale errors, not of angular ones (math.md 5.3), rad.
+
+    ``u_xy``, ``u_xz``, ``u_yz``: standard uncertainties from the noise of the readings alone, rad.
+    """
 
     theta_xy: float
     theta_xz: float
@@ -88,10 +217,35 @@ class SquarenessContrast:
 
 
 def squareness_contrast(totals_mm: dict[str, float], length_mm: F1, u_total_mm: float = 0.0) -> SquarenessContrast:
-    """Bias-free minimum-variance contrasts instead of the printed (13), whose values carry the scale errors.
+    """Minimum-variance contrasts of the diagonals' ends instead of the printed (13), whose values carry the scale errors (math.md 5.3).
 
-    ``totals_mm``: deviation at the end of each diagonal; ``length_mm``: travels X, Y, Z; ``u_total_mm``: their standard uncertainty.
+    Free of the SCALE errors only. Angular errors are read as squareness: a yaw of X that grows by 50 µrad over its travel moves theta_xy by
+    half of it, 25 µrad. The uncertainties hold the readings' noise alone and do not grow with any of that. Erratum: (13) is valid without
+    scale errors only.
+
+    Parameters
+    ----------
+    totals_mm : dict of float
+        Deviation at the end of ppp, npp, pnp, ppn, mm, displayed minus nominal.
+    length_mm : array, shape (3,)
+        Total travels X, Y, Z (not the increments), mm.
+    u_total_mm : float
+        Standard uncertainty of one total.
+
+    Returns
+    -------
+    SquarenessContrast
+        Obtuse positive as (9) and (11); (12) and (13) are acute positive, i.e. the negative.
+
+    Raises
+    ------
+    ValueError
+        A diagonal is missing, travels are not three positive numbers, or the uncertainty is negative.
     """
+    length_mm = checked_increments(length_mm, "travels")
+    _all_four(totals_mm)
+    if not u_total_mm >= 0:
+        raise ValueError(f"squareness: the uncertainty of a total must be 0 or more, got {u_total_mm}")
     r = float(np.linalg.norm(length_mm))
     p, n, q, s = (totals_mm[k] for k in ORDER)
     x, y, z = (float(v) for v in length_mm)

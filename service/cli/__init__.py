@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
+import os
 import sys
 from collections.abc import Sequence
 
 BAD_INPUT = 2
+UNWRITTEN = frozenset((errno.EPIPE, errno.EBADF, errno.ENOSPC, errno.EFBIG, errno.EDQUOT))
+"""What writing to stdout can end in: reader gone, closed, disk full, and so on."""
 INTERRUPTED = 130
 
 
@@ -43,8 +49,14 @@ def run(arguments: Sequence[str] | None = None) -> int:
     from service.cli.app import app
     from service.errors import AbbeError
 
+    if sys.stdout is None:
+        sys.stdout = _Closed()
     try:
-        return int(app(args=arguments, prog_name="abbe", standalone_mode=False) or 0)
+        code = int(app(args=arguments, prog_name="abbe", standalone_mode=False) or 0)
+        sys.stdout.flush()
+        return code
+    except OSError as err:
+        return _unwritten(err)
     except (AbbeError, DriverError) as err:
         return complain(err.code, str(err))
     except typer.Abort:
@@ -55,6 +67,27 @@ def run(arguments: Sequence[str] | None = None) -> int:
             sys.stderr.write(text.rstrip() + "\n")
             return BAD_INPUT
         return complain("USE-001", f"{text} - `abbe --help` lists commands, `abbe COMMAND --help` their options")
+
+
+class _Closed(io.TextIOBase):
+    """Stands in for a stdout that was closed before the program began (``>&-``): who writes to it learns that."""
+
+    def write(self, text: str, /) -> int:
+        """Refuse."""
+        raise OSError(errno.EBADF, "it is closed")
+
+
+def _unwritten(err: OSError) -> int:
+    """Exit code for output that cannot be written; every other error of the system is raised again."""
+    if err.filename is not None or err.errno not in UNWRITTEN:
+        raise err
+    with contextlib.suppress(OSError, ValueError):  # the rest of the buffer must not fail once more when the program ends
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+    if err.errno == errno.EPIPE:
+        return 1  # whoever read this has seen enough, as typer has it
+    return complain("USE-002", f"the output cannot be written: {err.strerror} - give stdout a place to go")
 
 
 def complain(code: str, text: str) -> int:
@@ -74,5 +107,6 @@ def complain(code: str, text: str) -> int:
     """
     from service.secrets import mask_secrets
 
-    sys.stderr.write(f"error {code}: {mask_secrets(' '.join(text.split()))}\n")
+    if sys.stderr is not None:  # closed: only the exit code is left
+        sys.stderr.write(f"error {code}: {mask_secrets(' '.join(text.split()))}\n")
     return BAD_INPUT

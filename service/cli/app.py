@@ -6,13 +6,16 @@ import typer
 
 from service.cli.configuration import check_config, schema
 from service.cli.demo import demo
+from service.cli.errors import errors
 from service.cli.exchange import export_campaign, import_campaign
 from service.cli.measure import correct, measure
+from service.cli.papers import papers
 from service.cli.serve import serve
 from service.cli.show import runs, show
 from service.cli.solve import solve
 from service.cli.system import SIM_SETTINGS, sim, version
 from service.cli.table import accept_table
+from service.cli.vectors import vectors
 
 app = typer.Typer(
     name="abbe",
@@ -26,6 +29,7 @@ app = typer.Typer(
 app.command("demo")(demo)
 app.command("measure")(measure)
 app.command("solve")(solve)
+app.command("errors")(errors)
 app.command("correct")(correct)
 app.command("serve")(serve)
 app.command("accept-table")(accept_table)
@@ -34,6 +38,8 @@ app.command("runs")(runs)
 app.command("show")(show)
 app.command("export")(export_campaign)
 app.command("import")(import_campaign)
+app.command("vectors")(vectors)
+app.command("papers")(papers)
 app.command("schema")(schema)
 app.command("sim", context_settings=SIM_SETTINGS, add_help_option=False)(sim)
 app.command("version")(version)

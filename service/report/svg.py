@@ -58,6 +58,12 @@ class Svg:
             else:
                 self.dot(part[0], 1.2, style.replace("s-", "f-"))
 
+    def polygon(self, points: Iterable[XY], style: str) -> None:
+        """Filled shape; left out when one of its corners is not finite."""
+        corners = list(points)
+        if corners and _finite(*corners):
+            self._body.append(f'<polygon points="{_points(corners)}" class="{_attr(style)}"/>')
+
     def rect(self, corner: XY, size: XY, style: str, tip: str = "") -> None:
         """Rectangle; ``tip`` is shown when the pointer rests on it."""
         if _finite(corner, size):

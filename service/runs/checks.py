@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from service.errors import FileFormatError
 from service.explain import expected, shown, where
 from service.runs.formats import Columns, RunFile, Setup
+from service.runs.json_text import strict_json
 from service.storage.records import Doc
 
 _OF_MOTION = ("mm", "um", "nm", "m", "rad", "urad", "mrad", "deg", "s", "ms", "us", "h", "mm_min", "mm_s", "rpm", "Hz", "kHz")
@@ -37,22 +38,18 @@ def read_json(path: Path) -> Doc:
     Raises
     ------
     FileFormatError
-        If it is missing, no UTF-8, no JSON, or holds NaN.
+        If it is missing, no UTF-8, or no JSON, as `service.runs.json_text.strict_json` reads it.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
             raise FileFormatError(f"{path}: larger than {MAX_BYTES >> 20} MiB", "expected a run or campaign file")
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = strict_json(path.read_text(encoding="utf-8"), path, finite=False)  # `check` says where a NaN stands
     except FileNotFoundError:
         raise FileFormatError(f"{path}: no such file", "give a folder with campaign.json and its run files") from None
     except OSError as err:
         raise FileFormatError(f"{path}: cannot be read: {err.strerror}", "check its access rights") from None
     except UnicodeDecodeError as err:
         raise FileFormatError(f"{path}: byte {err.start} is not UTF-8", "save the file as UTF-8") from None
-    except json.JSONDecodeError as err:
-        raise FileFormatError(f"{path}: line {err.lineno}, column {err.colno}: not JSON: {err.msg}", "correct the file") from None
-    except RecursionError:
-        raise FileFormatError(f"{path}: nested too deeply", "expected a run or campaign file") from None
     if not isinstance(value, dict):
         raise FileFormatError(f"{path}: expected a JSON object, got {shown(value)}", "see docs/schemas")
     return value

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from service.runs.machine_object import FileObject, MachineObject, Point
+from service.runs.machine_object import FileObject, Interval, MachineObject, Point
 
 RUN_FORMAT = "abbe-run/1"
 CAMPAIGN_FORMAT = "abbe-campaign/1"
@@ -153,18 +153,47 @@ class Polynomial(FileObject):
 
 
 class Tabulated(FileObject):
-    """Values at positions."""
+    """Values at positions; straight lines or one cubic spline (not-a-knot) in between, the end value outside."""
 
     kind: Literal["table"]
     position_mm: Numbers
     value: Numbers
-    interpolation: Literal["linear"]
+    interpolation: Literal["linear", "cubic"]
 
     @model_validator(mode="after")
     def _equally_long(self) -> Self:
         if len(self.position_mm) != len(self.value):
             raise ValueError(f"expected as many values as positions, got {len(self.value)} and {len(self.position_mm)}")
         return self
+
+
+class LegendreSeries(FileObject):
+    """value(x) = sum c_k P_k(u), u from -1 to 1 over the stroke, mm or rad; the end value outside. An addition of Abbe's to the format."""
+
+    kind: Literal["legendre"]
+    coefficients: Annotated[Numbers, Field(min_length=1)]
+    stroke_mm: Interval
+
+
+class Spline(FileObject):
+    """B-spline, mm or rad; the end value outside knots[degree] .. knots[number of coefficients]. An addition of Abbe's to the format."""
+
+    kind: Literal["bspline"]
+    knots_mm: Numbers
+    coefficients: Annotated[Numbers, Field(min_length=2)]
+    degree: Annotated[int, Field(ge=1, le=9)]
+
+    @model_validator(mode="after")
+    def _knots_fit(self) -> Self:
+        wanted = len(self.coefficients) + self.degree + 1
+        if len(self.knots_mm) != wanted:
+            raise ValueError(
+                f"expected {wanted} knots for {len(self.coefficients)} coefficients of degree {self.degree}, got {len(self.knots_mm)}"
+            )
+        return self
+
+
+ErrorFunction = Annotated[Polynomial | Tabulated | LegendreSeries | Spline, Field(discriminator="kind")]
 
 
 class Squareness(FileObject):
@@ -180,8 +209,6 @@ class ErrorsFile(FileObject):
 
     format: Literal["abbe-errors/1"]
     squareness_rad: Squareness
-    motions: dict[
-        Annotated[str, Field(pattern="^E[XYZABC][XYZ](@reverse)?$")], Annotated[Polynomial | Tabulated, Field(discriminator="kind")]
-    ]
+    motions: dict[Annotated[str, Field(pattern="^E[XYZABC][XYZ](@reverse)?$")], ErrorFunction]
     covariance: FileObject | None = None
     not_observable: list[FileObject] = Field(default_factory=list)

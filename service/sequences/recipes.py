@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from models.machine import Machine
 from models.paths.helix import Law, helix_points
 from models.paths.lines import diagonal_ends, step_diagonal, straight_line
+from service.errors import ConfigError
 from service.sequences.steps import (
     MAX_PATH_POINTS,
     MountBar,
@@ -34,6 +35,8 @@ RAPID_MM_MIN = 6000.0
 APPROACH_MM = 1.0
 BAR_APPROACH_MM = 0.5
 """With the bar hung in: far more than any lost motion, and the bar stays within its stroke of 1 mm either way."""
+MIN_TURNS = 3.0
+"""Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition 28 at 3 turns, 58 at 2, 1900 at 1; math.md 4.5)."""
 CLEARANCE_MM = 10.0
 """Laser lines keep this distance from the ends of the strokes, so that the approach stays inside them."""
 
@@ -70,7 +73,18 @@ class Helix:
     unmount: bool = True
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: to the centre, mount, out to the path's start, record the path, clear away."""
+        """Steps: to the centre, mount, out to the path's start, record the path, clear away.
+
+        Raises
+        ------
+        ConfigError
+            Fewer than three turns: their solution would be no measurement.
+        """
+        if not MIN_TURNS <= self.turns < np.inf:
+            raise ConfigError(
+                f"test {self.label}: {self.turns:g} turns do not tell cup offset from squareness, a helix needs {MIN_TURNS:g} or more",
+                "set turns to 3 or more; 5 are usual",
+            )
         length = 2 * np.pi * self.radius_mm * self.turns
         n = min(max(64, int(length / self.chord_mm)), MAX_PATH_POINTS)
         points = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=n, law=self.law, axis=self.axis)

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("service", "drivers", "models", "simulators")
-LOCKS = ("requirements.lock", "requirements-dev.lock")
+LOCKS = ("requirements.lock", "requirements-dev.lock", "requirements-bench.lock")
 SOURCES = sorted(p for package in PACKAGES for p in (ROOT / package).rglob("*.py"))
 
 # In two parts, so that this file does not itself hold what it forbids.
@@ -66,8 +66,9 @@ def test_lock_file_pins_by_hash_and_names_no_address(name: str) -> None:
 
 
 def test_the_developers_lock_holds_the_users_lock() -> None:
-    user, developer = (set(re.findall(r"^\S+==\S+", (ROOT / name).read_text(), re.MULTILINE)) for name in LOCKS)
+    user, developer, bench = (set(re.findall(r"^\S+==\S+", (ROOT / name).read_text(), re.MULTILINE)) for name in LOCKS)
     assert user <= developer
+    assert user <= bench
 
 
 def test_the_repository_names_no_machine_and_no_registry() -> None:

@@ -1,12 +1,11 @@
 """The machine's volume in isometric view, with an arrow for the error at every node.
 
-The view is from the front right, from above: X runs to the lower right, Y to the upper right, Z up. Before and after are drawn
-with one exaggeration and one colour scale: a picture in which each side is scaled to fill its box would hide the improvement.
+Before and after are drawn with one exaggeration and one colour scale: a picture in which each side is scaled to fill its box would hide
+the improvement.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -17,17 +16,14 @@ from service.report.axes import nice_step, round_up
 from service.report.model import ArrowField
 from service.report.numbers import plain, tidy
 from service.report.palette import SEQUENCE
-from service.report.svg import XY, Svg
+from service.report.plots.isometric import Paper, Window, depth, draw_box, label_edges, round_down
+from service.report.svg import Svg
 
 F2 = NDArray[np.float64]
 
 WIDTH, HEIGHT = 500.0, 450.0
 MAX_ARROWS = 420
 """More arrows than this are a thicket; nodes are then thinned out evenly (the figures still use all of them)."""
-
-# Rows: right and up on the paper, and towards the viewer, for a right-handed frame seen from (+1, -1, +1).
-_ROOT2, _ROOT6, _ROOT3 = math.sqrt(2.0), math.sqrt(6.0), math.sqrt(3.0)
-_VIEW: F2 = np.array([[1 / _ROOT2, 1 / _ROOT2, 0.0], [-1 / _ROOT6, 1 / _ROOT6, 2 / _ROOT6], [1 / _ROOT3, -1 / _ROOT3, 1 / _ROOT3]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +42,7 @@ def common_scale(*fields: ArrowField) -> ArrowScale:
     if longest <= 0.0 or diagonal <= 0.0:
         return ArrowScale(1.0, 1.0)
     step = round_up(longest / SEQUENCE)
-    return ArrowScale(_round_down(0.16 * diagonal / (longest * 1e-3)), SEQUENCE * step)
+    return ArrowScale(round_down(0.16 * diagonal / (longest * 1e-3)), SEQUENCE * step)
 
 
 def volume_arrows(field: ArrowField, scale: ArrowScale, *, key: str, heading: str) -> str:
@@ -76,10 +72,12 @@ def volume_arrows(field: ArrowField, scale: ArrowScale, *, key: str, heading: st
     finite_grid = field.grid_mm[np.isfinite(field.grid_mm).all(axis=1)] if field.grid_mm.size else field.grid_mm
     if finite_grid.size:
         low, high = finite_grid.min(axis=0), finite_grid.max(axis=0)
-        paper = _Paper.around(low, high)
-        _draw_box(svg, paper, low, high)
+        # Arrows at the faces leave the box: the margin leaves them room.
+        window = Window((WIDTH / 2.0, 58.0 + (HEIGHT - 110.0) / 2.0), WIDTH - 120.0, HEIGHT - 178.0)
+        paper = Paper.around(low, high, window)
+        draw_box(svg, paper, low, high)
         _draw_arrows(svg, paper, field, scale)
-        _label_edges(svg, paper, low, high)
+        label_edges(svg, paper, low, high)
         _draw_key(svg, paper, scale)
     return svg.render()
 
@@ -91,59 +89,9 @@ def volume_pair(before: ArrowField | None, after: ArrowField | None, *, key: str
     return [volume_arrows(f, scale, key=f"{key}-{name}", heading=f"{name.capitalize()} correction") for f, name in sides if f is not None]
 
 
-@dataclass(frozen=True, slots=True)
-class _Paper:
-    """Where a point of space comes to lie: pixels per mm, and the pixel of the volume's centre."""
-
-    zoom: float
-    centre: F2
-    at: XY
-
-    @classmethod
-    def around(cls, low: F2, high: F2) -> _Paper:
-        corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
-        flat = (corners - (low + high) / 2.0) @ _VIEW[:2].T
-        span = np.maximum(np.ptp(flat, axis=0), 1e-9)
-        # Arrows at the faces leave the box: the margin leaves them room.
-        zoom = min((WIDTH - 120.0) / span[0], (HEIGHT - 178.0) / span[1])
-        return cls(float(zoom), (low + high) / 2.0, (WIDTH / 2.0, 58.0 + (HEIGHT - 110.0) / 2.0))
-
-    def __call__(self, point: F2) -> XY:
-        right, up = self.zoom * (_VIEW[:2] @ (point - self.centre))
-        return self.at[0] + float(right), self.at[1] - float(up)
-
-
-def _draw_box(svg: Svg, paper: _Paper, low: F2, high: F2) -> None:
-    hidden = np.array([low[0], high[1], low[2]])  # the corner farthest from the viewer: its three edges lie behind the volume
-    for axis in range(3):
-        others = [a for a in range(3) if a != axis]
-        for choice in itertools.product((0, 1), repeat=2):
-            start, end = low.copy(), high.copy()
-            for a, c in zip(others, choice, strict=True):
-                start[a] = end[a] = (low, high)[c][a]
-            behind = np.allclose(start, hidden) or np.allclose(end, hidden)
-            svg.line(paper(start), paper(end), "hidden-edge" if behind else "frame")
-
-
-def _label_edges(svg: Svg, paper: _Paper, low: F2, high: F2) -> None:
-    middle = (low + high) / 2.0
-    spots = (
-        (np.array([middle[0], low[1], low[2]]), (-14.0, 26.0), "end"),
-        (np.array([high[0], middle[1], low[2]]), (14.0, 26.0), "start"),
-        (np.array([low[0], low[1], middle[2]]), (-8.0, 4.0), "end"),
-    )
-    for axis, (point, shift, anchor) in enumerate(spots):
-        x, y = paper(point)
-        words = f"{'XYZ'[axis]} {tidy(float(low[axis]))} … {tidy(float(high[axis]))}"
-        if axis == 2:
-            svg.text((x - 22.0, y), f"{words} mm", "t-soft t-halo", anchor="middle", turn=-90.0)
-        else:
-            svg.text((x + shift[0], y + shift[1]), f"{words} mm", "t-soft t-halo", anchor=anchor)
-
-
-def _draw_arrows(svg: Svg, paper: _Paper, field: ArrowField, scale: ArrowScale) -> None:
+def _draw_arrows(svg: Svg, paper: Paper, field: ArrowField, scale: ArrowScale) -> None:
     lengths = _lengths(field)
-    order = np.argsort(field.grid_mm @ _VIEW[2], kind="stable")  # far ones first, near ones over them
+    order = np.argsort(depth(field.grid_mm), kind="stable")  # far ones first, near ones over them
     for i in order[:: max(1, math.ceil(order.size / MAX_ARROWS))]:
         if not (np.isfinite(lengths[i]) and np.isfinite(field.grid_mm[i]).all()):
             continue
@@ -155,7 +103,7 @@ def _draw_arrows(svg: Svg, paper: _Paper, field: ArrowField, scale: ArrowScale) 
         svg.arrow(paper(node), paper(node + error * 1e-3 * scale.exaggeration), f"seq{colour}", tip)
 
 
-def _draw_key(svg: Svg, paper: _Paper, scale: ArrowScale) -> None:
+def _draw_key(svg: Svg, paper: Paper, scale: ArrowScale) -> None:
     step = scale.top_um / SEQUENCE
     x, y, cell = 24.0, HEIGHT - 34.0, 46.0
     for i in range(SEQUENCE):
@@ -179,8 +127,3 @@ def _lengths(field: ArrowField) -> NDArray[np.float64]:
 def _diagonal(grid: F2) -> float:
     finite_grid = grid[np.isfinite(grid).all(axis=1)] if grid.size else grid
     return float(np.linalg.norm(np.ptp(finite_grid, axis=0))) if finite_grid.size else 0.0
-
-
-def _round_down(value: float) -> float:
-    power = 10.0 ** math.floor(math.log10(value))
-    return max(m for m in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0) if m * power <= value * (1.0 + 1e-9)) * power

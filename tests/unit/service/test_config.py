@@ -165,3 +165,11 @@ def test_file_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "latin.toml").write_bytes(b'name = "M\xfcller"')
     with pytest.raises(ConfigError, match="is not UTF-8"):
         load_machine(tmp_path / "latin.toml")
+
+
+@pytest.mark.parametrize(("text", "says"), [("a = " + "[" * 5000, "nested too deeply"), ("a = " + "1" * 6000, "thousands of digits")])
+def test_toml_that_no_parser_takes_is_one_line(tmp_path, text, says):
+    path = tmp_path / "machine.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=says):
+        load_machine(path)

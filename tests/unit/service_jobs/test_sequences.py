@@ -123,7 +123,7 @@ def test_a_feed_over_the_limit_is_refused():
 
 
 def test_dry_run_times_a_path_and_counts_its_readings():
-    plan = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=1, feed_mm_min=1500.0, rate_hz=50, mount=False).plan(MACHINE)
+    plan = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=3, feed_mm_min=1500.0, rate_hz=50, mount=False).plan(MACHINE)
     run = dry_run(MACHINE, plan)
     path = list(positions(plan.steps))  # the approach included
     length = sum(math.dist(a, b) for a, b in pairwise(path))

@@ -1,0 +1,53 @@
+"""Least-squares straight lines through measured errors: Pahk's m[.] (math.md 2.1), Yang's Table 3 (math.md 8)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F1
+
+
+def straight_line(x: F1, y: F1) -> tuple[float, float]:
+    """Ordinary least-squares line through points.
+
+    Parameters
+    ----------
+    x, y : arrays, shape (n,)
+        Positions and values, any units.
+
+    Returns
+    -------
+    tuple of float
+        Slope (unit of y per unit of x) and value at x = 0.
+
+    Raises
+    ------
+    ValueError
+        Shapes differ, or fewer than two different positions.
+    """
+    a, b = _pair(x, y)
+    centred = a - a.mean()
+    power = float(centred @ centred)
+    if power == 0.0:
+        raise ValueError("straight line: it takes at least two different positions")
+    slope = float(centred @ b) / power
+    return slope, float(b.mean() - slope * a.mean())
+
+
+def slope_through_origin(x: F1, y: F1) -> float:
+    """Least-squares slope of the line through (0, 0): what Yang and Kim's Table 2 holds for the laser (math.md 8).
+
+    Shapes, units and errors as in `straight_line`; one position other than zero is enough.
+    """
+    a, b = _pair(x, y)
+    power = float(a @ a)
+    if power == 0.0:
+        raise ValueError("slope through the origin: it takes at least one position other than zero")
+    return float(a @ b) / power
+
+
+def _pair(x: F1, y: F1) -> tuple[F1, F1]:
+    a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if a.ndim != 1 or a.shape != b.shape or a.size == 0:
+        raise ValueError(f"straight line: positions {a.shape} and values {b.shape} do not fit together")
+    return a, b

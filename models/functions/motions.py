@@ -1,0 +1,216 @@
+"""A machine's 21 error motions: six functions for each axis, three squarenesses, and what differs after a reversal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from models.arrays import F1, F2, F3
+from models.functions.axis_function import AxisFunction, axes_positions
+from models.functions.rules import as_straightness
+from models.machine import AXES
+
+ROTATIONS = ("A", "B", "C")
+REVERSE = "@reverse"
+SQUARENESS: Mapping[str, tuple[int, int, float]] = MappingProxyType({"C0Y": (1, 0, -1.0), "B0Z": (2, 0, 1.0), "A0Z": (2, 1, -1.0)})
+"""Axis, component and sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/conventions.md)."""
+
+_SLOPES = {"EXY": ("C0Y", -1.0), "EXZ": ("B0Z", 1.0), "EYZ": ("A0Z", -1.0), "EYX": ("C0Y", -1.0), "EZX": ("B0Z", 1.0), "EZY": ("A0Z", -1.0)}
+"""What the slope of a straightness adds to which squareness (angle of +a and +b less 90 degrees, math.md 1)."""
+
+_TURNS = {"EYX": (2, 1.0), "EZX": (1, -1.0), "EZY": (0, 1.0)}
+"""The frame turns about this axis when the slope of the datum's own straightness goes into squareness."""
+
+
+def motion_names(axis: str) -> tuple[str, ...]:
+    """ISO 230-1 names of the six error motions of an axis, translations first: EXX EYX EZX EAX EBX ECX for X."""
+    return tuple(f"E{c}{axis}" for c in AXES + ROTATIONS)
+
+
+PLACES: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {name: (a, c) for a, x in enumerate(AXES) for c, name in enumerate(motion_names(x))}
+)
+"""Axis index and component 0..5 of each of the 18 motions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Straightened:
+    """The same errors with straight axes: deviation before = deviation after + offset_mm + rotation_rad x commanded position (rule G).
+
+    Parameters
+    ----------
+    motions : ErrorMotions
+        Straightness without line, squareness with all slopes.
+    offset_mm, rotation_rad : arrays, shape (3,)
+        Rigid motion of the frame that went with the lines.
+    """
+
+    motions: ErrorMotions
+    offset_mm: F1
+    rotation_rad: F1
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMotions:
+    """Error motions as functions of the axes' positions (``abbe-errors/1``, run-format.md 2).
+
+    Squareness acts on the commanded position, counted from AXIS ZERO (as `travel` does in rule G's levers); a count from the stroke's
+    start, as `models.geometry.bases` has it, differs by a constant offset of the whole machine.
+
+    Parameters
+    ----------
+    functions : mapping
+        ``"EXX"`` .. ``"ECZ"`` in mm or rad; what is missing is zero. ``"EXX@reverse"``: value when the axis last moved in -; without it
+        ``"EXX"`` holds for both directions.
+    squareness_rad : mapping
+        ``"C0Y"``, ``"B0Z"``, ``"A0Z"``; what is missing is zero.
+
+    Raises
+    ------
+    ValueError
+        An unknown name, or a squareness that is not finite.
+    """
+
+    functions: Mapping[str, AxisFunction] = field(default_factory=dict)
+    squareness_rad: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the names once; nobody can change them later."""
+        for key in self.functions:
+            if key.removesuffix(REVERSE) not in PLACES:
+                raise ValueError(f"error motion {key!r}: expected one of {', '.join(PLACES)}, or such a name with {REVERSE}")
+        for key, value in self.squareness_rad.items():
+            if key not in SQUARENESS or not np.isfinite(value):
+                raise ValueError(f"squareness {key!r} = {value}: expected a finite number for C0Y, B0Z or A0Z")
+        object.__setattr__(self, "functions", MappingProxyType(dict(self.functions)))
+        object.__setattr__(self, "squareness_rad", MappingProxyType({k: float(v) for k, v in self.squareness_rad.items()}))
+
+    def motions(self, axes_mm: ArrayLike, direction: ArrayLike | None = None) -> F3:
+        """Values for `models.geometry.chain.deviation_mm`, squareness times position included.
+
+        Parameters
+        ----------
+        axes_mm : array, shape (n, 3)
+            Commanded positions.
+        direction : array, shape (n, 3), optional
+            Sign of each axis' last move, as `models.geometry.chain.travel_sign` gives it. Below zero the ``@reverse`` functions hold,
+            otherwise, and when left out, the plain ones.
+
+        Returns
+        -------
+        array, shape (n, 3 axes, 6)
+            EX EY EZ (mm) and EA EB EC (rad).
+
+        Raises
+        ------
+        ValueError
+            Shapes are wrong or a number is not finite.
+        """
+        axes, signs = _checked(axes_mm, direction)
+        out: F3 = np.zeros((axes.shape[0], 3, 6))
+        for key, function in self.functions.items():
+            axis, component = PLACES[key.removesuffix(REVERSE)]
+            rows = self._rows(key, signs[:, axis])
+            out[rows, axis, component] = function(axes[rows, axis])
+        for name, value in self.squareness_rad.items():
+            axis, component, sign = SQUARENESS[name]
+            out[:, axis, component] += sign * value * axes[:, axis]
+        return out
+
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of all linear parameters: squareness, then ``KEY.k`` with k = 0, 1, ... the coefficient or the row of the table."""
+        named = (f"{key}.{k}" for key, function in self.functions.items() for k in range(function.parameters.size))
+        return (*SQUARENESS, *named)
+
+    def sensitivities(
+        self, names: Iterable[str], axes_mm: ArrayLike, direction: ArrayLike | None = None
+    ) -> tuple[list[tuple[int, int]], F2]:
+        """How much of each parameter stands in the error motions at given positions.
+
+        Parameters
+        ----------
+        names : iterable of str
+            As `parameter_names` writes them.
+        axes_mm, direction
+            As in `motions`.
+
+        Returns
+        -------
+        list of (axis, component), and array, shape (n, len(names))
+            The error motion that the parameter acts in, and its derivative with respect to the parameter.
+
+        Raises
+        ------
+        ValueError
+            A name is no parameter of these motions, or as in `motions`.
+        """
+        axes, signs = _checked(axes_mm, direction)
+        wanted, known = tuple(names), set(self.parameter_names())
+        places: list[tuple[int, int]] = []
+        weights: F2 = np.zeros((axes.shape[0], len(wanted)))
+        bases: dict[str, F2] = {}
+        for column, name in enumerate(wanted):
+            if name not in known:
+                raise ValueError(f"{name!r} is no parameter of these error motions")
+            if name in SQUARENESS:
+                axis, component, sign = SQUARENESS[name]
+                weights[:, column] = sign * axes[:, axis]
+            else:
+                key, _, index = name.rpartition(".")
+                axis, component = PLACES[key.removesuffix(REVERSE)]
+                if key not in bases:
+                    bases[key] = self.functions[key].basis(axes[:, axis])
+                rows = self._rows(key, signs[:, axis])
+                weights[rows, column] = bases[key][rows, int(index)]
+            places.append((axis, component))
+        return places, weights
+
+    def straightened(self, stroke_mm: ArrayLike) -> Straightened:
+        """Write all slopes of straightness as squareness, nothing lost: the deviation changes by a rigid motion that is handed back.
+
+        The lines are those of `models.functions.rules.as_straightness`.
+
+        Parameters
+        ----------
+        stroke_mm : array, shape (3, 2)
+
+        Raises
+        ------
+        ValueError
+            A straightness depends on the direction (then it has no one slope), or as in `as_straightness`.
+        """
+        strokes = np.asarray(stroke_mm, dtype=np.float64)
+        functions, squareness = dict(self.functions), dict.fromkeys(SQUARENESS, 0.0) | dict(self.squareness_rad)
+        offset, rotation = np.zeros(3), np.zeros(3)
+        for name, (target, sign) in _SLOPES.items():
+            if name + REVERSE in functions:
+                raise ValueError(f"{name}{REVERSE}: a straightness that depends on the direction has no one slope")
+            if name not in functions:
+                continue
+            axis, component = PLACES[name]
+            ruled = as_straightness(functions[name], strokes[axis])
+            functions[name] = ruled.function
+            offset[component] += ruled.offset_mm
+            squareness[target] += sign * ruled.slope
+            if name in _TURNS:
+                about, turn = _TURNS[name]
+                rotation[about] += turn * ruled.slope
+        return Straightened(ErrorMotions(functions, squareness), offset, rotation)
+
+    def _rows(self, key: str, sign: F1) -> slice | np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Points at which a function holds."""
+        if key.endswith(REVERSE):
+            return np.asarray(sign < 0.0)
+        return np.asarray(sign >= 0.0) if key + REVERSE in self.functions else slice(None)
+
+
+def _checked(axes_mm: ArrayLike, direction: ArrayLike | None) -> tuple[F2, F2]:
+    axes = axes_positions(axes_mm)
+    signs: F2 = np.zeros_like(axes) if direction is None else np.asarray(direction, dtype=np.float64)
+    if signs.shape != axes.shape or not np.isin(signs, (-1.0, 0.0, 1.0)).all():
+        raise ValueError(f"direction: expected -1, 0 or +1 in shape {axes.shape}, got shape {signs.shape}")
+    return axes, signs

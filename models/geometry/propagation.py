@@ -1,0 +1,145 @@
+"""What uncertain parameters of the error motions do to the deviation of the tool."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import F2, F3, F4
+from models.functions.motions import ErrorMotions
+from models.geometry.covariance import checked_covariance
+from models.geometry.jacobian import exact_jacobian, motion_jacobian
+from models.machine import Machine
+
+CHUNK = 8192
+"""Most points at a time."""
+
+WEIGHTS = 2**20
+"""Most weights (points times parameters) at a time, 8 MB: those of many points or of long tables do not fit into memory at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Where a deviation is asked for.
+
+    Parameters
+    ----------
+    axes_mm : array, shape (n, 3)
+        Commanded positions.
+    direction : array, shape (n, 3), optional
+        Sign of each axis' last move, as `ErrorMotions.motions` takes it.
+    tool_mm : array, shape (n, 3), optional
+        Tool at each point in place of the machine's.
+    """
+
+    axes_mm: F2
+    direction: F2 | None = None
+    tool_mm: F2 | None = None
+
+    def rows(self, which: slice) -> Points:
+        """Some of the points."""
+        direction = None if self.direction is None else self.direction[which]
+        return Points(self.axes_mm[which], direction, None if self.tool_mm is None else self.tool_mm[which])
+
+
+def sensitivity(machine: Machine, errors: ErrorMotions, names: Sequence[str], at: Points, *, exact: bool = False) -> F3:
+    """Derivative of the deviation with respect to parameters of the error motions.
+
+    Parameters
+    ----------
+    names : sequence of str
+        As `ErrorMotions.parameter_names` writes them.
+    at : Points
+    exact : bool
+        With finite rotations, at the given errors, instead of rule G.
+
+    Returns
+    -------
+    array, shape (n, 3, len(names))
+        mm per unit of the parameter.
+
+    Raises
+    ------
+    ValueError
+        A name is no parameter, or a shape is wrong.
+    """
+    places, weights = errors.sensitivities(names, at.axes_mm, at.direction)
+    slopes = _slopes(machine, errors, at, exact=exact)
+    axes, components = np.array(places, dtype=np.intp).reshape(-1, 2).T
+    out: F3 = slopes[:, :, axes, components] * weights[:, None, :]
+    return out
+
+
+def deviation_covariance(
+    machine: Machine, errors: ErrorMotions, covariance: tuple[Sequence[str], F2], at: Points, *, exact: bool = False
+) -> F3:
+    """Covariance of the three components of the deviation at each point, by the law of propagation.
+
+    Parameters
+    ----------
+    covariance : (names, matrix)
+        Parameters and their covariance, shape (p, p), units of the parameters squared. Parameters that are not named count as certain.
+    at, exact
+        As in `sensitivity`.
+
+    Returns
+    -------
+    array, shape (n, 3, 3), mm^2
+
+    Raises
+    ------
+    ValueError
+        The matrix does not fit the names or is no covariance (`models.geometry.covariance`), or as in `sensitivity`.
+    """
+    names, matrix = covariance
+    matrix = checked_covariance(matrix, len(names))
+    out: F3 = np.zeros((at.axes_mm.shape[0], 3, 3))
+    if len(names) == 0:
+        return out
+    places, _ = errors.sensitivities(names, np.zeros((0, 3)))
+    motion = np.array([6 * axis + component for axis, component in places])
+    order = np.argsort(motion, kind="stable")
+    acting, first = np.unique(motion[order], return_index=True)
+    ordered, matrix = [names[k] for k in order], matrix[np.ix_(order, order)]
+    step = max(1, min(CHUNK, WEIGHTS // len(names)))
+    for start in range(0, at.axes_mm.shape[0], step):
+        some = at.rows(slice(start, start + step))
+        _, weights = errors.sensitivities(ordered, some.axes_mm, some.direction)
+        of_motions = _motion_covariance(weights, matrix, first)
+        slopes = _slopes(machine, errors, some, exact=exact).reshape(-1, 3, 18)[:, :, acting]
+        out[start : start + step] = slopes @ of_motions @ slopes.transpose(0, 2, 1)
+    return out
+
+
+def _slopes(machine: Machine, errors: ErrorMotions, at: Points, *, exact: bool) -> F4:
+    """Derivative of the deviation with respect to each error motion, shape (n, 3, 3, 6)."""
+    if exact:
+        return exact_jacobian(machine, at.axes_mm, errors.motions(at.axes_mm, at.direction), at.tool_mm)
+    return motion_jacobian(machine, at.axes_mm, at.tool_mm)
+
+
+def _motion_covariance(weights: F2, covariance: F2, first: NDArray[np.intp]) -> F3:
+    """Covariance of the error motions themselves, shape (n, g, g): at most 18 of them stand between the parameters and the deviation.
+
+    A parameter acts in one motion, so that only the matrix' block of two motions enters for each pair of them, and half of the pairs do.
+
+    Parameters
+    ----------
+    weights : array, shape (n, p)
+        Derivative of its motion with respect to each parameter, parameters of one motion together.
+    covariance : array, shape (p, p)
+        Symmetric, in the same order.
+    first : array of int, shape (g,)
+        Where the parameters of each motion begin.
+    """
+    g = first.size
+    out: F3 = np.empty((weights.shape[0], g, g))
+    for k, start in enumerate(first):
+        end = int(first[k + 1]) if k + 1 < g else weights.shape[1]
+        share = (weights[:, start:end] @ covariance[start:end, start:]) * weights[:, start:]
+        out[:, k, k:] = np.add.reduceat(share, first[k:] - start, axis=1)
+        out[:, k:, k] = out[:, k, k:]
+    return out

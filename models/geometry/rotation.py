@@ -1,0 +1,144 @@
+"""What a small rotation adds to a vector: (R − I) v without ever forming R, so that nothing is lost by subtracting long vectors.
+
+Three exact forms of the rotation of a carriage that turns by E = (EA, EB, EC) (docs/conventions.md, "Exact kinematics"): they agree to
+first order and part at the second, by the order in which the three turns are taken.
+"""
+
+from __future__ import annotations
+
+from math import factorial
+from typing import Literal
+
+import numpy as np
+
+from models.arrays import F1, F2, F3
+
+RotationForm = Literal["vector", "zyx", "small"]
+
+
+def cross(a: F2, b: F2) -> F2:
+    """Vector product over the last axis of two arrays of equal shape (..., 3); a third of the time of `numpy.cross`."""
+    out = np.empty(np.broadcast(a, b).shape, dtype=np.result_type(a, b))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
+def rotation_factors(angle_squared: F1) -> tuple[F1, F1]:
+    """Rodrigues' two factors sin|E|/|E| and (1 − cos|E|)/|E|² from |E|² (rad²), both smooth through |E| = 0."""
+    angle = np.sqrt(angle_squared)
+    half = np.sinc(angle / (2.0 * np.pi))
+    return np.asarray(np.sinc(angle / np.pi)), np.asarray(0.5 * half * half)
+
+
+def factor_slopes(angle_squared: F1) -> tuple[F1, F1]:
+    """Derivative of Rodrigues' two factors with respect to |E|, divided by |E|: a power series below 1 rad, where the formulas cancel."""
+    q = np.asarray(angle_squared, dtype=np.float64)
+    near = np.minimum(q, 1.0)
+    s_series = sum((-1.0) ** n * 2 * n * near ** (n - 1) / factorial(2 * n + 1) for n in range(1, 11))
+    c_series = sum((-1.0) ** n * 2 * n * near ** (n - 1) / factorial(2 * n + 2) for n in range(1, 11))
+    s, c = rotation_factors(q)
+    far = np.maximum(q, 1.0)
+    return np.where(q < 1.0, s_series, (np.cos(np.sqrt(q)) - s) / far), np.where(q < 1.0, c_series, (s - 2.0 * c) / far)
+
+
+def cross_matrix(v: F2) -> F3:
+    """[v]x with [v]x u = v × u, shape (n, 3, 3)."""
+    out = np.zeros((*v.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., i, j], out[..., j, i] = -v[..., k], v[..., k]
+    return out
+
+
+def rotation_matrix(rotation_rad: F2) -> F3:
+    """Matrix of the rotation by the vector E, shape (n, 3, 3) for E of shape (n, 3)."""
+    s, c = rotation_factors((rotation_rad * rotation_rad).sum(axis=-1))
+    k = cross_matrix(rotation_rad)
+    matrix: F3 = np.eye(3) + s[..., None, None] * k + c[..., None, None] * (k @ k)
+    return matrix
+
+
+def turn_vector_slope(rotation_rad: F2, v_mm: F2) -> F3:
+    """Derivative of `turn_vector` with respect to the rotation vector, shape (n, 3 components, 3 of E), mm per rad.
+
+    Rodrigues' formula differentiated; at E = 0 it is −[v]x, as rule G has it.
+    """
+    square = (rotation_rad * rotation_rad).sum(axis=-1)
+    (s, c), (ds, dc) = rotation_factors(square), factor_slopes(square)
+    once = cross(rotation_rad, v_mm)
+    along = ds[..., None] * once + dc[..., None] * cross(rotation_rad, once)
+    turned = -cross_matrix(v_mm)
+    slope: F3 = s[..., None, None] * turned + along[..., :, None] * rotation_rad[..., None, :]
+    slope += c[..., None, None] * (cross_matrix(rotation_rad) @ turned - cross_matrix(once))
+    return slope
+
+
+def turn_vector(rotation_rad: F2, v_mm: F2) -> F2:
+    """(R − I) v for the rotation by the vector E (angle |E|, axis E/|E|), right-handed.
+
+    Parameters
+    ----------
+    rotation_rad, v_mm : arrays, shape (n, 3)
+
+    Returns
+    -------
+    array, shape (n, 3), mm
+    """
+    s, c = rotation_factors((rotation_rad * rotation_rad).sum(axis=-1))
+    once = cross(rotation_rad, v_mm)
+    added: F2 = s[..., None] * once + c[..., None] * cross(rotation_rad, once)
+    return added
+
+
+def turn_zyx(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
+    """(R − I) v for R = Rz(EC) Ry(EB) Rx(EA), first about X; ``reverse``: R = Rx(EA) Ry(EB) Rz(EC), the inverse of that of −E.
+
+    Shapes as in `turn_vector`.
+    """
+    added = np.zeros(np.broadcast(rotation_rad, v_mm).shape)
+    for k in (2, 1, 0) if reverse else (0, 1, 2):
+        u, w = (k + 1) % 3, (k + 2) % 3
+        s, c1 = np.sin(rotation_rad[..., k]), 2.0 * np.sin(0.5 * rotation_rad[..., k]) ** 2
+        a, b = v_mm[..., u] + added[..., u], v_mm[..., w] + added[..., w]
+        added[..., u] -= c1 * a + s * b
+        added[..., w] += s * a - c1 * b
+    return added
+
+
+def turn_small(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
+    """(R − I) v for the papers' matrix R = I + [E]×; ``reverse``: R = (I + [−E]×)⁻¹, exactly.
+
+    (I − [E]×)⁻¹ − I = ([E]× + [E]×²) / (1 + |E|²). Shapes as in `turn_vector`.
+    """
+    once = cross(rotation_rad, v_mm)
+    if not reverse:
+        return once
+    back: F2 = (once + cross(rotation_rad, once)) / (1.0 + (rotation_rad * rotation_rad).sum(axis=-1))[..., None]
+    return back
+
+
+def turned_by(rotation: RotationForm, rotation_rad: F2, v_mm: F2, *, work_side: bool) -> F2:
+    """(R − I) v of a carriage whose ISO rotation, tool relative to workpiece, is E, in one of the three exact forms.
+
+    Parameters
+    ----------
+    rotation : "vector", "zyx" or "small"
+        Rotation by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation; or the papers' I + [E]×.
+    rotation_rad, v_mm : arrays, shape (n, 3)
+    work_side : bool
+        A work-side carriage's own rotation is −E, and its transform is inverted exactly (math.md 2: p ← T⁻¹(p − L)). For the rotation by
+        a vector the inverse of −E is E itself, so the side makes no difference there.
+
+    Raises
+    ------
+    ValueError
+        ``rotation`` is none of the three.
+    """
+    if rotation == "vector":
+        return turn_vector(rotation_rad, v_mm)
+    if rotation == "zyx":
+        return turn_zyx(rotation_rad, v_mm, reverse=work_side)
+    if rotation == "small":
+        return turn_small(rotation_rad, v_mm, reverse=work_side)
+    raise ValueError(f"rotation {rotation!r}: must be 'vector', 'zyx' or 'small'")

@@ -1,0 +1,165 @@
+"""Rows that single experiments put into a least-squares problem, whatever the error functions are, and what such a problem can tell.
+
+A `Field` gives the deviation per unit of every parameter; bar and laser rows are its projections (math.md 4.2, 5.4). Ranks follow the
+convention of math.md 4.6: columns of unit length, then the set-up unknowns projected out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2, F3
+from models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
+
+Field = Callable[[F2], F3]
+"""Commanded workpiece coordinates (n, 3), mm, to the deviation per unit of each parameter (n, 3, p)."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Readings of one experiment per unit of the machine's parameters, shape (n, p), and of its set-up unknowns, shape (n, k)."""
+
+    machine: F2
+    setup: F2
+
+
+def bar_rows(field: Field, points_mm: F2, centre_mm: F1) -> Rows:
+    """Linearised ball-bar about one cup, eq (8) of Yang: n . (delta - delta0); set-up: cup offset (3) and bar length (1).
+
+    Parameters
+    ----------
+    field : Field
+    points_mm, centre_mm : array, shape (n, 3) and (3,)
+        Commanded workpiece coordinates; the cup stands where the tool is at ``centre_mm``.
+    """
+    d = points_mm - centre_mm
+    n = d / np.linalg.norm(d, axis=1, keepdims=True)
+    seen = np.einsum("ni,nik->nk", n, field(points_mm) - field(centre_mm[None]))
+    return Rows(seen, np.concatenate([-n, np.ones((len(n), 1))], axis=1))
+
+
+def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> Rows:
+    """Displacement along a beam since the first record (left out, it is zero by definition); set-up: mirror tilts in two directions.
+
+    Parameters
+    ----------
+    field : Field
+    path_mm : array, shape (n + 1, 3)
+        Commanded positions, the reference first.
+    beam, across : array, shape (3,) and (2, 3)
+        Nominal beam and the two directions in which the mirror may tilt, unit vectors.
+    """
+    f = field(path_mm)
+    d = path_mm[1:] - path_mm[0]
+    return Rows(np.einsum("i,nik->nk", beam, f[1:] - f[0]), d @ across.T)
+
+
+def vector_rows(field: Field, points_mm: F2) -> Rows:
+    """The whole deviation vector at points (the upper bound of what any instrument can tell), no set-up unknowns."""
+    f = field(points_mm)
+    flat = f.reshape(-1, f.shape[2])
+    return Rows(flat, np.zeros((flat.shape[0], 0)))
+
+
+def stacked(parts: list[F2], setups: list[tuple[F2, tuple[int, ...]]]) -> tuple[F2, F2]:
+    """One design from several experiments: machine columns on top of each other, set-up columns wherever each part says.
+
+    Parameters
+    ----------
+    parts : list of (n_k, p) arrays
+    setups : list of (array (n_k, q), columns)
+        Set-up columns of each part and which unknowns of the whole problem they are: equal numbers share an unknown.
+    """
+    width = 1 + max((c for _, columns in setups for c in columns), default=-1)
+    blocks = []
+    for part, (values, columns) in zip(parts, setups, strict=True):
+        block = np.zeros((part.shape[0], width))
+        for k, c in enumerate(columns):
+            block[:, c] += values[:, k]
+        blocks.append(block)
+    return np.concatenate(parts), np.concatenate(blocks)
+
+
+def unit_columns(a: F2) -> tuple[F2, F1]:
+    """Design with columns of unit length and the factors that made them so; a column of zeros stays."""
+    norm = np.linalg.norm(a, axis=0)
+    factor: F1 = 1.0 / np.where(norm > 0, norm, 1.0)
+    return np.asarray(a * factor), factor
+
+
+def ranks(a: F2, setup: F2) -> tuple[int, int]:
+    """Rank and effective rank: singular values above 1e-9 and 1e-3 of the largest, unit columns, set-up projected out (math.md 4.6).
+
+    Parameters
+    ----------
+    a, setup : array, shape (n, p) and (n, k)
+        Readings (mm) per unit of the machine's parameters and of the set-up unknowns; k may be 0.
+
+    Returns
+    -------
+    two integers of at most p: how many combinations of the machine's parameters the readings show, and how many they show well.
+    """
+    s = linalg.svd(project_out(unit_columns(a)[0], setup), compute_uv=False)
+    return int((s > RANK_TOLERANCE * s[0]).sum()), int((s > EFFECTIVE_TOLERANCE * s[0]).sum())
+
+
+def hidden_combination(a: F2, setup: F2, support: list[int]) -> tuple[F1, float]:
+    """The combination of the parameters ``support`` that leaves the least trace in the data.
+
+    Returns
+    -------
+    weights : array, shape (len(support),)
+        In units of the parameters, largest magnitude 1 and positive.
+    trace : float
+        Its share of what the parameters would show if their effects did not cancel: 0 for a null vector.
+    """
+    b = project_out(a[:, support], setup)
+    size = np.where(np.linalg.norm(b, axis=0) > 0, np.linalg.norm(b, axis=0), 1.0)
+    _, _, vt = linalg.svd(b / size)
+    v = vt[-1] / size
+    w: F1 = v / v[int(np.argmax(np.abs(v)))]
+    shown = float(np.linalg.norm(a[:, support] * w))
+    return w, float(np.linalg.norm(b @ w)) / (shown if shown > 0 else 1.0)
+
+
+def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
+    """Standard deviation of every component of the predicted map per unit of reading noise, shape (m, 3) (math.md 4.6 "noise gain").
+
+    What the readings do not show at all (singular values below 1e-9) is taken as zero and counts nothing; the frame's gauge is included.
+
+    Parameters
+    ----------
+    predict : array, shape (m, 3, p)
+        Deviation per unit of each parameter at the nodes of the map.
+    """
+    unit, factor = unit_columns(a)
+    _, s, vt = linalg.svd(project_out(unit, setup), full_matrices=False)
+    seen = s > RANK_TOLERANCE * s[0]
+    gain = (predict * factor) @ (vt[seen].T / s[seen])
+    return np.asarray(np.sqrt((gain**2).sum(axis=2)))
+
+
+def shortest_solution(a: F2, y: F1, scale: F1) -> F1:
+    """Least squares without a prior: of all best parameters those with the smallest sum of (parameter / scale)**2.
+
+    Where the rank is not full the answer depends on ``scale`` alone, i.e. on nothing that was measured (math.md 5.5).
+
+    Parameters
+    ----------
+    a : array, shape (n, p)
+        Readings, mm, per unit of each parameter, set-up unknowns included.
+    y : array, shape (n,)
+        Readings, mm.
+    scale : array, shape (p,)
+        Typical size of each parameter in its own unit; 0 holds one at zero.
+
+    Returns
+    -------
+    array, shape (p,), the parameters in their own units.
+    """
+    x = linalg.lstsq(a * scale, y, cond=RANK_TOLERANCE, lapack_driver="gelsd")[0]
+    return np.asarray(x * scale)

@@ -1,0 +1,1 @@
+"""`abbe papers`: every printed number of the four papers beside ours."""

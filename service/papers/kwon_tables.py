@@ -1,0 +1,297 @@
+"""Kwon, Tables 1 and 2: what the printed coefficients and sums say about each other (math.md 6, FORENSICS and ANOVA)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from models.arrays import F1
+from models.kwon.anova import anova_from_sums, critical_f
+from models.kwon.forensics import (
+    GridSums,
+    ImpliedPlane,
+    grid_sums,
+    implied_plane,
+    in_plane_coefficients,
+    in_plane_label,
+    ladder_name,
+    square_grid,
+)
+from models.kwon.layout import layout
+from models.kwon.terms import CUBIC, IN_PLANE
+from service.papers import kwon_printed as paper
+from service.papers.compare import Computed, agrees, computed_from
+from service.papers.printed import Printed, values
+from service.papers.row import Erratum, Row, stated
+from service.papers.words import minus
+
+ALPHA = 0.01
+GRID = "9 × 9 points, steps of 0.25 mm as printed, ± 1 mm assumed from the stroke of 2 mm and the 82 points of the text"
+_POWERS = ("", "", "²", "³")
+COEFFICIENTS = "rounding of the 20 printed coefficients"
+DAMAGED_ROW = (paper.COMPONENTS.index(paper.DAMAGED[0]), paper.DAMAGED[1])
+
+
+def rows() -> list[Row]:
+    """Both tables, and the largest errors that the text names."""
+    return [*_plane(), *_coefficients(), *_in_plane(), *_sums(), *_largest(), *_variance(), *_degrees_of_freedom()]
+
+
+@cache
+def plane() -> ImpliedPlane:
+    """Plane on which the coefficients of Table 1 were fitted, from all quotients but those of the damaged one."""
+    return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS]), leave_out=(DAMAGED_ROW,))
+
+
+def restored(component: str) -> tuple[Printed, ...]:
+    """Coefficients of a component with the damaged exponent put right."""
+    numbers = paper.TABLE1[component]
+    if component != paper.DAMAGED[0]:
+        return numbers
+    k = paper.DAMAGED[1]
+    return (*numbers[:k], paper.RESTORED, *numbers[k + 1 :])
+
+
+def in_plane(component: str, z_mm: float) -> F1:
+    """The component as a cubic of x and y on a plane, order of IN_PLANE."""
+    return in_plane_coefficients(np.array(values(restored(component))), z_mm)
+
+
+def _plane() -> list[Row]:
+    found = plane()
+    wrong = Erratum("Table 1 is the minimum-norm solution of a fit on another plane; the origin of Z may have been another")
+    how = "implied_plane: median of the quotients of neighbouring coefficients"
+    ratios = np.array([r for _, r in found.ratios_mm])
+    why = f"{ratios.size} quotients between {ratios.min():.2f} and {ratios.max():.2f} mm, {paper.PLANE_Z_MM.value - found.z_mm:.2f} mm off"
+    out = [
+        Row("kwon", "Table 1", "plane Z of the fit", "mm", paper.PLANE_Z_MM, Computed(found.z_mm), how, why, wrong),
+        stated("kwon", "6", "plane Z of the fit", "mm", paper.MATH_PLANE_MM, found.z_mm, how),
+        stated("kwon", "6", "spread of the quotients", "mm", paper.MATH_SPREAD_MM, found.sd_mm, how),
+    ]
+    for (component, up, low), _ in found.ratios_mm:
+        numbers = paper.TABLE1[paper.COMPONENTS[component]]
+        ratio = computed_from(_ratio, numbers[up], numbers[low])
+        name = f"β{up}/β{low} ({ladder_name((up, low))}) of {paper.COMPONENTS[component]}"
+        out.append(
+            Row(
+                "kwon",
+                "Table 1",
+                f"plane Z by {name}",
+                "mm",
+                paper.PLANE_Z_MM,
+                ratio,
+                how,
+                "",
+                wrong,
+                series="plane Z by quotients",
+                again=True,
+            )
+        )
+    return out
+
+
+def _coefficients() -> list[Row]:
+    component, k = paper.DAMAGED
+    number = paper.TABLE1[component][k]
+    factor = plane().z_mm
+    below = next(low for (c, up, low), _ in _all_pairs() if up == k and c == DAMAGED_ROW[0])
+    value = factor * paper.TABLE1[component][below].value
+    how = f"β{below} of {component} times the implied Z"
+    power = Erratum("printed with 10⁻³ instead of 10⁻⁵", computed_from(lambda b: 100.0 * factor * b, paper.TABLE1[component][below]))
+    out = [Row("kwon", "Table 1", f"β{k} of {component}", "mm/mm³", number, Computed(value), how, "exponent", power)]
+    lost = "needs the errors at the grid points, which are not printed"
+    for c in paper.COMPONENTS:
+        for i, coefficient in enumerate(paper.TABLE1[c]):
+            if (c, i) != paper.DAMAGED:
+                unit = f"mm/mm{_POWERS[sum(CUBIC[i])]}" if i else "mm"
+                out.append(Row("kwon", "Table 1", f"β{i} of {c}", unit, coefficient, why=lost, series=f"coefficients of {c}"))
+    return out
+
+
+def _all_pairs() -> tuple[tuple[tuple[int, int, int], float], ...]:
+    """All quotients, the damaged ones too."""
+    return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS])).ratios_mm
+
+
+def _in_plane() -> list[Row]:
+    how = f"in_plane_coefficients of Table 1 at Z = {plane().z_mm:.5f} mm, β10 of e_x restored"
+    out = []
+    for c in paper.COMPONENTS:
+        found = in_plane(c, plane().z_mm)
+        for term, number, value in zip(IN_PLANE, paper.MATH_IN_PLANE[c], found, strict=True):
+            name = f"in-plane cubic of {c}"
+            row = stated("kwon", "6", f"{name}, {in_plane_label(term)}", "mm", number, float(value), how)
+            out.append(replace(row, series=name))
+    return out
+
+
+def _on_grid(component: str, z_mm: float, figure: Callable[[GridSums], float]) -> Computed:
+    """A figure of a component's surface on the 9 x 9 grid, with what the rounding of its coefficients leaves open."""
+
+    def of(*beta: float) -> float:
+        return figure(grid_sums(in_plane_coefficients(np.array(beta), z_mm)))
+
+    return computed_from(of, *restored(component), because=COEFFICIENTS)
+
+
+def _sums() -> list[Row]:
+    grid = f"grid_sums about the mean, {GRID}"
+    used, other = plane().z_mm, paper.PLANE_Z_MM.value
+    out = []
+    for c in paper.COMPONENTS:
+        number = paper.TABLE2_SUMS[c][0]
+        here, there = (_on_grid(c, z, lambda s: s.ss_mean) for z in (used, other))
+        share = minus(f"{100.0 * (here.value - number.value) / number.value:+.2f}")
+        why = f"{share} % off. Table 1 and Table 2 check each other: N = 81, coordinates in mm (± 1 mm, assumed), sums about the mean"
+        how, how_other = (f"{grid}, Table 1 at Z = {z:.3f} mm" for z in (used, other))
+        quantity = f"regression sum of squares of {c}"
+        no_fit = "at the plane that the paper states the sums do not fit: it is not the plane of the fit"
+        out += [
+            Row("kwon", "Table 2", quantity, "mm²", number, here, how, why),
+            Row("kwon", "Table 2", f"{quantity}, printed Z", "mm²", number, there, how_other, no_fit, again=True),
+            stated("kwon", "6", quantity, "mm²", paper.MATH_SUMS[c], here.value, how),
+            stated("kwon", "6", f"{quantity}, printed Z", "mm²", paper.MATH_SUMS_PRINTED_Z[c], there.value, how_other),
+        ]
+    return out
+
+
+def _largest() -> list[Row]:
+    out = []
+    used = plane().z_mm
+    how = f"largest value on {GRID}, Table 1 at Z = {used:.3f} mm"
+    for c in paper.COMPONENTS:
+        number = paper.LARGEST_UM[c]
+        found = _on_grid(c, used, lambda s: 1e3 * s.largest)
+        near = abs(found.value - number.value) <= paper.RESIDUAL_UM.value
+        why = (
+            f"within the residuals of ± {paper.RESIDUAL_UM.text} µm that the paper states, if its figure is of the readings"
+            if near
+            else f"not even within the residuals of ± {paper.RESIDUAL_UM.text} µm: Table 1 does not give the figure of the text"
+        )
+        out.append(Row("kwon", "4.2", f"largest |{c}|", "µm", number, found, how, why))
+        out.append(stated("kwon", "6", f"largest |{c}|", "µm", paper.MATH_LARGEST_UM[c], found.value, how))
+    return out
+
+
+def _variance() -> list[Row]:
+    out = []
+    for c in paper.COMPONENTS:
+        regression, residual, total = paper.TABLE2_SUMS[c]
+        lost = "needs the errors at the grid points, which are not printed"
+        out += [
+            Row("kwon", "Table 2", f"residual sum of squares of {c}", "mm²", residual, why=lost),
+            Row(
+                "kwon",
+                "Table 2",
+                f"total sum of squares of {c}",
+                "mm²",
+                total,
+                computed_from(_add, regression, residual),
+                "regression + residual",
+            ),
+            *_mean_squares(c, regression, residual),
+            _f(c, regression, residual),
+        ]
+        right = anova_from_sums(regression.value, residual.value, *degrees_of_freedom()).f
+        how = "anova_from_sums of the printed sums with the degrees of freedom of the grid"
+        out.append(stated("kwon", "6", f"F of {c}, 9 and 71 degrees of freedom", "", paper.MATH_F[c], right, how))
+    return out
+
+
+def _add(a: float, b: float) -> float:
+    return a + b
+
+
+def _over_61(c: str) -> bool:
+    """Whether the residual's mean square of a component was divided by 61: only where the printed 60 do not give it and 61 do."""
+    residual, printed = paper.TABLE2_SUMS[c][1], paper.TABLE2_MEAN_SQUARES[c][1]
+    n = int(paper.DOF_RESIDUAL.value)
+    by_60, by_61 = computed_from(lambda s: s / n, residual), computed_from(lambda s: s / (n + 1), residual)
+    return not agrees(by_60, printed) and agrees(by_61, printed)
+
+
+def _mean_squares(c: str, regression: Printed, residual: Printed) -> list[Row]:
+    of_regression, of_residual = paper.TABLE2_MEAN_SQUARES[c]
+    k, n = int(paper.DOF_REGRESSION.value), int(paper.DOF_RESIDUAL.value)
+    other = Erratum(f"divided by {n + 1} instead of the printed {n} here", computed_from(lambda s: s / (n + 1), residual))
+    in_regression = computed_from(lambda s: s / k, regression)
+    why = "" if agrees(in_regression, of_regression) else "sum and mean square of the same line do not belong together"
+    in_residual = computed_from(lambda s: s / n, residual)
+    slip = other if _over_61(c) else None
+    return [
+        Row("kwon", "Table 2", f"mean square of the regression of {c}", "mm²", of_regression, in_regression, f"regression sum / {k}", why),
+        Row("kwon", "Table 2", f"mean square of the residual of {c}", "mm²", of_residual, in_residual, f"residual sum / {n}", erratum=slip),
+    ]
+
+
+def _f(c: str, regression: Printed, residual: Printed) -> Row:
+    k, n = int(paper.DOF_REGRESSION.value), int(paper.DOF_RESIDUAL.value)
+    found = computed_from(lambda a, b: anova_from_sums(a, b, k, n).f, regression, residual)
+    number = paper.TABLE2_F[c]
+    how = f"anova_from_sums of the printed sums with the printed {k} and {n} degrees of freedom"
+    erratum, why = None, ""
+    if not agrees(found, number):
+        ratio = computed_from(_ratio, *paper.TABLE2_MEAN_SQUARES[c])
+        if _over_61(c):
+            by_61 = computed_from(lambda a, b: anova_from_sums(a, b, k, n + 1).f, regression, residual)
+            why = f"divisor; the ratio of the printed mean squares is {_interval(ratio)}"
+            erratum = Erratum(f"residual divided by {n + 1} instead of the printed {n}, as in its mean square", by_61)
+        else:
+            why = f"unexplained. Nearest is the ratio of the printed mean squares, {_interval(ratio)}"
+            erratum = Erratum("ratio of the printed mean squares in place of that of the sums", ratio)
+    return Row("kwon", "Table 2", f"F of {c}", "", number, found, how, why, erratum)
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b
+
+
+def _interval(found: Computed) -> str:
+    low, high = found.value - found.allowance, found.value + found.allowance
+    return f"{found.value:.2f} ({low:.2f} to {high:.2f} with the rounding of both)"
+
+
+def degrees_of_freedom() -> tuple[int, int]:
+    """Of regression and residual on the grid of the paper: rank - 1 and points - rank."""
+    found = layout(square_grid(step_mm=paper.STEP_MM.value, z_mm=plane().z_mm))
+    return found.rank - 1, found.n - found.rank
+
+
+def _degrees_of_freedom() -> list[Row]:
+    regression, residual = degrees_of_freedom()
+    points = regression + residual + 1
+    grid = f"layout of the grid on one plane, {GRID}"
+    counted = Erratum(
+        "the paper counts its 20 coefficients; on one plane only 10 are independent, and one is the mean", Computed(float(len(CUBIC)))
+    )
+    left = Erratum("81 points − 1 − 20", Computed(float(points - 1 - len(CUBIC))))
+    k, n = int(paper.DOF_REGRESSION.value), int(paper.DOF_RESIDUAL.value)
+    more = "the sums of Table 2 and 20 + 60 + 1 = 81 say 9 × 9 points"
+    return [
+        Row(
+            "kwon",
+            "Table 2",
+            "degrees of freedom of the regression",
+            "",
+            paper.DOF_REGRESSION,
+            Computed(float(regression)),
+            grid,
+            "rank",
+            counted,
+        ),
+        Row("kwon", "Table 2", "degrees of freedom of the residual", "", paper.DOF_RESIDUAL, Computed(float(residual)), grid, "rank", left),
+        Row("kwon", "4.2", "grid points", "", paper.POINTS, Computed(float(points)), grid, more),
+        Row("kwon", "4.2", f"critical F({k}, {n}, {ALPHA})", "", paper.CRITICAL_F, Computed(critical_f(k, n, ALPHA)), "critical_f"),
+        stated(
+            "kwon",
+            "6",
+            f"critical F({regression}, {residual}, {ALPHA})",
+            "",
+            paper.MATH_CRITICAL_F,
+            critical_f(regression, residual, ALPHA),
+            "critical_f",
+        ),
+    ]

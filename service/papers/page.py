@@ -1,0 +1,151 @@
+"""The papers as one self-contained HTML page, written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from service.errors import FileFormatError
+from service.papers.check import Check
+from service.papers.pictures import figures
+from service.papers.row import Row
+from service.papers.run import PaperResult
+from service.papers.words import NONE, check_cells, computed_cells, note, short
+from service.report.numbers import printable
+from service.report.palette import style_rules
+from service.report.plots.signed import signed_rules
+
+_MARKS = {"reproduced": "✔", "consistent": "≈", "differs": "≠", "input": "▷", "not reproducible": "○"}
+_CHECK_MARKS = {"holds": "✔", "fails": "✘"}
+_UNIT_AFTER = re.compile(r"(?<=\d) (?=(?:µm|mm|nm|µrad|mrad|rad|°|%)(?!\w))")
+"""Where a line must not break: between a number and its unit."""
+
+
+def write_page(found: Sequence[PaperResult], target: Path) -> None:
+    """Write the page beside its place and move it there: a reader sees the old file or the whole new one.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+    """
+    text = render_page(found)
+    aside: Path | None = None
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(21, "it is a folder")
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
+        aside = Path(name)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.chmod(0o644)  # mkstemp makes private files, this one is for others
+        aside.replace(target)
+    except OSError as error:
+        if aside is not None:
+            aside.unlink(missing_ok=True)
+        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a folder that may be written") from None
+
+
+def render_page(found: Sequence[PaperResult]) -> str:
+    """The page. Equal rows give equal bytes."""
+    page = (
+        _environment()
+        .get_template("papers.html")
+        .render(
+            style=Markup(style_rules() + signed_rules()),  # noqa: S704 - our own constants
+            papers=[_paper(f) for f in found],
+            version=version("abbe"),
+            marks=_MARKS,
+            check_marks=_CHECK_MARKS,
+        )
+    )
+    return printable(page)
+
+
+@cache
+def _environment() -> Environment:
+    loader = ChoiceLoader([PackageLoader("service.papers"), PackageLoader("service.report")])
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+def _paper(found: PaperResult) -> dict[str, object]:
+    return {
+        "key": found.paper,
+        "title": found.title,
+        "counts": found.counts(),
+        "rows": _rows(found.rows),
+        "checks": _checks(found.checks),
+        "outcomes": found.check_counts(),
+        "figures": [{"pictures": _trusted(f.pictures), "caption": _whole(f.caption), "kind": f.kind} for f in figures(found.paper)],
+    }
+
+
+def _trusted(pictures: Sequence[str]) -> list[Markup]:
+    # The SVG writer has escaped every text; escaping again would show the reader the tags.
+    return [Markup(p) for p in pictures]  # noqa: S704
+
+
+def _whole(text: str) -> str:
+    """The text with every number and its unit on one line."""
+    return _UNIT_AFTER.sub("\u00a0", text)
+
+
+def _checks(checks: Sequence[Check]) -> list[dict[str, str]]:
+    out, before = [], ""
+    for check in checks:
+        given, found, deviation, bound = (_whole(cell) for cell in check_cells(check))
+        text = _whole(f"{check.how}. {check.why}")
+        cells = {
+            "where": check.where,
+            "quantity": _whole(check.quantity),
+            "given": given,
+            "found": found,
+            "deviation": deviation,
+            "bound": bound,
+        }
+        out.append({**cells, "status": check.status, "text": "as above" if text == before else text})
+        before = text
+    return out
+
+
+def _rows(rows: Sequence[Row]) -> list[dict[str, str]]:
+    out, before = [], ""
+    for row in rows:
+        text = _whole(". ".join(part for part in (row.how, note(row)) if part))
+        out.append({**_cells(row), "text": "as above" if text and text == before else text})
+        before = text
+    return out
+
+
+def _cells(row: Row) -> dict[str, str]:
+    unit = f" {row.unit}" if row.unit != "1" else ""
+    out = {
+        "where": row.where if row.source == "paper" else f"math.md, {row.where}",
+        "quantity": _whole(row.quantity),
+        "unit": unit.strip(),
+        "printed": ("< " if row.printed.bound else "") + row.printed.text.replace("-", "−"),
+        "computed": NONE,
+        "difference": NONE,
+        "within": NONE,
+        "because": "",
+        "status": row.status,
+    }
+    if row.computed is not None:
+        out["computed"], out["difference"], out["within"] = computed_cells(row)
+        parts = [f"half a unit of the last printed digit: {short(row.printed.rounding)}{unit}"]
+        if row.fit == "padding":
+            parts[0] = f"if zeros are padding: {short(row.within or 0.0)}{unit}"
+        elif row.computed.allowance:
+            parts.append(f"{row.computed.because}: {short(row.computed.allowance)}{unit}")
+        out["because"] = "; ".join(parts)
+    return out

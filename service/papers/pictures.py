@@ -1,0 +1,143 @@
+"""The pictures that the papers show, drawn from what is left of their inputs. Every caption says what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from models.arrays import F1
+from models.geometry.chain import deviation_mm
+from models.kwon.forensics import square_grid
+from models.kwon.terms import IN_PLANE, regressors
+from models.notation.pahk import motions_from_pahk, pahk_machine, pahk_type
+from service.papers import kwon_printed, pahk_printed, yang_printed
+from service.papers.kwon_tables import in_plane, plane
+from service.papers.pahk import machine_inputs
+from service.papers.pahk_printed import Cmm
+from service.papers.printed import values
+from service.papers.probe_example import EXAMPLE, example
+from service.papers.row import Paper
+from service.papers.words import minus, short
+from service.papers.yang_table3 import bar_line_um, restored_x_mm
+from service.report.plots.comparison import Comparison, comparison_plot
+from service.report.plots.contours import contour_plot
+from service.report.plots.deformed import deformed_grid
+from service.report.plots.facets import Surface, lobing_plot, surface_plot
+from service.report.plots.signed import SignedScale
+
+NODES = 5
+SURFACE_NODES = 41
+"""Of a side of Kwon's square: the paper's nine and four between neighbours; both pictures of a surface share them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """Pictures (``<svg>`` elements) that share a caption."""
+
+    pictures: tuple[str, ...]
+    caption: str
+    kind: Literal["pair", "wide", "three"] = "pair"
+
+
+def figures(paper: Paper) -> list[Figure]:
+    """Pictures of one paper, in its order."""
+    if paper == "pahk":
+        return [_probe(), _machines()]
+    if paper == "yang":
+        return [_laser_and_bar()]
+    if paper == "kwon":
+        return _surfaces()
+    return []
+
+
+def _surfaces() -> list[Figure]:
+    z = plane().z_mm
+    drawn = {c: _surface(c, z) for c in kwon_printed.COMPONENTS}
+    scale = SignedScale.around(*(s.values for s in drawn.values()))
+    text = (
+        f"response surfaces of the position error from the coefficients of Table 1 on the plane that they imply, Z = {z:.3f} mm (the paper"
+        f" states {kwon_printed.PLANE_Z_MM.text} mm; β10 of e_x restored). The readings are not printed."
+        f" The square of ± 1 mm is an assumption from the text: {kwon_printed.POINTS.text} points {kwon_printed.STEP_MM.text} mm apart,"
+        f" stroke of 2 mm. One scale for all three, extremes over {SURFACE_NODES} × {SURFACE_NODES} points."
+    )
+    spatial = tuple(surface_plot(s, scale, key=f"surface-{c}", heading=f"{c} over the plane") for c, s in drawn.items())
+    flat = tuple(contour_plot(s, scale, key=f"contour-{c}", heading=f"{c}, level lines") for c, s in drawn.items())
+    return [Figure(spatial, f"Kwon, Fig. 11: {text}", "three"), Figure(flat, f"Kwon, Fig. 12: level lines of the same {text}", "three")]
+
+
+def _surface(component: str, z_mm: float) -> Surface:
+    line = np.linspace(-1.0, 1.0, SURFACE_NODES)
+    points = square_grid(1.0, 2.0 / (SURFACE_NODES - 1), z_mm)
+    values_um = 1e3 * (regressors(points, IN_PLANE) @ in_plane(component, z_mm))
+    return Surface(line, line, values_um.reshape(SURFACE_NODES, SURFACE_NODES).T, "X in mm", "Y in mm", "µm")  # square_grid runs y fastest
+
+
+def _hemisphere(step_deg: float) -> tuple[F1, F1]:
+    """Colatitudes and longitudes of the upper half of a sphere, rad, equator and full turn included."""
+    low, around = (np.deg2rad(np.arange(0.0, end + step_deg / 2, step_deg)) for end in (90.0, 360.0))
+    return low, around
+
+
+def _probe() -> Figure:
+    found = example()
+    coarse, fine = _hemisphere(6.0), _hemisphere(2.0)
+    relief, chart = found.values_um(*coarse), found.values_um(*fine)
+    scale = SignedScale.around(relief, chart)
+    flat = Surface(np.rad2deg(fine[1]), np.rad2deg(fine[0]), chart, "longitude θ in degrees", "colatitude φ in degrees", "µm")
+    dots = [(float(np.rad2deg(b)), float(np.rad2deg(a))) for a, b in found.calibration.directions_rad]
+    pictures = (
+        lobing_plot(*coarse, relief, scale, key="lobing-3d", heading="Probe error in space, EXAMPLE"),
+        contour_plot(flat, scale, key="lobing-2d", heading="Probe error in plan, EXAMPLE", dots=dots),
+    )
+    caption = (
+        "Pahk, Figs. 3(a) and 3(b), EXAMPLE: the paper's map is not printed. Master sphere, effective ball radius and the 101 directions"
+        f" (dots) are the printed ones (Rs {pahk_printed.SPHERE_MM.text} mm, Reff {pahk_printed.EFFECTIVE_MM.text} mm, every"
+        f" {pahk_printed.PATTERN_STEP_DEG.text}°); the lobing is declared: {EXAMPLE}. Drawn is the map that the calibration recovers"
+        f" (Reff {found.calibration.effective_radius_mm:.4f} mm, map within {short(1e3 * found.largest_mm)} µm of the declared one),"
+        " bilinear between the touches. Positive: the probe triggers late. Dashed: equator of the ball without error."
+    )
+    return Figure(pictures, caption)
+
+
+def _machines() -> Figure:
+    caption = (
+        "Pahk, Figs. 5 and 7(a): volumetric error of CMM A and CMM B, 5 × 5 × 5 nodes, tool relative to workpiece, Y line as datum"
+        " as in the paper. Only the three printed squareness errors are in it: the positional, straightness and angular curves of Figs. 4"
+        " and 6 are lost, so these are not the paper's maps. Dashed: as commanded; solid: with the errors magnified as each picture states."
+    )
+    return Figure(tuple(_machine(cmm) for cmm in pahk_printed.CMMS), caption)
+
+
+def _machine(cmm: Cmm) -> str:
+    volume, squareness = machine_inputs(cmm)
+    kind = pahk_type(cmm.type_name)
+    machine = pahk_machine(kind, np.stack([np.zeros(3), volume], axis=1))
+    lines = [np.linspace(0.0, v, NODES) for v in volume]
+    grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+    nodes = grid.reshape(-1, 3)
+    nothing = np.zeros((len(nodes), 3, 3))
+    deviation = deviation_mm(machine, nodes, motions_from_pahk(kind, nodes, nothing, nothing, squareness)).reshape(grid.shape)
+    heading = f"{cmm.name} ({cmm.type_name}), squareness only"
+    return deformed_grid(grid, 1e3 * deviation, key=f"pahk-{cmm.type_name}", heading=heading)
+
+
+def _laser_and_bar() -> Figure:
+    x = np.array(restored_x_mm())
+    laser, bar, _ = yang_printed.TABLE2["dxx"]
+    data = Comparison(
+        "X in mm",
+        x,
+        "laser, Table 3",
+        np.array(values(yang_printed.TABLE3_LASER)),
+        (
+            (f"line of the ball bar, slope {minus(bar.text)}", np.array(bar_line_um())),
+            (f"line of the laser, slope {minus(laser.text)}", laser.value * x * 1e3),
+        ),
+    )
+    caption = (
+        "Yang and Kim, Fig. 7: δxx (EXX) by laser (Table 3, the eighth position restored to 254.0 mm) with the two first-order lines of"
+        " Table 2. Below: laser minus the ball bar's line."
+    )
+    return Figure((comparison_plot(data, key="yang-dxx", heading="δxx: laser against ball bar"),), caption, kind="wide")

@@ -1,0 +1,205 @@
+"""Printed against computed: one row a number. What became of it is decided here, from the numbers, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from decimal import ROUND_HALF_UP, Decimal
+from typing import Any, Literal
+
+from service.papers.compare import Computed, Fit, agrees, fit, within_if_padded
+from service.papers.printed import Printed
+
+Paper = Literal["pahk", "kwon", "yang", "wang"]
+Status = Literal["reproduced", "consistent", "differs", "input", "not reproducible"]
+Source = Literal["paper", "math.md"]
+_OF_FIT: dict[Fit, Status] = {
+    "equal": "reproduced",
+    "rounding": "consistent",
+    "padding": "consistent",
+    "bound": "consistent",
+    "no": "differs",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Erratum:
+    """What is wrong in print, and the number computed again with that taken into account (None where it cannot be computed)."""
+
+    text: str
+    again: Computed | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One printed number beside ours.
+
+    Attributes
+    ----------
+    paper, where : str
+        Which paper, and its table, equation or section.
+    quantity, unit : str
+    printed : Printed
+    computed : Computed or None
+        In ``unit``; None for an input, and when the paper does not hold what it takes.
+    how : str
+        From which inputs, through which function.
+    why : str
+        Why it differs or cannot be computed, or what the row shows. Never empty for a number that is not computed.
+    erratum : Erratum, optional
+    series : str
+        Name of the column a row belongs to; people see a column in one line when all of it ends alike.
+    again : bool
+        Another row already stands for this printed number: this one looks at it in another way and is not counted.
+    source : "paper" | "math.md"
+        Who printed it.
+    given : bool
+        An input, or zero by construction: there is nothing to compute, so it proves nothing.
+    """
+
+    paper: Paper
+    where: str
+    quantity: str
+    unit: str
+    printed: Printed
+    computed: Computed | None = None
+    how: str = ""
+    why: str = ""
+    erratum: Erratum | None = None
+    series: str = ""
+    again: bool = False
+    source: Source = "paper"
+    given: bool = False
+
+    def __post_init__(self) -> None:
+        """A number that is not computed needs a reason; one that is needs its origin and is no input."""
+        if self.computed is None and not self.why:
+            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is not computed and nobody says why")
+        if self.computed is not None and not self.how:
+            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is computed and nobody says from what")
+        if self.computed is not None and self.given:
+            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is an input and is computed all the same")
+
+    @property
+    def difference(self) -> float | None:
+        """Computed minus printed."""
+        return None if self.computed is None else self.computed.value - self.printed.value
+
+    @property
+    def fit(self) -> Fit | None:
+        """How print and computation agree; None where nothing is computed."""
+        return None if self.computed is None else fit(self.computed, self.printed)
+
+    @property
+    def status(self) -> Status:
+        """What the numbers say.
+
+        Reproduced: equal to the last printed digit. Consistent: not equal, but no farther apart than the rounding of the inputs allows, so
+        print and computation neither confirm nor refute each other to the last digit; the same if that takes zeros that are padding
+        (`remark` says so), and for a bound that holds: it confirms no digit. Input: given, nothing to compute.
+        """
+        if self.fit is None:
+            return "input" if self.given else "not reproducible"
+        return _OF_FIT[self.fit]
+
+    @property
+    def within(self) -> float | None:
+        """How far the two may be apart with this status; None for a bound and where nothing is computed."""
+        if self.computed is None or self.printed.bound:
+            return None
+        if self.fit == "padding":
+            return within_if_padded(self.computed, self.printed)
+        return self.printed.rounding + self.computed.allowance
+
+    @property
+    def remark(self) -> str:
+        """What the status rests on where it is more than a comparison of digits; empty otherwise."""
+        if self.computed is None:
+            return ""
+        if self.printed.bound:
+            return _of_bound(self.computed.value, self.printed)
+        return f"only if {_padding(self.computed, self.printed)}" if self.fit == "padding" else ""
+
+    @property
+    def again_fit(self) -> Fit | None:
+        """How the erratum, taken into account, agrees with print; None without an erratum that can be computed."""
+        return None if self.erratum is None or self.erratum.again is None else fit(self.erratum.again, self.printed)
+
+    @property
+    def explained(self) -> bool | None:
+        """Whether the erratum gives the printed number without any assumption about zeros (`gap` says what it takes)."""
+        return None if self.again_fit is None else self.again_fit not in ("padding", "no")
+
+    @property
+    def gap(self) -> str:
+        """The same in words; empty without an erratum that can be computed."""
+        if self.erratum is None or self.erratum.again is None or self.again_fit is None:
+            return ""
+        if self.again_fit == "padding":
+            return f"explained by the erratum only if {_padding(self.erratum.again, self.printed)}"
+        return {
+            "equal": "explained by the erratum",
+            "bound": "explained by the erratum",
+            "rounding": "explained by the erratum within the rounding of its inputs",
+            "no": "NOT explained",
+        }[self.again_fit]
+
+    def doc(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "paper": self.paper,
+            "where": self.where,
+            "quantity": self.quantity,
+            "unit": self.unit,
+            "printed": self.printed.value,
+            "printed_text": self.printed.text,
+            "printed_is_bound": self.printed.bound,
+            "rounding": self.printed.rounding,
+            "rounding_if_padded": self.printed.rounding_if_padded,
+            "computed": None if self.computed is None else self.computed.value,
+            "allowance": None if self.computed is None else self.computed.allowance,
+            "allowance_because": "" if self.computed is None else self.computed.because,
+            "allowance_if_padded": None if self.computed is None else max(self.computed.allowance, self.computed.allowance_if_padded),
+            "padding_because": "" if self.computed is None else _padding(self.computed, self.printed),
+            "difference": self.difference,
+            "within": self.within,
+            "status": self.status,
+            "remark": self.remark,
+            "how": self.how,
+            "why": self.why,
+            "erratum": None if self.erratum is None else {**asdict(self.erratum), "explained": self.explained, "gap": self.gap},
+            "series": self.series,
+            "again": self.again,
+            "source": self.source,
+        }
+
+
+def stated(paper: Paper, where: str, quantity: str, unit: str, number: Printed, value: float, how: str) -> Row:
+    """Row for a number that math.md states. Where it differs, math.md may have rounded an already rounded number: that is tried."""
+    computed = Computed(value)
+    if agrees(computed, number):
+        return Row(paper, where, quantity, unit, number, computed, how, source="math.md")
+    twice = Computed(_rounded_twice(value, number))
+    if agrees(twice, number):
+        slip = Erratum("math.md rounds a rounded number", twice)
+        return Row(paper, where, quantity, unit, number, computed, how, erratum=slip, source="math.md")
+    digits = abs(value - number.value) / (2.0 * number.rounding)
+    why = f"off by {digits:.1f} units of the last digit that math.md states"
+    return Row(paper, where, quantity, unit, number, computed, how, why, source="math.md")
+
+
+def _rounded_twice(value: float, number: Printed) -> float:
+    once = Decimal(repr(value)).quantize(Decimal(1).scaleb(number.exponent - 1), ROUND_HALF_UP)
+    return float(once.quantize(Decimal(1).scaleb(number.exponent), ROUND_HALF_UP))
+
+
+def _of_bound(value: float, number: Printed) -> str:
+    size = abs(value)
+    if fit(Computed(value), number) != "bound":
+        return f"bound broken: {size:.8g} against {number.text}"
+    if size > number.value:
+        return f"bound holds within its printed rounding: {size:.8g} exceeds {number.text} by {size - number.value:.1e}"
+    return "bound holds"
+
+
+def _padding(computed: Computed, number: Printed) -> str:
+    return "; ".join(dict.fromkeys(reason for reason in (number.padding, computed.padding) if reason))

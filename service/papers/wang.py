@@ -1,0 +1,60 @@
+"""Wang, section IV (math.md 8): the numbers of the error discussion. Part I holds no measured data."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from models.wang.mirror import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
+from service.papers import wang_printed as paper
+from service.papers.compare import Computed
+from service.papers.row import Erratum, Row
+
+CUBE = np.ones(3)
+
+
+def rows() -> list[Row]:
+    """Every row of the paper, in its order."""
+    share = float(projection_factors(CUBE)[0])
+    # The text writes the factor as "one over root three squared": read literally a third.
+    literal = Erratum("the text writes 1/√3²; 1/√3 is meant", Computed(share))
+    of_cube = "projection_factors of a cube"
+    return [
+        Row("wang", "IV.A", "share of an axis' error seen on the diagonal", "", paper.PROJECTION, Computed(share), of_cube),
+        Row(
+            "wang",
+            "IV.A",
+            "the same as the text writes it, 1/√3²",
+            "",
+            paper.PROJECTION,
+            Computed(share**2),
+            of_cube,
+            erratum=literal,
+            again=True,
+        ),
+        Row("wang", "IV.A", "factor on the resolution", "", paper.RESOLUTION, Computed(1.0 / share), f"1 / {of_cube}"),
+        _cosine(),
+        _mirror(),
+    ]
+
+
+def _cosine() -> Row:
+    misaligned = math.atan(paper.BEAM_MM_PER_M.value * 1e-3)
+    computed = Computed(cosine_error(misaligned) * 1e6)
+    how = "cosine_error of 1 mm in 1 m"
+    why = "second order of the angle; the paper gives an upper bound"
+    return Row("wang", "IV.B", "cosine error, beam askew by 1 mm in 1 m", "µm/m", paper.COSINE_UM_PER_M, computed, how, why)
+
+
+def _mirror() -> Row:
+    beam = diagonal_beam(CUBE, "ppp")
+    tilt = np.array([paper.MIRROR_MRAD.value * 1e-3, 0.0])
+    step = paper.STEP_MM.value * tilt_axes(beam)[:1]
+    computed = Computed(1e3 * abs(float(reading_mm(step, mirror_normal(beam, tilt), beam)[0])))
+    how = "reading_mm of a 50 mm step across the beam to a mirror_normal tilted by 0.5 mrad"
+    why = (
+        "the paper gives an upper bound. It calls the error constant and removable by calculation: that takes 12 slopes away with it and"
+        " leaves only 3 squarenesses and one weighted scale (math.md 5.4)"
+    )
+    return Row("wang", "IV.C", "mirror askew by 0.5 mrad, step of 50 mm", "µm", paper.MIRROR_UM, computed, how, why)

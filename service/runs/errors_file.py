@@ -1,0 +1,185 @@
+"""An errors file (``abbe-errors/1``) as error motions that can be evaluated, with what the file says about its own limits."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from models.arrays import F2
+from models.functions.axis_function import AxisFunction
+from models.functions.bspline import BSpline
+from models.functions.legendre import Legendre
+from models.functions.motions import SQUARENESS, ErrorMotions
+from models.functions.polynomial import Polynomial
+from models.functions.table import Table
+from models.geometry.covariance import checked_covariance
+from service.errors import FileFormatError
+from service.explain import nearest, shown
+from service.runs import formats
+from service.runs.checks import check, read_json
+
+NOT_GIVEN = "no uncertainty given in the errors file"
+_KINDS: Mapping[str, type[BaseModel]] = MappingProxyType(
+    {"polynomial": formats.Polynomial, "table": formats.Tabulated, "legendre": formats.LegendreSeries, "bspline": formats.Spline}
+)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownErrors:
+    """What an errors file says.
+
+    Parameters
+    ----------
+    motions : ErrorMotions
+    covariance : (names, matrix) or None
+        Parameters as `ErrorMotions.parameter_names` writes them.
+    uncertainty : str
+        One line: what the uncertainty covers, or why there is none.
+    not_observable : list of dict
+        As the file has them.
+    unused : list of str
+        One line for each key that means nothing here.
+    """
+
+    motions: ErrorMotions
+    covariance: tuple[tuple[str, ...], F2] | None
+    uncertainty: str
+    not_observable: list[dict[str, Any]]
+    unused: list[str]
+
+    def warnings(self) -> list[str]:
+        """One line for each key that is not used, and for each combination of parameters that the measurement could not see."""
+        return [*self.unused, *(f"not observable: {_combination(one)}" for one in self.not_observable)]
+
+
+def read_errors(path: Path) -> KnownErrors:
+    """Read and check an errors file.
+
+    Raises
+    ------
+    FileFormatError
+        For the first mistake: file and key.
+    """
+    if not path.exists():
+        raise FileFormatError(f"{path}: no such file", "give a file with error functions (abbe-errors/1)")
+    document = read_json(path)
+    check(path, document, formats.ErrorsFile)
+    functions = {}
+    for key, one in document["motions"].items():
+        try:
+            functions[key] = axis_function(one)
+        except ValueError as err:
+            raise FileFormatError(
+                f"{path}: motions.{key}: {err}", "correct the function; docs/how-to/errors.md describes the kinds"
+            ) from None
+    motions = ErrorMotions(functions, {name: document["squareness_rad"][name] for name in SQUARENESS})
+    covariance, text = _covariance(path, document.get("covariance"), motions)
+    return KnownErrors(motions, covariance, text, document.get("not_observable") or [], _unused(path, document))
+
+
+def axis_function(one: Mapping[str, Any]) -> AxisFunction:
+    """The function that one entry of ``motions`` describes.
+
+    Raises
+    ------
+    ValueError
+        An impossible function: positions that do not rise, knots that decrease, no coefficient.
+    """
+    if one["kind"] == "polynomial":
+        return Polynomial(one["coefficients"], one["origin_mm"])
+    if one["kind"] == "legendre":
+        return Legendre(one["coefficients"], one["stroke_mm"])
+    if one["kind"] == "bspline":
+        return BSpline(one["knots_mm"], one["coefficients"], one["degree"])
+    return Table(one["position_mm"], one["value"], one["interpolation"])
+
+
+def _covariance(path: Path, given: Mapping[str, Any] | None, motions: ErrorMotions) -> tuple[tuple[tuple[str, ...], F2] | None, str]:
+    if given is None:
+        return None, NOT_GIVEN
+    names = _names(path, given.get("parameters"))
+    matrix = _matrix(path, given.get("matrix"), len(names))
+    known = set(motions.parameter_names())
+    strange = [name for name in names if name not in known]
+    if strange:
+        more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
+        return (
+            None,
+            f"no uncertainty: the covariance of the errors file speaks of {strange[0]!r}{more}, which is no parameter of its functions",
+        )
+    return (names, matrix), _covered(names, motions)
+
+
+def _names(path: Path, names: Any) -> tuple[str, ...]:
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise FileFormatError(f"{path}: covariance.parameters: expected a list of names, got {shown(names)}", 'e.g. ["C0Y", "EXX.1"]')
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise FileFormatError(f"{path}: covariance.parameters: {twice!r} stands there twice", "name each parameter once")
+    return tuple(names)
+
+
+def _matrix(path: Path, rows: Any, size: int) -> F2:
+    where = f"{path}: covariance.matrix"
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, list) for row in rows):
+        raise FileFormatError(f"{where}: expected rows of finite numbers, got {shown(rows)}")
+    strange = [value for row in rows for value in row if isinstance(value, bool) or not isinstance(value, int | float)]
+    if strange or any(len(row) != len(rows[0]) for row in rows):
+        raise FileFormatError(f"{where}: expected rows of numbers, all equally long, got {shown(strange[0] if strange else rows)}")
+    if (len(rows), len(rows[0])) != (size, size):
+        raise FileFormatError(f"{where}: expected {size} x {size} numbers, got {len(rows)} rows of {len(rows[0])}")
+    try:
+        return checked_covariance(np.array(rows, dtype=np.float64), size, where)
+    except ValueError as err:
+        raise FileFormatError(str(err), "correct the matrix, or leave the covariance out") from None
+
+
+def _covered(names: tuple[str, ...], motions: ErrorMotions) -> str:
+    certain = [name for name, value in motions.squareness_rad.items() if value != 0.0 and name not in names]
+    named = set(names)
+    for key, function in motions.functions.items():
+        left = [k for k in np.flatnonzero(function.parameters).tolist() if f"{key}.{k}" not in named]
+        whole = not any(f"{key}.{k}" in named for k in range(function.parameters.size))
+        certain += ([key] if left else []) if whole else _runs(key, left)
+    text = f"u from the covariance of the errors file ({len(names)} parameters)"
+    return text + (f"; without uncertainty there, so counted as certain: {', '.join(certain)}" if certain else "")
+
+
+def _runs(key: str, indices: list[int]) -> list[str]:
+    """``EXX.1``, or ``EXX.1 to EXX.50`` for parameters that follow each other."""
+    ends: list[list[int]] = []
+    for k in indices:
+        if ends and k == ends[-1][-1] + 1:
+            ends[-1] = [ends[-1][0], k]
+        else:
+            ends.append([k])
+    return [" to ".join(f"{key}.{k}" for k in run) for run in ends]
+
+
+def _unused(path: Path, document: Mapping[str, Any]) -> list[str]:
+    """Keys that the format does not know, at every place but ``not_observable``, which is repeated as it is."""
+    places: list[tuple[str, Mapping[str, Any], Iterable[str]]] = [("", document, formats.ErrorsFile.model_fields)]
+    places.append(("squareness_rad.", document["squareness_rad"], SQUARENESS))
+    places += [(f"motions.{key}.", one, _KINDS[one["kind"]].model_fields) for key, one in document["motions"].items()]
+    places.append(("covariance.", document.get("covariance") or {}, ("parameters", "matrix")))
+    return [
+        f"{path}: key '{place}{key}' is not used ({nearest(key, valid)})"
+        for place, part, valid in places
+        for key in part
+        if key not in valid
+    ]
+
+
+def _combination(one: Mapping[str, Any]) -> str:
+    parts = one.get("combination")
+    text = shown(parts)
+    if isinstance(parts, dict) and parts and all(isinstance(factor, int | float) for factor in parts.values()):
+        text = " + ".join(name if factor == 1 else f"{factor:g} {name}" for name, factor in parts.items()).replace("+ -", "- ")
+    return f"{text} ({one['why']})" if one.get("why") else text

@@ -1,0 +1,75 @@
+"""JSON text read strictly: what Python's own reader takes silently, or lets end in a traceback, is one FileFormatError."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NoReturn
+
+from service.errors import FileFormatError
+
+MAX_DIGITS = 308
+"""Longer integers are beyond float64 (and beyond 4300 digits Python refuses to read them at all)."""
+
+
+def refuse_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """``object_pairs_hook`` of ``json.loads``: an object whose keys are all different.
+
+    Raises
+    ------
+    ValueError
+        A key stands twice; of the two values only the last would have been seen.
+    """
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"key {key!r} stands twice in one object")
+        found[key] = value
+    return found
+
+
+def strict_json(text: str, path: Path, *, finite: bool = True) -> Any:
+    """Value of a JSON text.
+
+    Parameters
+    ----------
+    text : str
+    path : Path
+        File that the text comes from, for the messages.
+    finite : bool
+        Refuse ``NaN``, ``Infinity`` and numbers beyond float64 such as ``1e999``. Callers who check numbers themselves, and can say where
+        in the document one stands, give False.
+
+    Raises
+    ------
+    FileFormatError
+        No JSON, a key twice in one object, nested too deeply, an integer of more than 308 digits, or (``finite``) a number that is none.
+    """
+    strict: dict[str, Any] = {"parse_constant": _refuse, "parse_float": _finite} if finite else {}
+    try:
+        return json.loads(text, object_pairs_hook=refuse_duplicates, parse_int=_integer, **strict)
+    except json.JSONDecodeError as err:
+        raise FileFormatError(f"{path}: line {err.lineno}, column {err.colno}: not JSON: {err.msg}", "correct the file") from None
+    except RecursionError:
+        raise FileFormatError(f"{path}: nested too deeply", "correct the file") from None
+    except ValueError as err:
+        raise FileFormatError(f"{path}: {err}", "correct the file") from None
+
+
+def _integer(digits: str) -> int:
+    if len(digits.lstrip("-")) > MAX_DIGITS:
+        raise ValueError(f"an integer of {len(digits.lstrip('-'))} digits ({digits[:12]}...), expected at most {MAX_DIGITS}")
+    return int(digits)
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        _refuse(digits)
+    return value
+
+
+def _refuse(word: str) -> NoReturn:
+    raise ValueError(f"expected finite numbers, got {word[:30]}")

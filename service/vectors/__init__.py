@@ -1,0 +1,1 @@
+"""`abbe vectors`: independent vector files through the public functions."""

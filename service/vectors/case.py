@@ -1,0 +1,212 @@
+"""A vector file as its reader sees it: every number that is looked at is remembered, so that nothing is left out unnoticed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from models.arrays import F1
+from service.errors import FileFormatError
+
+Path = tuple[str | int, ...]
+Shape = tuple[int | None, ...]
+
+
+LAYOUT = "compare the file with the layout of shared/vectors"
+
+
+class Seen(set[Path]):
+    """Paths of the numbers of a file that were read so far, and the last part that was looked at, for messages."""
+
+    last: Path = ()
+
+
+class Case:
+    """One object, list or number of a vector file.
+
+    Parameters
+    ----------
+    value : JSON value
+    path : tuple of keys and indices from the top of the file, the file name first
+    seen : paths of the numbers read so far, shared by all parts of a file
+    """
+
+    def __init__(self, value: Any, path: Path, seen: Seen | None = None) -> None:
+        self.value = value
+        self.path = path
+        self._seen = Seen() if seen is None else seen
+
+    @property
+    def label(self) -> str:
+        """Where this stands, as a person reads it."""
+        return "/".join(str(p) for p in self.path)
+
+    @property
+    def last(self) -> str:
+        """Part of the file that was looked at last."""
+        return "/".join(str(p) for p in self._seen.last or self.path)
+
+    def at(self, *keys: str | int) -> Case:
+        """Part under nested keys or indices.
+
+        Raises
+        ------
+        FileFormatError
+            There is none.
+        """
+        here: Any = self.value
+        for k, key in enumerate(keys):
+            try:
+                here = here[key]
+            except (KeyError, IndexError, TypeError):
+                where = "/".join(str(p) for p in (*self.path, *keys[:k]))
+                raise FileFormatError(f"{where}: {key!r} is missing", LAYOUT) from None
+        self._seen.last = (*self.path, *keys)
+        return Case(here, (*self.path, *keys), self._seen)
+
+    def has(self, key: str) -> bool:
+        """Whether an object holds a key."""
+        return isinstance(self.value, dict) and key in self.value
+
+    def keys(self) -> list[str]:
+        """Keys of an object, in file order.
+
+        Raises
+        ------
+        FileFormatError
+            It is no object, or an empty one: nothing would be compared, unnoticed.
+        """
+        if not isinstance(self.value, dict):
+            raise FileFormatError(f"{self.label}: expected an object, got {type(self.value).__name__}", LAYOUT)
+        if not self.value:
+            raise FileFormatError(f"{self.label}: expected at least one key, the object is empty", LAYOUT)
+        return list(self.value)
+
+    def items(self) -> Iterator[tuple[str, Case]]:
+        """Key and part of an object, in file order; never of an empty one."""
+        for key in self.keys():
+            yield key, self.at(key)
+
+    def named(self, *names: str) -> Iterator[tuple[str, Case]]:
+        """Key and part of an object that must have these keys and no others, in the order of ``names``.
+
+        Raises
+        ------
+        FileFormatError
+            It is no object, or one of the keys is missing or unknown.
+        """
+        unknown = [key for key in self.keys() if key not in names]
+        if unknown:
+            raise FileFormatError(f"{self.label}: key {unknown[0]!r} is unknown", f"known: {', '.join(names)}")
+        for name in names:
+            yield name, self.at(name)
+
+    def parts(self, *, or_none: bool = False) -> list[Case]:
+        """Elements of a list.
+
+        Raises
+        ------
+        FileFormatError
+            It is no list, or (unless ``or_none``) an empty one: nothing would be compared, unnoticed.
+        """
+        if not isinstance(self.value, list):
+            raise FileFormatError(f"{self.label}: expected a list, got {type(self.value).__name__}", LAYOUT)
+        if not self.value and not or_none:
+            raise FileFormatError(f"{self.label}: expected at least one element, the list is empty", LAYOUT)
+        return [self.at(k) for k in range(len(self.value))]
+
+    def number(self, *keys: str | int) -> float:
+        """One finite number under nested keys.
+
+        Raises
+        ------
+        FileFormatError
+            It is missing or no finite number.
+        """
+        part = self.at(*keys) if keys else self
+        values = list(_leaves(part.value, part.path))
+        if len(values) != 1 or isinstance(part.value, (list, dict)):
+            raise FileFormatError(f"{part.label}: expected one number", LAYOUT)
+        return float(part.array())
+
+    def array(self, *keys: str | int, shape: Shape | None = None) -> F1:
+        """Finite numbers of a (nested) list as an array of float64.
+
+        Parameters
+        ----------
+        *keys : str or int
+            Where it is.
+        shape : tuple, optional
+            What it must be, None where any length will do.
+
+        Raises
+        ------
+        FileFormatError
+            It is missing, empty, ragged, of another shape, or holds something that is no finite number.
+        """
+        part = self.at(*keys) if keys else self
+        for path, value in _leaves(part.value, part.path):
+            _demand_number(path, value)
+            self._seen.add(path)
+        try:
+            found = np.asarray(part.value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise FileFormatError(f"{part.label}: expected numbers in rows of equal length", LAYOUT) from None
+        if not found.size:
+            raise FileFormatError(f"{part.label}: expected at least one number, got none", LAYOUT)
+        if shape is not None and (
+            found.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, found.shape, strict=True))
+        ):
+            wanted = " x ".join("n" if n is None else str(n) for n in shape)
+            raise FileFormatError(f"{part.label}: expected {wanted} numbers, got shape {found.shape}", LAYOUT)
+        return found
+
+    def text(self, *keys: str | int) -> str:
+        """A string under nested keys."""
+        part = self.at(*keys) if keys else self
+        if not isinstance(part.value, str):
+            raise FileFormatError(f"{part.label}: expected a text, got {type(part.value).__name__}", LAYOUT)
+        return part.value
+
+    def skip(self) -> int:
+        """Mark all numbers of this part as looked at without comparing them; their count. For `Checks.not_computable` only.
+
+        Raises
+        ------
+        FileFormatError
+            One of them is no finite number.
+        """
+        numbers = [(path, value) for path, value in _leaves(self.value, self.path) if not isinstance(value, str | None)]
+        if not numbers:
+            raise FileFormatError(f"{self.label}: expected numbers", LAYOUT)
+        for path, value in numbers:
+            _demand_number(path, value)
+            self._seen.add(path)
+        return len(numbers)
+
+    def unread(self) -> list[str]:
+        """Numbers of this part that nobody has looked at."""
+        return [
+            "/".join(map(str, path))
+            for path, value in _leaves(self.value, self.path)
+            if not isinstance(value, str | None) and path not in self._seen
+        ]
+
+
+def _demand_number(path: Path, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise FileFormatError(f"{'/'.join(map(str, path))}: expected a finite number, got {value!r}", "restore the file")
+
+
+def _leaves(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from _leaves(part, (*path, key))
+    elif isinstance(value, list):
+        for k, part in enumerate(value):
+            yield from _leaves(part, (*path, k))
+    else:
+        yield path, value

@@ -1,0 +1,119 @@
+"""wang_step_diagonal.json: simulated step diagonals with and without tilt, squareness, ranks and the demonstration of math.md 5.5."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.functions.monomials import ErrorArrays
+from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from models.solvers.designs import ranks
+from models.solvers.step_diagonal import closure_mm, demeaned, increments, squareness_contrast, wang_eq7, wang_four
+from models.wang.experiments import problem
+from models.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm
+from models.wang.model import displacement_eq11, exact_positions_mm
+from models.wang.squareness import AcuteSquareness, diagonal_totals_eq12, squareness_eq13_printed
+from service.errors import FileFormatError
+from service.vectors.case import LAYOUT, Case
+from service.vectors.checks import Checks
+from service.vectors.wang_demo import DEMO_PLANS, RANK_PLANS, RANK_POSITIONS, RANK_STEPS, demonstration
+
+LAST = "last digits"
+CURVES = tuple(i + a for a in "XYZ" for i in "XYZ")
+
+
+def read(case: Case, checks: Checks) -> None:
+    """Every case, then squareness, ranks and the demonstration."""
+    n = case.number("n")
+    if n != int(n):
+        raise FileFormatError(f"{case.label}/n: expected a whole number, got {n!r}", "")
+    inc = case.array("inc", shape=(3,))
+    for _ in case.at("compensation_demo").named("metric", *DEMO_PLANS):
+        pass  # all must be there; they are computed last
+    for _, part in case.at("cases").items():
+        _readings(part, checks, int(n), inc)
+        _curves(part, checks, int(n), inc)
+    _squareness(case.at("squareness"), checks)
+    checks.assume(
+        f"the ranks are of {RANK_STEPS} steps per diagonal and {RANK_POSITIONS} positions per straight line: only with these all effective "
+        "ranks come out"
+    )
+    for key, part in case.at("ranks").named(*RANK_PLANS):
+        plan = RANK_PLANS[key](int(n) * inc)
+        if len(part.parts()) != len(case.at("ranks", next(iter(RANK_PLANS))).parts()):
+            raise FileFormatError(f"{part.label}: expected as many degrees as the other experiments", LAYOUT)
+        found = [ranks(*problem(plan, degree + 1)) for degree in range(len(part.parts()))]
+        checks.compare("rank and effective rank", found, part, unit="1")
+    demonstration(case, checks, int(n), inc, errors_of)
+
+
+def errors_of(part: Case, axes_mm: F2, travel_mm: F1) -> ErrorArrays:
+    """The machine of a case: ``d_coef["YX"]`` powers 1, 2, .. of x / travel in delta_y(X) (mm), ``a_coef`` likewise (rad)."""
+    u = np.asarray(axes_mm) / travel_mm
+    d, e = np.zeros((len(u), 3, 3)), np.zeros((len(u), 3, 3))
+    for out, key in ((d, "d_coef"), (e, "a_coef")):
+        for i in range(3):
+            for j in range(3):
+                c = part.array(key, "XYZ"[i] + "XYZ"[j], shape=(None,))
+                out[:, i, j] = sum(v * u[:, j] ** (k + 1) for k, v in enumerate(c))
+    xy, yz, xz = part.array("txy_tyz_txz", shape=(3,))
+    return ErrorArrays(d, e, np.array([xy, xz, yz]))
+
+
+def tilts_of(part: Case) -> dict[str, F1]:
+    """Mirror tilts of a case, two angles per diagonal; none: ideal mirrors."""
+    if not part.at("tilt").value:
+        return {}
+    return {name: angles.array(shape=(2,)) for name, angles in part.at("tilt").named(*DIAGONALS)}
+
+
+def _readings(part: Case, checks: Checks, n: int, inc: F1) -> None:
+    tilts, travel = tilts_of(part), n * inc
+    box = np.stack([np.zeros(3), travel], axis=1)
+    for name in DIAGONALS:
+        path = step_diagonal(*diagonal_ends(box, name), n, back=False)
+        beam = diagonal_beam(inc, name)
+        mirror = mirror_normal(beam, tilts.get(name, np.zeros(2)))
+        found = step_readings_mm(path, exact_positions_mm(errors_of(part, path, travel), path), beam, mirror)
+        stored, rounding = part.at("readings", name), "difference of positions of up to 1000 mm"
+        checks.compare("readings, exact", found, stored, unit="mm", floor=6e-13, rounding=rounding)
+
+
+def _curves(part: Case, checks: Checks, n: int, inc: F1) -> None:
+    """Everything that follows from the readings of the file themselves."""
+    q = increments({name: part.array("readings", name) for name in DIAGONALS})
+    for name, values in q.items():
+        checks.compare("q", values, part.at("q", name), unit="mm", floor=1e-17, rounding=LAST)
+    seven, four, flat = wang_eq7(q, inc), wang_four(q, inc), wang_eq7(demeaned(q), inc)
+    for key, found in (("wang_eq7", seven), ("wang_lsq4", four), ("wang_demeaned", flat)):
+        for name, stored in part.at(key).named(*CURVES):
+            checks.compare(key, found["XYZ".index(name[0]), "XYZ".index(name[1])], stored, unit="mm", floor=2e-16, rounding=LAST)
+    for name, stored in part.at("truth_eq11_translational").named(*CURVES):
+        i, a = "XYZ".index(name[0]), "XYZ".index(name[1])
+        line = np.outer(np.arange(n + 1) * inc[a], np.eye(3)[a])
+        true = displacement_eq11(errors_of(part, line, n * inc), line)[:, i, a]
+        checks.compare("truth, eq (11) on the axis", true, stored, unit="mm", floor=1e-17, rounding=LAST)
+        worst, error = np.abs(seven[i, a] - true).max(), part.at("max_abs_error_eq7", name)
+        checks.compare("largest error of eq (7)", worst, error, unit="mm", floor=2e-16, rounding=LAST)
+    checks.compare("closure", np.abs(closure_mm(q)).max(), part.at("closure_max"), unit="mm", floor=1e-17, rounding=LAST)
+
+
+def _squareness(part: Case, checks: Checks) -> None:
+    length, scale = part.array("L", shape=(3,)), part.array("scale_ppm", shape=(3,))
+    acute = AcuteSquareness(*(-part.number("theta_obtuse", k) for k in ("tyz", "txz", "txy")))
+    for name, total in diagonal_totals_eq12(acute, length, scale).items():
+        stored, rounding = part.at("dR_total", name), "difference of two lengths of 1024 mm"
+        checks.compare("totals, eq (12) with scales", total, stored, unit="mm", floor=6e-13, rounding=rounding)
+    totals = {name: part.number("dR_total", name) for name in DIAGONALS}
+    printed = squareness_eq13_printed(totals, length)
+    contrast = squareness_contrast(totals, length)
+    pairs = (
+        ("squareness, eq (13) as printed", "printed_eq13_acute", "tyz", printed.theta_yz),
+        ("squareness, eq (13) as printed", "printed_eq13_acute", "tzx", printed.theta_zx),
+        ("squareness, eq (13) as printed", "printed_eq13_acute", "txy", printed.theta_xy),
+        ("squareness, contrasts", "contrast_obtuse", "tyz", contrast.theta_yz),
+        ("squareness, contrasts", "contrast_obtuse", "txz", contrast.theta_xz),
+        ("squareness, contrasts", "contrast_obtuse", "txy", contrast.theta_xy),
+    )
+    for name, key, letter, value in pairs:
+        checks.compare(name, value, part.at(key, letter), unit="rad", floor=1e-19, rounding=LAST)

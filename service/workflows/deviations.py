@@ -1,0 +1,259 @@
+"""`abbe errors`: the deviation of a machine with known error motions at given points, with its uncertainty where the file gives one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from models.arrays import F1, F2, F3
+from models.functions.motions import REVERSE, ErrorMotions
+from models.geometry.chain import deviation_mm, exact_deviation_mm
+from models.geometry.propagation import Points, deviation_covariance
+from models.machine import AXES, Machine
+from service.config import load_machine, read_toml
+from service.config_schema import MachineFile
+from service.errors import ConfigError, FileFormatError
+from service.explain import nearest
+from service.runs.checks import check, read_json
+from service.runs.errors_file import KnownErrors, read_errors
+from service.runs.machine_object import MachineObject
+from service.runs.points import POSITION, TOOL, PointsFile, read_points
+from service.site import machine_from_doc
+
+FORMAT = "abbe-deviations/1"
+MEANING = "actual minus nominal, tool relative to workpiece; rigid motion not removed; squareness counts from axis zero"
+SLACK_MM = 1e-9
+"""A point on the end of a stroke may be off by rounding."""
+CHUNK = 65_536
+"""Points that are evaluated at a time."""
+ROWS = 4096
+"""Points that are written at a time."""
+
+Model = Literal["first-order", "exact"]
+
+
+@dataclass(frozen=True, slots=True)
+class Deviations:
+    """Deviation at points.
+
+    Parameters
+    ----------
+    machine : str
+        Name of the machine.
+    model : "first-order" or "exact"
+    points : PointsFile
+    deviation_mm : array, shape (n, 3)
+    u_mm : array, shape (n, 4), or None
+        Standard uncertainty of dX, dY, dZ and of the norm (`standard_uncertainty_mm`). None: the errors file gives no uncertainty.
+    uncertainty : str
+        One line about it.
+    not_observable : list of dict
+        As the errors file has them.
+    warnings : list of str
+        What a user has to know about these numbers.
+    """
+
+    machine: str
+    model: Model
+    points: PointsFile
+    deviation_mm: F2
+    u_mm: F2 | None
+    uncertainty: str
+    not_observable: list[dict[str, Any]]
+    warnings: list[str]
+
+    @property
+    def norm_mm(self) -> F1:
+        """Length of the deviation, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.deviation_mm, axis=1), dtype=np.float64)
+
+
+def standard_uncertainty_mm(deviation_mm: F2, covariance_mm2: F3) -> F2:
+    """Standard uncertainty of dX, dY, dZ and of the norm.
+
+    The norm's is that along the deviation, the linear term. Where the norm is at most twice the uncertainty of the worst direction (root
+    of the covariance's largest eigenvalue), the direction itself is uncertain, so the linear term says too little, and nothing at all at
+    norm zero: there it is the uncertainty of the worst direction.
+
+    Parameters
+    ----------
+    deviation_mm : array, shape (n, 3)
+    covariance_mm2 : array, shape (n, 3, 3)
+
+    Returns
+    -------
+    array, shape (n, 4)
+        NaN where the covariance is not finite.
+    """
+    finite = np.asarray(np.isfinite(covariance_mm2).all(axis=(1, 2)))
+    covariance = np.where(finite[:, None, None], covariance_mm2, 0.0)
+    norm: F1 = np.asarray(np.linalg.norm(deviation_mm, axis=1))
+    along = np.divide(deviation_mm, norm[:, None], out=np.zeros_like(deviation_mm), where=norm[:, None] > 0.0)
+    of_norm = np.einsum("ni,nij,nj->n", along, covariance, along)
+    near = np.flatnonzero(norm * norm <= 4.0 * np.trace(covariance, axis1=1, axis2=2))  # the trace bounds the largest eigenvalue
+    worst = np.linalg.eigvalsh(covariance[near])[:, -1]
+    of_norm[near] = np.where(norm[near] ** 2 <= 4.0 * worst, worst, of_norm[near])
+    variances = np.concatenate([np.diagonal(covariance, axis1=1, axis2=2), of_norm[:, None]], axis=1)
+    variances[~finite] = np.nan
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)), dtype=np.float64)
+
+
+def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exact: bool = False) -> Deviations:
+    """Evaluate a machine's error motions at points.
+
+    Parameters
+    ----------
+    machine_path : Path
+        Abbe's machine file (TOML), or a machine object (run-format.md 1) as TOML or JSON.
+    errors_path : Path
+        ``abbe-errors/1``.
+    points_path : Path
+        CSV, see `service.runs.points.read_points`.
+    exact : bool
+        Finite rotations (docs/conventions.md) in place of rule G.
+
+    Raises
+    ------
+    ConfigError, FileFormatError
+        One of the files is missing or wrong, or a point lies outside the strokes.
+    """
+    name, machine, notes = read_machine(machine_path)
+    with np.errstate(all="ignore"):  # what overflows is looked for, and said in words
+        known = read_errors(errors_path)
+        points = read_points(points_path)
+        _check_strokes(machine, points)
+        off, u = _evaluate(machine, known, points, exact=exact)
+        _check_finite(errors_path, points, off, u)
+    notes += [*known.warnings(), *_notes(known, points)]
+    return Deviations(name, "exact" if exact else "first-order", points, off, u, known.uncertainty, known.not_observable, notes)
+
+
+def _evaluate(machine: Machine, known: KnownErrors, points: PointsFile, *, exact: bool) -> tuple[F2, F2 | None]:
+    """Deviation, shape (n, 3), and uncertainties, shape (n, 4), piece by piece: only these are kept of a million points."""
+    at = Points(points.axes_mm, points.direction, points.tool_mm)
+    count = points.axes_mm.shape[0]
+    off: F2 = np.empty((count, 3))
+    u: F2 | None = None if known.covariance is None else np.empty((count, 4))
+    for start in range(0, count, CHUNK):
+        rows = slice(start, start + CHUNK)
+        some = at.rows(rows)
+        values = known.motions.motions(some.axes_mm, some.direction)
+        off[rows] = (exact_deviation_mm if exact else deviation_mm)(machine, some.axes_mm, values, some.tool_mm)
+        if u is not None and known.covariance is not None:
+            covariance = deviation_covariance(machine, known.motions, known.covariance, some, exact=exact)
+            u[rows] = standard_uncertainty_mm(off[rows], covariance)
+    return off, u
+
+
+def read_machine(path: Path) -> tuple[str, Machine, list[str]]:
+    """Name and nominal geometry from Abbe's machine file or from a machine object, TOML or JSON, and what is strange about it.
+
+    Raises
+    ------
+    ConfigError, FileFormatError
+        File, key, and what is expected there.
+    """
+    if path.suffix.lower() == ".json":
+        if not path.exists():
+            raise ConfigError(f"machine file {path} does not exist", "give the path of a machine file (TOML or JSON)")
+        document = read_json(path)
+    else:
+        document = json.loads(json.dumps(read_toml(path), default=str))  # a date is text there, as in every other machine object
+        own, found = set(MachineFile.model_fields), set(document)
+        if found & (own - set(MachineObject.model_fields)) or ("name" in found and found <= own):
+            loaded = load_machine(path).machine
+            return loaded.name, machine_from_doc(loaded.machine_doc()), []
+    check(path, document, MachineObject)
+    strange = sorted(set(document) - set(MachineObject.model_fields))
+    notes = [f"{path}: key {key!r} is not used ({nearest(key, MachineObject.model_fields)})" for key in strange]
+    plain = {key: value for key, value in document.items() if value is not None}
+    plain["pivots_mm"] = {axis: point for axis, point in (document.get("pivots_mm") or {}).items() if point is not None}
+    return str(document.get("name") or path.stem), machine_from_doc(plain), notes
+
+
+def _check_strokes(machine: Machine, points: PointsFile) -> None:
+    low, high = machine.stroke_mm[:, 0] - SLACK_MM, machine.stroke_mm[:, 1] + SLACK_MM
+    outside = (points.axes_mm < low) | (points.axes_mm > high)
+    rows = np.flatnonzero(outside.any(axis=1))
+    if rows.size:
+        index, axis = int(rows[0]), int(np.argmax(outside[rows[0]]))
+        stroke = f"the stroke of {AXES[axis]}, {machine.stroke_mm[axis, 0]:g} to {machine.stroke_mm[axis, 1]:g} mm"
+        more = f" (and {rows.size - 1} more rows)" if rows.size > 1 else ""
+        raise FileFormatError(
+            f"{points.place(index)}: {POSITION[axis]} = {points.axes_mm[index, axis]:g} is outside {stroke}{more}",
+            "nothing was measured there",
+        )
+
+
+def _check_finite(path: Path, points: PointsFile, off: F2, u: F2 | None) -> None:
+    bad = ~np.isfinite(np.linalg.norm(off, axis=1))
+    if u is not None:
+        bad |= ~np.isfinite(u).all(axis=1)
+    if bad.any():
+        what = "functions" if u is None else "functions or the covariance"
+        raise FileFormatError(
+            f"{path}: the values are too large for a number at {points.place(int(np.argmax(bad)))}", f"correct the {what}"
+        )
+
+
+def _notes(known: KnownErrors, points: PointsFile) -> list[str]:
+    notes = [f"{points.path}: column {name!r} is not used" for name in points.unused]
+    for axis, letter in enumerate(AXES):
+        reverse = [key for key in known.motions.functions if key.endswith(letter + REVERSE)]
+        if reverse and axis not in points.directed:
+            notes.append(f"no column direction_{letter.lower()}: {letter} counts as last moved in +, {', '.join(reverse)} not used")
+    return notes + _ends(known.motions, points)
+
+
+def _ends(motions: ErrorMotions, points: PointsFile) -> list[str]:
+    notes = []
+    for key, function in motions.functions.items():
+        lo, hi = function.domain_mm
+        x = points.axes_mm[:, AXES.index(key.removesuffix(REVERSE)[-1])]
+        count = int(((x < lo - SLACK_MM) | (x > hi + SLACK_MM)).sum())
+        if count:
+            notes.append(f"{key} is known from {lo:g} to {hi:g} mm only: its end value is held at {count} of {x.size} points")
+    return notes
+
+
+def deviations_json(found: Deviations) -> Iterator[str]:
+    """Everything as one JSON object on one line, in pieces: one object per point with the columns of the points file, lengths in mm.
+
+    ``u_`` is a standard uncertainty. Pieces, because a million points as Python objects take more than a gigabyte.
+    """
+    head = {
+        "format": FORMAT,
+        "machine": found.machine,
+        "model": found.model,
+        "meaning": MEANING,
+        "uncertainty": {"given": found.u_mm is not None, "text": found.uncertainty},
+        "not_observable": found.not_observable,
+        "warnings": found.warnings,
+    }
+    yield json.dumps(head, ensure_ascii=False).removesuffix("}") + ', "points": ['
+    norm = found.norm_mm
+    for start in range(0, norm.size, ROWS):
+        columns = _columns(found, norm, slice(start, start + ROWS))
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        yield (", " if start else "") + json.dumps(rows)[1:-1]
+    yield "]}"
+
+
+def _columns(found: Deviations, norm: F1, rows: slice) -> dict[str, list[Any]]:
+    points = found.points
+    columns: dict[str, list[Any]] = dict(zip(POSITION, points.axes_mm[rows].T.tolist(), strict=True))
+    if points.direction is not None:
+        signs = points.direction[rows].astype(int).T.tolist()
+        columns |= {f"direction_{AXES[axis].lower()}": signs[axis] for axis in points.directed}
+    if points.tool_mm is not None:
+        columns |= dict(zip(TOOL, points.tool_mm[rows].T.tolist(), strict=True))
+    columns |= {"deviation_mm": found.deviation_mm[rows].tolist(), "norm_mm": norm[rows].tolist()}
+    if found.u_mm is None:
+        nothing = [None] * len(columns["norm_mm"])
+        return columns | {"u_deviation_mm": nothing, "u_norm_mm": nothing}
+    return columns | {"u_deviation_mm": found.u_mm[rows, :3].tolist(), "u_norm_mm": found.u_mm[rows, 3].tolist()}
