@@ -173,6 +173,7 @@ class BarPeer:
         os.set_blocking(self.master, False)
         self.url = f"serial://{os.ttyname(self.slave)}?baud=460800"
         self.buffer = b""
+        self.unsent = b""
         self.boot_id = 0xCAFE0001
         self.commands: list[tuple[int, int]] = []
         self.asked = asyncio.Event()
@@ -221,11 +222,25 @@ class BarPeer:
             self.stopped.set()
 
     def send(self, data: bytes) -> None:
-        assert os.write(self.master, data) == len(data)
+        """Everything, in order: a pty takes only as much at once as its buffer has room for, so the rest waits its turn."""
+        self.unsent += data
+        self.writable()
+
+    def writable(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            self.unsent = self.unsent[os.write(self.master, self.unsent) :]
+        except BlockingIOError:
+            pass
+        if self.unsent:
+            loop.add_writer(self.master, self.writable)
+        else:
+            loop.remove_writer(self.master)
 
     def unplug(self) -> None:
         if self.master >= 0:
             asyncio.get_running_loop().remove_reader(self.master)
+            asyncio.get_running_loop().remove_writer(self.master)
             os.close(self.master)
             os.close(self.slave)
             self.master = -1
