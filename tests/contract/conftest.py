@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import binascii
+import contextlib
 import os
 import struct
 import tty
@@ -228,10 +229,8 @@ class BarPeer:
 
     def writable(self) -> None:
         loop = asyncio.get_running_loop()
-        try:
+        with contextlib.suppress(BlockingIOError):
             self.unsent = self.unsent[os.write(self.master, self.unsent) :]
-        except BlockingIOError:
-            pass
         if self.unsent:
             loop.add_writer(self.master, self.writable)
         else:
