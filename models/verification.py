@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.arrays import F1
-from models.solvers.joint import bar_normals
 from models.solvers.observations import RunData, nominal_reading
+from models.solvers.observe import bar_normals
 from models.solvers.priors import U_WAVELENGTH
 
 U_REPEAT_MM = 1e-4

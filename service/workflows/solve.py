@@ -10,8 +10,9 @@ import numpy as np
 
 from models.compensation.summary import SCALE_NOTE, mean_linear
 from models.solvers.helix import HelixSolution, fit_run
-from models.solvers.joint import JointSolution, bar_normals, implausible, setup_unknowns, solve_joint
+from models.solvers.joint import JointSolution, implausible, solve_joint
 from models.solvers.observations import RunData, nominal_reading
+from models.solvers.observe import bar_normals, setup_unknowns
 from models.solvers.priors import U_WAVELENGTH, Priors
 from models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
 from service.errors import InstrumentsDisagree, NotObservable

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from models.compensation.summary import mean_linear
-from models.solvers.joint import setup_unknowns, solve_joint
+from models.solvers.joint import solve_joint
+from models.solvers.observe import setup_unknowns
 from models.solvers.priors import Priors
 from models.volumetric import remove_rigid, volume_grid
 from service.runs.observations import run_data

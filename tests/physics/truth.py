@@ -6,8 +6,8 @@ from models.geometry.chain import exact_deviation_mm, travel_sign
 from models.machine import Machine
 from models.paths.helix import helix_points
 from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.joint import perpendicular, with_tool
 from models.solvers.observations import RunData, block_average
+from models.solvers.observe import perpendicular, with_tool
 
 MACHINE = Machine(
     "w-X-Y-b-Z-t",

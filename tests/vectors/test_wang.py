@@ -10,8 +10,8 @@ from models.geometry.chain import travel_sign
 from models.machine import Machine
 from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from models.solvers.identifiability import analyse, project_out
-from models.solvers.joint import run_design, setup_unknowns
 from models.solvers.observations import RunData
+from models.solvers.observe import run_design, setup_unknowns
 from models.solvers.priors import Priors
 from service.vectors.run import check_file
 from tests.vectors.altering import missed
