@@ -1,0 +1,1 @@
+"""Measuring campaigns on the simulated machine without any wire: for statistics over many machines."""

@@ -1,0 +1,157 @@
+"""What a ball-bar and a laser would read on the true machine, run after run, without device protocols: for statistics over many machines.
+
+The formulas are those of `simulators.ballbar.device` and `simulators.laser.device`; the machine is `simulators.truth`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from simulators.arrays import F
+from simulators.laser.device import Mount
+from simulators.scenario import Scenario
+from simulators.truth.draws import UM, URAD, Draws, draw_machine, generator
+from simulators.truth.machine import Geometry, Machine
+from simulators.truth.play import Play
+from simulators.truth.surroundings import drift
+
+STREAM_SETUP, STREAM_NOISE, STREAM_LENGTH, STREAM_SCALE = range(20, 24)
+LEAD_IN_MM = 1.0
+"""Every run is approached in the direction of its first motion, farther than any lost motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """How well one measures: standard deviation of one reading, share and size of outliers, set-up, scale of the laser.
+
+    ``bar_length_sd_mm``: of the error of each bar (one bar per nominal radius). ``pause_s``: between two runs. ``drift``: whether the
+    machine's thermal drift acts.
+    """
+
+    bar_noise_mm: float = 0.5e-3
+    laser_noise_mm: float = 0.3e-3
+    outlier_share: float = 0.005
+    outlier_mm: tuple[float, float] = (5e-3, 50e-3)
+    bar_length_sd_mm: float = 1.0e-3
+    wavelength_sd: float = 0.3e-6
+    pause_s: float = 120.0
+    drift: bool = True
+
+
+class Rig:
+    """One machine under measurement. Runs follow each other: the axes remember where they came from and the clock goes on."""
+
+    def __init__(self, scenario: Scenario, conditions: Conditions | None = None) -> None:
+        self.scenario = scenario
+        self.conditions = conditions or Conditions()
+        self.draws: Draws = draw_machine(scenario)
+        self.geometry = Geometry(scenario.machine)
+        self.time_s = 0.0
+        self.wavelength_error = float(generator(scenario.seed, STREAM_SCALE).normal(scale=self.conditions.wavelength_sd))
+        self._play = Play(self.draws.backlash_mm, self.geometry.high_mm)
+        self._setup = generator(scenario.seed, STREAM_SETUP)
+        self._noise = generator(scenario.seed, STREAM_NOISE)
+
+    def machine(self, tool_mm: F | None = None) -> Machine:
+        """The true machine with another tool; None: its own."""
+        geometry = Geometry(self.scenario.machine)
+        if tool_mm is not None:
+            geometry.tool_mm = np.asarray(tool_mm, dtype=np.float64)
+        return Machine(geometry, self.draws)
+
+    def bar_length_error_mm(self, radius_mm: float) -> float:
+        """True length minus nominal, taken with the sign of the reading (a reading is distance - radius + this), of the bar of a radius."""
+        rng = generator(self.scenario.seed, STREAM_LENGTH, round(1000 * radius_mm))
+        return float(rng.normal(scale=self.conditions.bar_length_sd_mm))
+
+    def cup(self, centre_mm: F, tool_mm: F | None = None) -> F:
+        """Drive to a centre and set up the cup there, a little beside the tool's actual position: where it stands, (3,) mm."""
+        at = self._locate(np.array([self.time_s]), np.asarray(centre_mm, dtype=np.float64)[None], tool_mm)[0]
+        direction = self._setup.normal(size=3)
+        size_mm = self._setup.uniform(*self.scenario.magnitudes.cup_offset_um) * UM
+        cup: F = at + direction / np.linalg.norm(direction) * size_mm
+        return cup
+
+    def bar(
+        self,
+        axes_mm: F,
+        centre_mm: F,
+        radius_mm: float,
+        tool_mm: F | None = None,
+        t_s: F | None = None,
+        cup_mm: F | None = None,
+    ) -> F:
+        """Readings of a ball-bar, distance minus nominal radius, mm.
+
+        Parameters
+        ----------
+        axes_mm : array, shape (n, 3)
+            Commanded positions of the samples, in the order of the motion.
+        centre_mm : array, shape (3,)
+            Nominal centre, where the cup is set up unless ``cup_mm`` (from `cup`) names one that stands already.
+        t_s : array, shape (n,), optional
+            Instants; without them 33 samples a second from now on.
+        """
+        if cup_mm is None:
+            cup_mm = self.cup(centre_mm, tool_mm)
+        times = self._times(len(axes_mm), 0.03, t_s)
+        distance = np.linalg.norm(self._locate(times, axes_mm, tool_mm) - cup_mm, axis=1)
+        return self._read(distance - radius_mm + self.bar_length_error_mm(radius_mm), self.conditions.bar_noise_mm)
+
+    def laser(self, axes_mm: F, beam: F, tool_mm: F | None = None, t_s: F | None = None) -> F:
+        """Readings of a laser zeroed at the first position, displacement minus nominal, mm.
+
+        Parameters
+        ----------
+        axes_mm : array, shape (n, 3)
+            Commanded positions of the records.
+        beam : array, shape (3,)
+            Nominal beam, away from the laser. Beam and mirror are set up anew, each a little askew.
+        t_s : array, shape (n,), optional
+            Instants; without them one record in 2 s from now on.
+        """
+        nominal = np.asarray(beam, dtype=np.float64) / np.linalg.norm(beam)
+        sizes = self.scenario.magnitudes
+        true_beam = nominal + self._sideways(nominal, sizes.beam_misalignment_urad)
+        normal = nominal + self._sideways(nominal, sizes.mirror_tilt_urad)
+        times = self._times(len(axes_mm), 2.0, t_s)
+        where = self._locate(times, axes_mm, tool_mm)
+        mount = Mount(true_beam / np.linalg.norm(true_beam), normal, where[0])
+        path = np.array([mount.displacement(p) for p in where]) * (1.0 + self.wavelength_error)
+        return self._read(path - (axes_mm - axes_mm[0]) @ nominal, self.conditions.laser_noise_mm)
+
+    def _locate(self, times_s: F, axes_mm: F, tool_mm: F | None) -> F:
+        """Where the tool really is at commanded positions, lost motion and drift included, (n, 3) mm; approached in its first direction."""
+        first = np.array([_first_sign(axes_mm[:, a]) for a in range(3)])
+        self._play.run(np.stack([axes_mm[0] - LEAD_IN_MM * first]))
+        actual: F = self.machine(tool_mm).tool_position(self._play.run(axes_mm))
+        if self.conditions.drift:
+            actual = actual + drift(self.draws, times_s)
+        return actual
+
+    def _read(self, exact_mm: F, noise_mm: float) -> F:
+        n = exact_mm.size
+        c = self.conditions
+        wrong = self._noise.random(n) < c.outlier_share
+        size = self._noise.uniform(*c.outlier_mm, n) * self._noise.choice([-1.0, 1.0], n)
+        reading: F = exact_mm + self._noise.normal(scale=noise_mm, size=n) + np.where(wrong, size, 0.0)
+        return reading
+
+    def _times(self, n: int, step_s: float, t_s: F | None) -> F:
+        times: F = self.time_s + self.conditions.pause_s + step_s * np.arange(n, dtype=np.float64)
+        if t_s is not None:
+            times = np.asarray(t_s, dtype=np.float64)
+        self.time_s = float(times[-1])
+        return times
+
+    def _sideways(self, direction: F, size_urad: tuple[float, float]) -> F:
+        """Small vector perpendicular to a unit vector, its length uniform between the ends."""
+        across = self._setup.normal(size=3)
+        across -= direction * (direction @ across)
+        vector: F = across / np.linalg.norm(across) * self._setup.uniform(*size_urad) * URAD
+        return vector
+
+
+def _first_sign(track_mm: F) -> float:
+    moved = np.flatnonzero(np.diff(track_mm))
+    return float(np.sign(np.diff(track_mm)[moved[0]])) if moved.size else 1.0
