@@ -1,0 +1,112 @@
+"""What one mounting tells about the machine: an information matrix over the unknowns that all mountings share.
+
+Shared are the smooth terms, the lost motion, the length of every bar and the laser's wavelength; cup, mirror tilts, zero and drift belong
+to one mounting and are marginalised (Schur complement with their priors). Every shared unknown counts in units of its prior standard
+deviation, so that the prior is the unit matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from models.geometry.chain import design
+from models.machine import Machine
+from models.planning.instruments import Instruments
+from models.planning.measurements import BAR_VALUES, HelixTest, Measurement, expected_run
+from models.solvers.observations import RunData
+from models.solvers.observe import run_design, setup_unknowns
+from models.solvers.priors import Priors, term_prior_sd
+from models.volumetric import rigid_design, volume_grid
+
+LASER_SCALE = "laser_scale"
+SEARCH_VALUES = 120
+"""Points that stand for the block means of a helix while searching: 24 a turn follow every smooth term; the weight stays the run's."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Machine, instruments and priors of a plan, and the unknowns that all mountings share (names and prior sd)."""
+
+    machine: Machine
+    tools: Instruments
+    priors: Priors
+    terms: tuple[Term, ...]
+    names: tuple[str, ...]
+    prior_sd: F1
+
+    @property
+    def size(self) -> int:
+        """Number of shared unknowns."""
+        return len(self.names)
+
+
+def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | None = None) -> Problem:
+    """Set up what a plan is about; ``order``: highest Legendre order of the error motions."""
+    priors, terms = priors or Priors(), smooth_terms(order)
+    bars = [f"bar_length_{r:g}" for r in sorted(tools.bar_lengths_mm)]
+    names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *bars, LASER_SCALE)
+    rest = [priors.backlash_mm] * 3 + [tools.u_bar_length_mm] * len(bars) + [tools.u_wavelength]
+    return Problem(machine, tools, priors, terms, names, np.concatenate([term_prior_sd(machine, terms, priors), rest]))
+
+
+def mounting_information(what: Problem, tests: tuple[Measurement, ...]) -> F2:
+    """Information of all tests of one mounting on the shared unknowns, shape (size, size), in units of their priors."""
+    runs = tuple(_search_run(what, t) for t in tests)
+    setup = setup_unknowns(runs, what.priors)
+    own = [i for i, n in enumerate(setup.names) if n not in what.names]
+    shared, nuisance = [], []
+    for run in runs:
+        full = run_design(what.machine, what.terms, run, setup) / _sigma(what, run)[:, None]
+        shared.append(_shared_columns(what, run, full, setup.names))
+        nuisance.append(full[:, len(what.terms) + 3 :][:, own] * setup.prior_sd[own])
+    a, b = np.concatenate(shared), np.concatenate(nuisance)
+    cross = b.T @ a
+    return np.asarray(a.T @ a - cross.T @ linalg.solve(b.T @ b + np.eye(len(own)), cross, assume_a="pos"))
+
+
+def _search_run(what: Problem, test: Measurement) -> RunData:
+    return expected_run(what.machine, test, what.tools, values=SEARCH_VALUES if isinstance(test, HelixTest) else BAR_VALUES)
+
+
+def _sigma(what: Problem, run: RunData) -> F1:
+    """Standard uncertainty of each value; fewer points than block means count for more, so that the run tells as much as it will."""
+    tools = what.tools
+    if run.kind == "laser":
+        return np.hypot(tools.laser_noise_mm / np.sqrt(run.weight_n), tools.floor_mm)
+    n, raw = run.deviation_mm.size, run.weight_n.sum()
+    values = min(BAR_VALUES, raw)
+    return np.full(n, np.hypot(tools.bar_noise_mm / np.sqrt(raw / values), tools.floor_mm) * np.sqrt(n / values))
+
+
+def _shared_columns(what: Problem, run: RunData, full: F2, setup_names: tuple[str, ...]) -> F2:
+    first = len(what.terms) + 3
+    out = np.zeros((full.shape[0], what.size))
+    out[:, :first] = full[:, :first]
+    for i, name in enumerate(setup_names):
+        if name in what.names:
+            out[:, what.names.index(name)] = full[:, first + i]
+    if run.beam is not None:
+        out[:, -1] = (run.axes_mm - run.axes_mm[0]) @ run.beam / _sigma(what, run)
+    return np.asarray(out * what.prior_sd)
+
+
+def factor(information: F2) -> F2:
+    """Rows F with F^T F = information, without directions that tell less than a hundred-thousandth of the prior, shape (r, size)."""
+    value, vector = linalg.eigh(information, subset_by_value=(1e-5, np.inf))
+    return np.asarray(np.sqrt(value)[:, None] * vector.T)
+
+
+def field_rows(what: Problem, share: float, nodes: int) -> F2:
+    """Deviation free of rigid motion at the nodes of the inner volume per unit of every shared unknown, shape (nodes^3 * 3, size), mm."""
+    box = what.machine.centre_mm[:, None] + share * (what.machine.stroke_mm - what.machine.centre_mm[:, None])
+    grid = volume_grid(box, nodes)
+    g = design(what.machine, what.terms, grid).reshape(-1, len(what.terms))
+    rigid, _ = np.linalg.qr(rigid_design(grid).reshape(-1, 6))
+    out = np.zeros((g.shape[0], what.size))
+    out[:, : len(what.terms)] = g - rigid @ (rigid.T @ g)
+    return np.asarray(out * what.prior_sd)

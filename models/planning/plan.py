@@ -1,0 +1,183 @@
+"""Plan a campaign: which set-ups, in which order, what each of them buys in micrometres, and what the whole leaves open.
+
+The uncertainties stated here are the posterior (Bayesian Cramer-Rao) bound of the planned readings: what an estimator that knows noise,
+priors and set-up unknowns exactly could reach, and the joint solution does reach when the machine is as smooth as the priors say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F2
+from models.machine import AXES, Machine
+from models.planning.candidates import candidates
+from models.planning.information import field_rows, problem
+from models.planning.instruments import Instruments, SetupMinutes
+from models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
+from models.planning.search import Chosen, Search
+from models.solvers.observations import RunData
+from models.solvers.priors import Priors
+
+PLAN_ORDER = 8
+"""Legendre order of the error motions a plan is judged with; orders above 6 fade in the prior."""
+INNER_SHARE = 0.8
+REPORT_NODES = 5
+PASSES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One measurement of a plan.
+
+    Attributes
+    ----------
+    label, setup_id : str
+        Name of the run; set-up that it shares with the steps beside it.
+    test : HelixTest, DiagonalTest or LineTest
+    minutes, until_min : float
+        Set-up and machine time of this step; the same of the plan up to its end.
+    u_worst_mm, u_mean_mm : float
+        After this step: standard uncertainty of the deviation vector (rigid motion free) at the worst node and as root mean square over
+        the nodes of the inner volume.
+    """
+
+    label: str
+    setup_id: str
+    test: Measurement
+    minutes: float
+    until_min: float
+    u_worst_mm: float
+    u_mean_mm: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A planned campaign.
+
+    Attributes
+    ----------
+    machine : Machine
+    tools : Instruments
+    steps : tuple of Step
+        In the order of measuring: what gains most per minute comes first.
+    runs : tuple of RunData
+        What a perfect machine would record, deviations zero: positions, directions, times, weights of the block means.
+    u_before_mm : (worst, mean)
+        From the priors alone.
+    """
+
+    machine: Machine
+    tools: Instruments
+    steps: tuple[Step, ...]
+    runs: tuple[RunData, ...]
+    u_before_mm: tuple[float, float]
+
+    @property
+    def recipes(self) -> tuple[Measurement, ...]:
+        """The measurements alone, in order."""
+        return tuple(s.test for s in self.steps)
+
+    @property
+    def minutes(self) -> float:
+        """Set-up and machine time of the whole plan."""
+        return self.steps[-1].until_min if self.steps else 0.0
+
+    @property
+    def u_worst_mm(self) -> float:
+        """Standard uncertainty at the worst node after the whole plan."""
+        return self.steps[-1].u_worst_mm if self.steps else self.u_before_mm[0]
+
+
+def plan_campaign(
+    machine: Machine,
+    *,
+    minutes: float = 60.0,
+    tools: Instruments | None = None,
+    setup_minutes: SetupMinutes | None = None,
+    priors: Priors | None = None,
+    vertical: int = 2,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Plan:
+    """Choose the measurements that tell most about the deviation over the inner 80 % of the volume in the minutes there are.
+
+    Parameters
+    ----------
+    minutes : float
+        Set-up and machine time together.
+    vertical : int
+        Index of the vertical axis.
+    progress : callable
+        Called with the share that is done, 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        Nothing fits into the strokes or into the minutes.
+    """
+    if not 0 < minutes < np.inf:
+        raise ValueError(f"planner: {minutes:g} minutes, expected a positive number")
+    tools, setup_minutes = tools or Instruments(), setup_minutes or SetupMinutes()
+    search = Search(problem(machine, tools, PLAN_ORDER, priors), candidates(machine, tools, vertical), setup_minutes, INNER_SHARE)
+    chosen = search.fill({}, minutes)
+    if not chosen:
+        raise ValueError(f"planner: no measurement fits into {minutes:g} minutes")
+    return laid_out(search, search.exchange(chosen, minutes, PASSES))
+
+
+def laid_out(search: Search, chosen: Chosen) -> Plan:
+    """A choice of measurements as a plan: ordered by gain per minute, named, with what each buys."""
+    rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
+    total = np.eye(search.what.size)
+    before = uncertainty_mm(total, rows)
+    steps: list[Step] = []
+    until = 0.0
+    for number, name in enumerate(_in_order(search, chosen), start=1):
+        tests = chosen[name]
+        for k, test in enumerate(tests):
+            minutes = search.cost_min(test, tests[:k])
+            until += minutes
+            worst, mean = uncertainty_mm(total + search.mounting(tests[: k + 1]), rows)
+            steps.append(Step(_label(test, number, k), f"S{number}", test, minutes, until, worst, mean))
+        total += search.mounting(tests)
+    machine, tools = search.what.machine, search.what.tools
+    starts = [(s.until_min - s.minutes) * 60.0 for s in steps]
+    runs = tuple(
+        replace(expected_run(machine, s.test, tools, start_s=t), label=s.label, setup=s.setup_id)
+        for s, t in zip(steps, starts, strict=True)
+    )
+    return Plan(machine, tools, tuple(steps), runs, before)
+
+
+def uncertainty_mm(information: F2, rows: F2) -> tuple[float, float]:
+    """Standard uncertainty of the deviation vector at the worst node and as root mean square over the nodes, mm."""
+    half = linalg.solve_triangular(linalg.cholesky(information, lower=True), rows.T, lower=True)
+    v = (half**2).sum(axis=0).reshape(-1, 3).sum(axis=1)
+    return float(np.sqrt(v.max())), float(np.sqrt(v.mean()))
+
+
+def _in_order(search: Search, chosen: Chosen) -> list[str]:
+    order: list[str] = []
+    done: Chosen = {}
+    while len(order) < len(chosen):
+        rest = [n for n in chosen if n not in done]
+        now = search.criterion(done)
+        rates = []
+        for n in rest:
+            cost = search.total_min({n: chosen[n]})
+            rates.append((now - search.criterion({**done, n: chosen[n]})) / max(cost, 1e-6))
+        best = rest[int(np.argmax(rates))]
+        order.append(best)
+        done[best] = chosen[best]
+    return order
+
+
+def _label(test: Measurement, number: int, k: int) -> str:
+    if isinstance(test, HelixTest):
+        return f"{number:02d}-helix-{test.radius_mm:g}{'abcdefghijklmnop'[k] if k else ''}{'' if test.direction > 0 else '-back'}"
+    if isinstance(test, DiagonalTest):
+        return f"{number:02d}-step-{test.diagonal}-{test.order}" if test.order else f"{number:02d}-diagonal-{test.diagonal}"
+    return f"{number:02d}-line-{AXES[test.axis]}"

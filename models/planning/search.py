@@ -1,0 +1,153 @@
+"""Which measurements, in the minutes there are: greedy by gain per minute, then exchange passes.
+
+The criterion is I-optimal: the variance of the predicted, rigid-motion-free deviation over the inner volume, as a power mean over the
+nodes that leans on the worst node (power 1 would be the plain mean, an infinite power the worst node alone).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.planning.information import Problem, factor, field_rows, mounting_information
+from models.planning.instruments import SetupMinutes
+from models.planning.measurements import HelixTest, LineTest, Measurement, machine_seconds
+
+POWER = 4.0
+"""Of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
+SEARCH_NODES = 4
+
+Chosen = dict[str, tuple[Measurement, ...]]
+"""Mounting to its tests, in the order in which they were chosen."""
+
+
+def extra_minutes(minutes: SetupMinutes, machine_min: float, test: Measurement, before: tuple[Measurement, ...]) -> float:
+    """Set-up and machine time of a test when its mounting already holds ``before``."""
+    if isinstance(test, HelixTest):
+        if not before:
+            return minutes.cup + machine_min
+        same = any(isinstance(b, HelixTest) and b.radius_mm == test.radius_mm for b in before)
+        return (0.0 if same else minutes.bar) + machine_min
+    if before:
+        return machine_min
+    return (minutes.line if isinstance(test, LineTest) else minutes.diagonal) + machine_min
+
+
+@dataclass
+class Search:
+    """Searches one problem; keeps every mounting's information, because the same ones are asked for again and again."""
+
+    what: Problem
+    candidates: tuple[Measurement, ...]
+    minutes: SetupMinutes
+    share: float = 0.8
+    tick: Callable[[float], None] = lambda _: None
+    _rows: F2 = field(init=False)
+    _information: dict[tuple[Measurement, ...], F2] = field(init=False, default_factory=dict)
+    _factors: dict[tuple[tuple[Measurement, ...], Measurement], F2] = field(init=False, default_factory=dict)
+    _machine_min: dict[Measurement, float] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Lay out the nodes at which plans are judged."""
+        self._rows = field_rows(self.what, self.share, SEARCH_NODES)
+
+    def cost_min(self, test: Measurement, before: tuple[Measurement, ...]) -> float:
+        """Minutes that a test takes after the others on its mounting."""
+        if test not in self._machine_min:
+            self._machine_min[test] = machine_seconds(self.what.machine, test) / 60.0
+        return extra_minutes(self.minutes, self._machine_min[test], test, before)
+
+    def total_min(self, chosen: Chosen) -> float:
+        """Minutes of a whole plan."""
+        return sum(self.cost_min(t, tests[:k]) for tests in chosen.values() for k, t in enumerate(tests))
+
+    def information(self, chosen: Chosen) -> F2:
+        """Prior and all mountings, shape (size, size)."""
+        total = np.eye(self.what.size)
+        for tests in chosen.values():
+            total += self.mounting(tests)
+        return total
+
+    def mounting(self, tests: tuple[Measurement, ...]) -> F2:
+        """Information of one mounting."""
+        if tests not in self._information:
+            self._information[tests] = mounting_information(self.what, tests)
+        return self._information[tests]
+
+    def _gain_factor(self, before: tuple[Measurement, ...], test: Measurement) -> F2:
+        key = (before, test)
+        if key not in self._factors:
+            added = self.mounting((*before, test))
+            self._factors[key] = factor(added - self.mounting(before) if before else added)
+        return self._factors[key]
+
+    def criterion(self, chosen: Chosen) -> float:
+        """Logarithm of the power-mean standard uncertainty (mm) of a plan."""
+        half = linalg.solve_triangular(linalg.cholesky(self.information(chosen), lower=True), self._rows.T, lower=True)
+        return self._judge((half**2).sum(axis=0))
+
+    @staticmethod
+    def _judge(variance: F1) -> float:
+        v = variance.reshape(-1, 3).sum(axis=1)
+        return float(0.5 / POWER * np.log(np.mean(v**POWER)))
+
+    def best_addition(self, chosen: Chosen, budget_min: float) -> tuple[Measurement, float] | None:
+        """The affordable test with the largest gain per minute, and that gain; None: nothing fits or gains."""
+        lower = linalg.cholesky(self.information(chosen), lower=True)
+        half = linalg.solve_triangular(lower, self._rows.T, lower=True)
+        start = (half**2).sum(axis=0)
+        now, best = self._judge(start), None
+        for test in self.candidates:
+            before = chosen.get(test.mounting, ())
+            if test in before:
+                continue
+            cost = self.cost_min(test, before)
+            if cost > budget_min:
+                continue
+            b = linalg.solve_triangular(lower, self._gain_factor(before, test).T, lower=True).T
+            s = linalg.cholesky(np.eye(len(b)) + b @ b.T, lower=True)
+            less = linalg.solve_triangular(s, b @ half, lower=True)
+            gain = (now - self._judge(start - (less**2).sum(axis=0))) / cost
+            if gain > 1e-6 and (best is None or gain > best[1]):
+                best = (test, gain)
+        return best
+
+    def fill(self, chosen: Chosen, budget_min: float) -> Chosen:
+        """Add tests by gain per minute until nothing more fits."""
+        chosen = dict(chosen)
+        left = budget_min - self.total_min(chosen)
+        while (found := self.best_addition(chosen, left)) is not None:
+            test = found[0]
+            before = chosen.get(test.mounting, ())
+            left -= self.cost_min(test, before)
+            chosen[test.mounting] = (*before, test)
+            self.tick(1.0 - max(left, 0.0) / budget_min)
+        return chosen
+
+    def exchange(self, chosen: Chosen, budget_min: float, passes: int) -> Chosen:
+        """Take every mounting, and every last test of one, out in turn; fill the time again; keep what is better."""
+        best = self.criterion(chosen)
+        for _ in range(passes):
+            improved = False
+            for smaller in _without_one(chosen):
+                trial = self.fill(smaller, budget_min)
+                value = self.criterion(trial)
+                if value < best - 1e-4:
+                    chosen, best, improved = trial, value, True
+                    break
+            if not improved:
+                break
+        return chosen
+
+
+def _without_one(chosen: Chosen) -> list[Chosen]:
+    out: list[Chosen] = []
+    for name, tests in chosen.items():
+        out.append({k: v for k, v in chosen.items() if k != name})
+        if len(tests) > 1:
+            out.append({k: (v[:-1] if k == name else v) for k, v in chosen.items()})
+    return out
