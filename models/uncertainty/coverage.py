@@ -1,0 +1,89 @@
+"""Coverage factors and coverage intervals: Welch-Satterthwaite (GUM G.4), shortest and symmetric intervals of samples (GUM-S1 7.7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from models.arrays import F1, F2
+
+PROBABILITY = 0.95
+
+
+def effective_dof(variances: F2, dof: F1) -> F1:
+    """Effective degrees of freedom of sums of variances, (sum v)^2 / sum (v^2 / nu) (GUM eq G.2b).
+
+    Parameters
+    ----------
+    variances : array, shape (s, m)
+        Variance of each of s sources in each of m results.
+    dof : array, shape (s,)
+        Degrees of freedom of each source's variance; inf where it is stated.
+
+    Returns
+    -------
+    array, shape (m,); inf where no source with finite degrees of freedom takes part.
+    """
+    spread = (variances**2 / dof[:, None]).sum(axis=0)
+    total = variances.sum(axis=0)
+    return np.asarray(np.where(spread > 0, total**2 / np.where(spread > 0, spread, 1.0), np.inf))
+
+
+def coverage_factor(dof: F1, probability: float = PROBABILITY) -> F1:
+    """Coverage factor k: the two-sided quantile of Student's t; 1.96 for 95 % and many degrees of freedom."""
+    _checked_probability(probability)
+    return np.asarray(stats.t.ppf(0.5 * (1.0 + probability), np.maximum(dof, 1.0)))
+
+
+def vector_factor(components: int = 3, probability: float = PROBABILITY) -> float:
+    """Factor of the ellipsoid that holds a whole vector of normal components, e.g. 2.80 for three and 95 % (GUM-S2 6.5.2)."""
+    _checked_probability(probability)
+    return float(np.sqrt(stats.chi2.ppf(probability, components)))
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Coverage intervals of each result, arrays of shape (m,)."""
+
+    low: F1
+    high: F1
+
+    @property
+    def width(self) -> F1:
+        """High minus low."""
+        return np.asarray(self.high - self.low)
+
+
+def symmetric_interval(samples: F2, probability: float = PROBABILITY) -> Interval:
+    """Probabilistically symmetric interval of samples, shape (trials, m): as many above as below (GUM-S1 7.7.2)."""
+    ordered = np.sort(samples, axis=0)
+    trials = len(ordered)
+    inside = _inside(trials, probability)
+    first = (trials - inside + 1) // 2 - 1
+    return Interval(ordered[max(first, 0)], ordered[max(first, 0) + inside])
+
+
+def shortest_interval(samples: F2, probability: float = PROBABILITY) -> Interval:
+    """Shortest interval of samples, shape (trials, m), that holds the probability (GUM-S1 7.7.4)."""
+    ordered = np.sort(samples, axis=0)
+    inside = _inside(len(ordered), probability)
+    width = ordered[inside:] - ordered[:-inside]
+    at = width.argmin(axis=0)
+    columns = np.arange(ordered.shape[1])
+    return Interval(ordered[at, columns], ordered[at + inside, columns])
+
+
+def _inside(trials: int, probability: float) -> int:
+    """How many of the trials the interval spans, q of GUM-S1 7.7.2."""
+    _checked_probability(probability)
+    inside = int(probability * trials + 0.5)
+    if not 0 < inside < trials:
+        raise ValueError(f"coverage interval: {trials} trials are too few for a probability of {probability}")
+    return inside
+
+
+def _checked_probability(probability: float) -> None:
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"coverage: probability {probability} must lie between 0 and 1")

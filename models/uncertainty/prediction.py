@@ -1,0 +1,127 @@
+"""Predicted volumetric error with its uncertainty at any point and for any tool, by the law of propagation (GUM 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.arrays import F1, F2, F3
+from models.uncertainty.coverage import PROBABILITY, coverage_factor, effective_dof, vector_factor
+from models.uncertainty.frame import RigidFree, field
+from models.uncertainty.sources import ErrorSources
+
+CHUNK_POINTS = 2000
+"""Points worked at once: 3 x 300 coefficients of each are then below 15 MB."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted deviation (mean of both directions of motion) at m points, tool relative to workpiece.
+
+    Attributes
+    ----------
+    points_mm, deviation_mm : array, shape (m, 3)
+    covariance_mm2 : array, shape (m, 3, 3)
+    names : tuple of str
+        The sources (`models.uncertainty.sources.WORDS`).
+    variance_mm2 : array, shape (sources, m, 3)
+        What each source adds to the variance of each component: they sum up to the diagonal of ``covariance_mm2``.
+    dof : array, shape (m, 3)
+        Effective degrees of freedom (Welch-Satterthwaite).
+    probability : float
+        Coverage probability of the expanded uncertainties.
+    """
+
+    points_mm: F2
+    deviation_mm: F2
+    covariance_mm2: F3
+    names: tuple[str, ...]
+    variance_mm2: F3
+    dof: F2
+    probability: float
+
+    @property
+    def u_mm(self) -> F2:
+        """Standard uncertainty of each component, shape (m, 3)."""
+        return np.asarray(np.sqrt(np.einsum("mii->mi", self.covariance_mm2)))
+
+    @property
+    def u_vector_mm(self) -> F1:
+        """Root of the sum of the three variances, shape (m,): standard deviation of the length of the error vector of the prediction."""
+        return np.asarray(np.sqrt(np.einsum("mii->m", self.covariance_mm2)))
+
+    @property
+    def coverage_factor(self) -> F2:
+        """k of each component, from its degrees of freedom, shape (m, 3)."""
+        return coverage_factor(self.dof, self.probability)
+
+    @property
+    def expanded_mm(self) -> F2:
+        """Expanded uncertainty U = k u of each component, shape (m, 3)."""
+        return np.asarray(self.coverage_factor * self.u_mm)
+
+    @property
+    def expanded_vector_mm(self) -> F1:
+        """Longest half-axis of the ellipsoid that holds the whole vector with the coverage probability, shape (m,).
+
+        For many degrees of freedom; it is larger than the expanded uncertainty of any component.
+        """
+        widest = np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance_mm2)[:, -1], 0.0))
+        return np.asarray(vector_factor(3, self.probability) * widest)
+
+    def along(self, direction: F2) -> tuple[F1, F1]:
+        """Deviation along unit vectors, shape (3,) or (m, 3), and its standard uncertainty, mm, shape (m,) each."""
+        d = np.broadcast_to(direction, self.deviation_mm.shape)
+        u = np.sqrt(np.einsum("mi,mij,mj->m", d, self.covariance_mm2, d))
+        return np.einsum("mi,mi->m", d, self.deviation_mm), u
+
+
+def predict_deviation(
+    sources: ErrorSources,
+    points_mm: F2,
+    *,
+    tool_mm: F1 | None = None,
+    frame: RigidFree | None = None,
+    probability: float = PROBABILITY,
+) -> Prediction:
+    """Deviation and uncertainty at commanded positions.
+
+    Parameters
+    ----------
+    sources : ErrorSources
+        Of the campaign's solution (`models.uncertainty.sources.error_sources`).
+    points_mm : array, shape (m, 3)
+    tool_mm : array, shape (3,), optional
+        Spindle reference to functional point; None: the machine's own tool.
+    frame : RigidFree, optional
+        None: the machine's own frame, where positioning and angles are zero at the start of the strokes (docs/conventions.md). Compare
+        maps, or a map with what a part shows, in the rigid-free frame.
+    probability : float
+
+    Raises
+    ------
+    ValueError
+        Points of another shape, or not finite.
+    """
+    points = np.asarray(points_mm, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ValueError(f"prediction: points_mm must be finite numbers of shape (m, 3), got shape {points.shape}")
+    parts = [_part(sources, points[i : i + CHUNK_POINTS], tool_mm, frame) for i in range(0, max(len(points), 1), CHUNK_POINTS)]
+    deviation, covariance = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
+    variance = np.concatenate([p[2] for p in parts], axis=1)
+    dof = np.array([s.dof for s in sources.sources])
+    effective = effective_dof(variance.reshape(len(dof), -1), dof).reshape(deviation.shape)
+    return Prediction(points, deviation, covariance, tuple(s.name for s in sources.sources), variance, effective, probability)
+
+
+def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFree | None) -> tuple[F2, F3, F3]:
+    d = field(sources.solution.machine, sources.terms, points, tool_mm, frame)
+    covariance = np.zeros((len(points), 3, 3))
+    variance = np.zeros((len(sources.sources), len(points), 3))
+    for k, source in enumerate(sources.sources):
+        influence = d @ source.factor
+        share = influence @ np.swapaxes(influence, 1, 2) + source.scatter_mm**2 * np.eye(3)
+        covariance += share
+        variance[k] = np.einsum("mii->mi", share)
+    return d @ sources.coefficients, covariance, variance

@@ -1,0 +1,202 @@
+"""Which inputs the solution of a campaign rests on, and what each of them does to it: one error source per input (GUM 5.1).
+
+The estimate is linear in what went into it, theta = C A^T W y + C P^-1 m: readings y with weights W, prior means m with variances P,
+posterior covariance C. So the covariance falls apart without remainder, C = C A^T W A C + C P^-1 C: noise per instrument, and the prior of
+every single unknown (the bar's calibrated length, the set-ups, the typical size of errors). To that come the inputs that the solver does
+not know.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.geometry.bases import Term
+from models.machine import AXES
+from models.solvers.joint import JointSolution
+from models.solvers.observations import RunData
+from models.uncertainty.inputs import Inputs
+from models.uncertainty.order import order_source
+from models.uncertainty.response import Response, response
+
+WORDS = {
+    "bar_noise": "sensor noise of the ball-bar (and what a smooth model cannot follow)",
+    "laser_noise": "sensor noise of the laser (and what a smooth model cannot follow)",
+    "repeatability": "repeatability of the machine",
+    "bar_length": "calibration of the bar's length",
+    "bar_temperature": "temperature of the bar (assumed)",
+    "wavelength": "calibration of the laser's wavelength (assumed)",
+    "setup": "set-up: cup, mirror, zero and drift, where the data leave them open",
+    "scale_temperature": "temperature of the scales (assumed)",
+    "model_order": "what orders above the chosen one may still do",
+    "prior": "typical size of errors, where the data leave them open (assumed)",
+    "misfit": "residuals larger than the stated noise",
+}
+"""Every source of a budget in the user's words."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One source of uncertainty.
+
+    Attributes
+    ----------
+    name : str
+        A key of `WORDS`.
+    factor : array, shape (P, q)
+        What q independent inputs of unit variance do to the coefficients of `ErrorSources.terms`: the source's covariance is factor
+        factor^T.
+    dof : float
+        Degrees of freedom of its size; inf where it is stated.
+    scatter_mm : float
+        Standard deviation that comes on top at each point, per component.
+    """
+
+    name: str
+    factor: F2
+    dof: float = float("inf")
+    scatter_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class ErrorSources:
+    """All sources of one solution.
+
+    ``terms``: the terms of the solution, then those of the orders above it; ``coefficients``: their values, zero above, shape
+    (len(terms),).
+    """
+
+    solution: JointSolution
+    inputs: Inputs
+    terms: tuple[Term, ...]
+    coefficients: F1
+    sources: tuple[Source, ...]
+
+    def source(self, name: str) -> Source:
+        """A source by name; KeyError for one that the campaign does not have."""
+        for s in self.sources:
+            if s.name == name:
+                return s
+        raise KeyError(name)
+
+
+def error_sources(solution: JointSolution, inputs: Inputs | None = None) -> ErrorSources:
+    """The sources of uncertainty of a solution.
+
+    Parameters
+    ----------
+    solution : JointSolution
+    inputs : Inputs, optional
+        Stated inputs; default: the documented ones.
+
+    Returns
+    -------
+    ErrorSources
+        Without the stated inputs (`Inputs.of_the_data_alone`) the sources add up to ``solution.term_covariance``.
+    """
+    inputs = inputs or Inputs()
+    r = response(solution)
+    n = len(solution.terms)
+    found = [*_noise(solution, r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
+    if inputs.single_approach:
+        found.append(Source("repeatability", np.zeros((n, 0)), inputs.repeatability_dof, inputs.repeatability_mm))
+    found = _merged([Source(s.name, s.factor[:n], s.dof, s.scatter_mm) for s in found])
+    terms, extra = order_source(solution, r, inputs.orders_above)
+    above = len(terms) - n
+    sources = [Source(s.name, np.pad(s.factor, ((0, above), (0, 0))), s.dof, s.scatter_mm) for s in found]
+    if above:
+        sources.append(Source("model_order", extra))
+    return ErrorSources(solution, inputs, terms, np.concatenate([solution.coefficients, np.zeros(above)]), tuple(sources))
+
+
+def _merged(sources: list[Source]) -> list[Source]:
+    """One source per name, in order; the narrowest degrees of freedom count."""
+    out: dict[str, Source] = {}
+    for s in sources:
+        have = out.get(s.name)
+        if have is None:
+            out[s.name] = s
+        else:
+            factor = np.concatenate([have.factor, s.factor], axis=1)
+            out[s.name] = Source(s.name, factor, min(have.dof, s.dof), float(np.hypot(have.scatter_mm, s.scatter_mm)))
+    return [Source(s.name, _compressed(s.factor), s.dof, s.scatter_mm) for s in out.values()]
+
+
+def _compressed(factor: F2) -> F2:
+    """The same covariance from no more columns than rows."""
+    if factor.shape[1] <= factor.shape[0]:
+        return factor
+    return np.asarray(linalg.qr(factor.T, mode="r")[0][: factor.shape[0]].T)
+
+
+def _noise(solution: JointSolution, r: Response, inputs: Inputs) -> list[Source]:
+    """Scatter of the readings per instrument, the machine's repeatability told apart, and what the residuals say on top."""
+    out = []
+    share = np.full(r.sigma_mm.size, inputs.repeatability_mm**2)
+    kinds = np.concatenate([np.full(run.deviation_mm.size, run.kind) for run in solution.data])
+    for kind in ("bar", "laser"):
+        seen = kinds == kind
+        if seen.any():
+            variance = np.where(seen, np.maximum(r.sigma_mm**2 - share, 0.0), 0.0)
+            out.append(Source(f"{kind}_noise", r.noise_factor(variance), r.noise_dof))
+    if inputs.repeatability_mm > 0:
+        out.append(Source("repeatability", r.noise_factor(share), inputs.repeatability_dof))
+    if r.misfit > 1.0:
+        out.append(Source("misfit", np.sqrt(r.misfit - 1.0) * r.covariance_root, solution.estimate.dof))
+    return out
+
+
+def _priors(solution: JointSolution, r: Response) -> list[Source]:
+    """Influence of every unknown's prior mean on the estimate, C e_i / p_i per standard deviation p_i of the prior."""
+    names = [_prior_source(name, i < len(solution.terms)) for i, name in enumerate(solution.estimate.names)]
+    known = np.isfinite(solution.prior_sd)
+    per_sd = r.covariance[:, known] / solution.prior_sd[known]
+    which = np.array(names)[known]
+    return [Source(s, per_sd[:, which == s]) for s in ("bar_length", "wavelength", "setup", "prior") if (which == s).any()]
+
+
+def _prior_source(name: str, is_term: bool) -> str:
+    if is_term or name.startswith("backlash_"):
+        return "prior"
+    if name.startswith("bar_length"):
+        return "bar_length"
+    return "wavelength" if name.startswith(("wavelength", "laser_scale")) else "setup"
+
+
+def _calibration(solution: JointSolution, r: Response, inputs: Inputs) -> list[Source]:
+    """Errors that all readings of one instrument share: the laser's wavelength, the bar's temperature."""
+    out = []
+    lasers = any(run.kind == "laser" for run in solution.data)
+    if lasers and inputs.u_wavelength > 0 and not any(n.startswith(("wavelength", "laser_scale")) for n in solution.estimate.names):
+        moved = np.concatenate([_travel(run) for run in solution.data])
+        out.append(Source("wavelength", inputs.u_wavelength * r.of_readings(moved)[:, None]))
+    u_bar = inputs.u_bar_temperature_k * inputs.bar_expansion_per_k
+    if u_bar > 0 and any(run.kind == "bar" for run in solution.data):
+        length = np.concatenate([np.full(run.deviation_mm.size, run.radius_mm or 0.0) for run in solution.data])
+        out.append(Source("bar_temperature", u_bar * r.of_readings(length)[:, None]))
+    return out
+
+
+def _travel(run: RunData) -> F1:
+    """Distance along the beam since the first record, mm: what a wrong wavelength scales; zero for the ball-bar."""
+    if run.beam is None:
+        return np.zeros(run.deviation_mm.size)
+    return np.asarray((run.axes_mm - run.axes_mm[0]) @ run.beam)
+
+
+def _temperature(solution: JointSolution, inputs: Inputs) -> list[Source]:
+    """Scales warmer than thought: a linear positioning error of each axis, alpha u_T times the travel from the start of its stroke.
+
+    Written as the term of Legendre order 1, whose function is twice the share of the stroke (`models.geometry.bases.term_values`).
+    """
+    slope = inputs.u_scale_temperature_k * inputs.scale_expansion_per_k
+    if slope == 0.0:
+        return []
+    names = [t.name for t in solution.terms]
+    factor = np.zeros((len(names), 3))
+    for a, axis in enumerate(AXES):
+        factor[names.index(f"E{axis}{axis}.1"), a] = slope * solution.machine.length_mm[a] / 2.0
+    return [Source("scale_temperature", factor)]
