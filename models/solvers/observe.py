@@ -1,68 +1,68 @@
-"""What a run reads of a machine and its set-up: unknowns with their priors, linearised reading, reading.
+"""What a run reads of a machine and its set-up, exactly, and how each unknown changes it (docs/conventions.md, "Readings").
 
-Cup offsets, bar lengths, mirror tilts, laser zeros and drifts are unknowns with documented priors (`models.solvers.priors`): published
-methods take the set-ups as perfect (math.md 4.5, 5.4).
+Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns (`models.solvers.observe_setup`). The
+readings are those of math.md 4.2 and 5.4 without any linearisation: finite rotations in the chain, the length of the bar as a length, the
+mirror as a tilted plane that a misaligned beam meets. A helix, a circle in any plane and a partial arc are one and the same reading of a
+ball-bar; step diagonal, plain diagonal and single-axis line one of a laser: only the commanded positions differ.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from models.arrays import F1, F2, F3
 from models.geometry.bases import Term
-from models.geometry.chain import design
 from models.machine import Machine
 from models.solvers.observations import RunData
-from models.solvers.priors import Priors, bar_length_sd
+from models.solvers.observe_kinematics import LOST, Places, with_tool
+from models.solvers.observe_setup import Setup, perpendicular, setup_unknowns
+
+__all__ = [
+    "Setup",
+    "bar_normals",
+    "linearise",
+    "perpendicular",
+    "predict",
+    "run_design",
+    "run_jacobian",
+    "setup_unknowns",
+    "with_tool",
+]
 
 
-def with_tool(machine: Machine, tool_mm: F1 | None) -> Machine:
-    """The machine with another tool, for rule G's levers; None: its own."""
-    return machine if tool_mm is None else replace(machine, tool_mm=tool_mm)
+def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> F1:
+    """Reading of a run for given unknowns, exact, shape (n,), mm: bar length minus radius, or displacement minus nominal.
 
-
-@dataclass(frozen=True)
-class Setup:
-    """Names and priors of the set-up unknowns of a campaign."""
-
-    names: tuple[str, ...]
-    prior_sd: F1
-
-
-def setup_unknowns(runs: tuple[RunData, ...], priors: Priors) -> Setup:
-    """Set-up unknowns of a set of runs: per cup, per bar length, per mirror, per laser run.
-
-    Runs with the same nominal radius share one bar; where they state its length differently, the widest statement is believed.
+    Parameters
+    ----------
+    machine, terms
+        Nominal machine; terms of its error motions.
+    run : RunData
+        Where the axes were commanded to; its readings are not looked at.
+    setup : Setup
+        Set-up unknowns of the campaign (`setup_unknowns`); one that has no name there is taken as zero.
+    theta : array, shape (terms + 3 + set-up,)
+        Coefficients (mm, rad), lost motion (mm), set-up unknowns.
     """
-    sd: dict[str, float] = {}
-    for run in runs:
-        if run.kind == "bar":
-            sd |= {f"cup_{run.setup}_{a}": priors.cup_mm for a in "xyz"}
-            bar = f"bar_length_{run.radius_mm:g}"
-            sd[bar] = max(sd.get(bar, 0.0), bar_length_sd(run.u_length_mm, run.length_calibrated, priors))
-        else:
-            if _bent(run):
-                sd |= {f"tilt_{run.setup}_{k}": priors.tilt_rad for k in "12"}
-            sd[f"zero_{run.label}"] = priors.zero_mm
-            sd[f"drift_{run.label}"] = priors.drift_mm_s
-    return Setup(tuple(sd), np.array(list(sd.values())))
+    return _of(machine, terms, run, setup, theta).reading()
 
 
-def perpendicular(beam: F1) -> F2:
-    """Two unit vectors perpendicular to a beam and to each other, shape (2, 3)."""
-    helper = np.eye(3)[int(np.argmin(np.abs(beam)))]
-    first = np.cross(beam, helper)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(beam, first)])
+def run_jacobian(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> F2:
+    """Exact analytic derivative of `predict` at given unknowns, shape (n, terms + 3 + set-up); parameters as there."""
+    return _of(machine, terms, run, setup, theta).jacobian()
 
 
-def _bent(run: RunData) -> bool:
-    """Whether the path leaves the beam, so that a tilted mirror shows."""
-    assert run.beam is not None
-    d = run.axes_mm - run.axes_mm[0]
-    return bool(np.abs(d - np.outer(d @ run.beam, run.beam)).max() > 1e-6)
+def run_design(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup) -> F2:
+    """Linearised reading per unit of every unknown: `run_jacobian` of the perfect machine in a perfect set-up."""
+    return run_jacobian(machine, terms, run, setup, np.zeros(len(terms) + LOST + len(setup.names)))
+
+
+def linearise(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> tuple[F1, F2]:
+    """`predict` and `run_jacobian` at once, for a step of an iteration."""
+    at = _of(machine, terms, run, setup, theta)
+    return at.reading(), at.jacobian()
 
 
 def bar_normals(run: RunData) -> F2:
@@ -72,44 +72,135 @@ def bar_normals(run: RunData) -> F2:
     return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
-def run_field(machine: Machine, terms: tuple[Term, ...], run: RunData) -> F3:
-    """Design of the deviation along a run, with the run's own tool, shape (n, 3, terms)."""
-    return design(with_tool(machine, run.tool_mm), terms, run.axes_mm)
+@dataclass(frozen=True)
+class _SetupValues:
+    """Set-up part of the unknowns by name; what is not an unknown of this campaign is zero and has no column."""
+
+    at: dict[str, int]
+    values: F1
+
+    def get(self, *names: str) -> F1:
+        """Values of some unknowns, shape (len(names),)."""
+        return np.array([self.values[self.at[n]] if n in self.at else 0.0 for n in names])
+
+    def columns(self, parts: dict[str, F1], n: int) -> F2:
+        """Derivatives by name, put where the unknowns stand, shape (n, set-up)."""
+        out = np.zeros((n, self.values.size))
+        for name, column in parts.items():
+            if name in self.at:
+                out[:, self.at[name]] = column
+        return out
 
 
-def run_design(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup) -> F2:
-    """Linearised reading per unit of every unknown of the campaign, shape (n, terms + 3 + set-up)."""
-    field = run_field(machine, terms, run)
-    lost = -0.5 * run.sign
-    out = np.zeros((run.deviation_mm.size, len(setup.names)))
-    at = {name: i for i, name in enumerate(setup.names)}
-    if run.kind == "bar":
-        n = bar_normals(run)
-        for k, a in enumerate("xyz"):
-            out[:, at[f"cup_{run.setup}_{a}"]] = -n[:, k]
-        out[:, at[f"bar_length_{run.radius_mm:g}"]] = 1.0
-        return np.concatenate([np.einsum("ni,nik->nk", n, field), n * lost, out], axis=1)
-    assert run.beam is not None
-    d = run.axes_mm - run.axes_mm[0]
-    if _bent(run):
-        for k, t in enumerate(perpendicular(run.beam)):
-            out[:, at[f"tilt_{run.setup}_{k + 1}"]] = d @ t
-    out[:, at[f"zero_{run.label}"]] = 1.0
-    out[:, at[f"drift_{run.label}"]] = run.t_s - run.t_s[0]
-    seen = np.einsum("i,nik->nk", run.beam, field - field[0])
-    return np.concatenate([seen, (lost - lost[0]) * run.beam, out], axis=1)
-
-
-def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> F1:
-    """Reading of a run for given unknowns; the ball-bar without linearisation, shape (n,)."""
+def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> _Bar | _Laser:
+    n_machine = len(terms) + LOST
+    if theta.shape != (n_machine + len(setup.names),):
+        raise ValueError(f"run {run.label}: {theta.size} unknowns given, {n_machine + len(setup.names)} expected")
+    machine = with_tool(machine, run.tool_mm)
+    known = _SetupValues({name: i for i, name in enumerate(setup.names)}, theta[n_machine:])
+    places = Places.of(machine, terms, run.axes_mm, run.sign)
     if run.kind == "laser":
-        return np.asarray(run_design(machine, terms, run, setup) @ theta)
+        return _Laser(run, places, known, places.motions(theta))
     assert run.centre_mm is not None
-    assert run.radius_mm is not None
-    at = {name: i for i, name in enumerate(setup.names)}
-    n_terms = len(terms)
-    tip = run.axes_mm - run.centre_mm + run_field(machine, terms, run) @ theta[:n_terms]
-    tip = tip - 0.5 * run.sign * theta[n_terms : n_terms + 3]
-    rest = theta[n_terms + 3 :]
-    tip = tip - np.array([rest[at[f"cup_{run.setup}_{a}"]] for a in "xyz"])
-    return np.asarray(np.linalg.norm(tip, axis=1) - run.radius_mm + rest[at[f"bar_length_{run.radius_mm:g}"]])
+    cup = Places.of(machine, terms, run.centre_mm[None], np.zeros((1, 3)))
+    return _Bar(run, places, known, places.motions(theta), cup, cup.motions(theta), run.t_s - setup.start_s.get(run.setup, run.t_s[0]))
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """|p - c + D(p) - D(c) - offset + drift t| - R + length error: nominal bar R, nominal cup c, D the machine's deviation.
+
+    The spindle puts the cup down, so the cup carries the machine's deviation D(c) there, with the tool of the run; from which side the
+    axes came then is not known and belongs to the mounting offset.
+    """
+
+    run: RunData
+    places: Places
+    known: _SetupValues
+    motions: F3
+    cup: Places
+    cup_motions: F3
+    since_s: F1
+
+    def _names(self) -> tuple[list[str], list[str], str]:
+        s = self.run.setup
+        return [f"cup_{s}_{a}" for a in "xyz"], [f"bar_drift_{s}_{a}" for a in "xyz"], f"bar_length_{self.run.radius_mm:g}"
+
+    def _bar(self) -> F2:
+        """From the cup to the tool, shape (n, 3), mm."""
+        cup, drift, _ = self._names()
+        assert self.run.centre_mm is not None
+        placed = self.cup.deviation_mm(self.cup_motions)[0] + self.known.get(*cup)
+        moved = self.places.deviation_mm(self.motions) - placed + np.outer(self.since_s, self.known.get(*drift))
+        return np.asarray(self.run.axes_mm - self.run.centre_mm + moved)
+
+    def reading(self) -> F1:
+        length = self.known.get(self._names()[2])[0]
+        assert self.run.radius_mm is not None
+        return np.asarray(np.linalg.norm(self._bar(), axis=1) - self.run.radius_mm + length)
+
+    def jacobian(self) -> F2:
+        bar = self._bar()
+        u = bar / np.linalg.norm(bar, axis=1, keepdims=True)
+        rows = self.places.rows(u, self.places.slope(self.motions))
+        placed = self.cup.rows(np.eye(3), np.repeat(self.cup.slope(self.cup_motions), 3, axis=0))
+        cup, drift, length = self._names()
+        parts = {length: np.ones(len(u))}
+        parts |= {name: -u[:, k] for k, name in enumerate(cup)}
+        parts |= {name: u[:, k] * self.since_s for k, name in enumerate(drift)}
+        return np.concatenate([rows - u @ placed, self.known.columns(parts, len(u))], axis=1)
+
+
+@dataclass(frozen=True)
+class _Laser:
+    """(1 + scale) m.(P - P0) / (m.l) - nominal + zero + drift t: P where the mirror really is (P0 at the first record), l the beam.
+
+    Normal of the mirror m = n + t1 e1 + t2 e2 with the nominal beam n and tilts as tangents, so that m.n = 1 and 1 / (m.l) = 1 + cosine.
+    """
+
+    run: RunData
+    places: Places
+    known: _SetupValues
+    motions: F3
+
+    def _names(self) -> tuple[list[str], str, str, str]:
+        s, label = self.run.setup, self.run.label
+        return [f"tilt_{s}_1", f"tilt_{s}_2"], f"cosine_{s}", f"zero_{label}", f"drift_{label}"
+
+    def _mirror(self) -> tuple[F1, F2, F1]:
+        """Normal of the mirror less the nominal beam, the two directions of tilt, and (1 + scale), (1 + cosine)."""
+        tilt, cosine, _, _ = self._names()
+        assert self.run.beam is not None
+        across = perpendicular(self.run.beam)
+        return self.known.get(*tilt) @ across, across, 1.0 + self.known.get("laser_scale", cosine)
+
+    def _moved(self) -> tuple[F2, F2]:
+        """Nominal displacement and what the machine adds to it since the first record, shape (n, 3) each, mm."""
+        deviation = self.places.deviation_mm(self.motions)
+        return self.run.axes_mm - self.run.axes_mm[0], deviation - deviation[0]
+
+    def reading(self) -> F1:
+        assert self.run.beam is not None
+        lean, _, factors = self._mirror()
+        nominal, added = self._moved()
+        _, _, zero, drift = self._names()
+        values = self.known.get(zero, drift)
+        factor = factors.prod()
+        seen = nominal @ lean + added @ (self.run.beam + lean)  # apart, so that no digits of the metre are lost
+        return np.asarray((factor - 1.0) * (nominal @ self.run.beam) + factor * seen + values[0] + values[1] * self._since_s())
+
+    def jacobian(self) -> F2:
+        assert self.run.beam is not None
+        lean, across, factors = self._mirror()
+        mirror, (nominal, added) = self.run.beam + lean, self._moved()
+        n = len(nominal)
+        rows = self.places.rows(np.broadcast_to(factors.prod() * mirror, (n, 3)), self.places.slope(self.motions))
+        tilt, cosine, zero, drift = self._names()
+        path = nominal + added
+        parts = {zero: np.ones(n), drift: self._since_s()}
+        parts |= {"laser_scale": factors[1] * (path @ mirror), cosine: factors[0] * (path @ mirror)}
+        parts |= {name: factors.prod() * (path @ across[k]) for k, name in enumerate(tilt)}
+        return np.concatenate([rows - rows[0], self.known.columns(parts, n)], axis=1)
+
+    def _since_s(self) -> F1:
+        return np.asarray(self.run.t_s - self.run.t_s[0])

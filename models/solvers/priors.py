@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
+from models.arrays import F1, F2
 from models.geometry.bases import Term
 from models.machine import Machine
 
@@ -35,6 +35,11 @@ class Priors:
     backlash_mm, cup_mm, tilt_rad, zero_mm, drift_mm_s : lost motion; cup offset; mirror tilt; first laser record; drift of a laser run.
     bar_length_mm, bar_unknown_mm : length of a bar that is called calibrated without a figure; of a bar that is not calibrated (what a
         careful hand sets with a rule block or caliper: on a 150 mm bar it leaves every scale to the scales' own prior).
+    laser_scale : relative error of the wavelength, common to all laser runs of a campaign.
+    cosine : relative 1 / (m.l) - 1 of one laser set-up (math.md 5.4), u^2/2 - t.u for a beam aligned to 0.3 mrad in each direction (0.3 mm
+        in 1 m) and a mirror tilted by ``tilt_rad``: rms 0.25e-6. On 1 m that is 0.25 um, as much as the noise of the reading.
+    bar_drift_mm_s : growth of tool against cup in each direction while a ball-bar set-up stands: 0.18 um/min or 11 um/h, an assumption
+        for a machine that is neither cold nor settled, until drifts are measured.
     """
 
     scale_rad: float = 100e-6
@@ -51,6 +56,9 @@ class Priors:
     tilt_rad: float = 500e-6
     zero_mm: float = 2e-3
     drift_mm_s: float = 1e-6
+    laser_scale: float = U_WAVELENGTH
+    cosine: float = 0.25e-6
+    bar_drift_mm_s: float = 3e-6
 
 
 def bar_length_sd(u_length_mm: float | None, calibrated: bool | None, priors: Priors) -> float:
@@ -80,3 +88,64 @@ def _sd(machine: Machine, term: Term, p: Priors) -> float:
             return float(p.scale_rad * machine.length_mm[term.axis] / 2)
         return p.positioning_mm * fade
     return p.straightness_mm * fade
+
+
+SIZE_FACTOR = 3.0
+"""Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
+SPECTRUM_SD = 1.0
+"""Hyperprior of the two numbers that bend how sizes fade with the order."""
+LEARNED_SETUP = ("cup", "tilt", "drift")
+"""Set-up unknowns that hands and temperatures make, so that their size may be learned. Stated calibrations never are."""
+
+
+@dataclass(frozen=True)
+class SizeModel:
+    """How prior variances depend on a few numbers that the data may correct: log variance = log reference + ``design @ psi``.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What each number is: a class of unknowns (its log variance over the documented one), or ``fade`` and ``cut`` of the orders.
+    design : array, shape (p, h)
+    sd : array, shape (h,)
+        Standard deviation of the normal hyperprior of each number, around 0 (the documented size).
+    """
+
+    names: tuple[str, ...]
+    design: F2
+    sd: F1
+
+
+def size_model(terms: tuple[Term, ...], rest: tuple[str, ...]) -> SizeModel:
+    """Classes of the smooth ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
+
+    All squareness errors share one size, all scales, all positioning errors of order 2 and more, all straightness errors, all angles, all
+    slopes of angles, and so on: what the data show of some tells how large the others may be. Sizes fade with the order k as
+    exp(-fade ln(k/2) - cut (k^2 - 4)/72) on top of `Priors.decay_order`, the same for all motions.
+    """
+    kinds = [_class(t) for t in terms] + [_setup_class(n) for n in rest]
+    names = tuple(dict.fromkeys(k for k in kinds if k))
+    columns = [np.array([float(k == name) for k in kinds]) for name in names]
+    sd = [2.0 * np.log(SIZE_FACTOR)] * len(names)
+    order = np.array([t.order if t.order >= 2 else 2 for t in terms] + [2] * len(rest), dtype=np.float64)
+    if order.max(initial=2.0) > 3.0:
+        names += ("fade", "cut")
+        columns += [-2.0 * np.log(order / 2.0), -(order**2 - 4.0) / 36.0]
+        sd += [SPECTRUM_SD, SPECTRUM_SD]
+    design = np.stack(columns, axis=1) if columns else np.zeros((len(kinds), 0))
+    return SizeModel(names, design, np.array(sd))
+
+
+def _class(term: Term) -> str:
+    if term.order == 0:
+        return "squareness"
+    if term.component >= 3:
+        return "angle slope" if term.order == 1 else "angle"
+    if term.component == term.axis:
+        return "scale" if term.order == 1 else "positioning"
+    return "straightness"
+
+
+def _setup_class(name: str) -> str:
+    kind = name.partition("_")[0]
+    return kind if kind in (*LEARNED_SETUP, "backlash") else ""
