@@ -36,7 +36,8 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
     """Mean scale error of X, Y, Z (slope of EXX, EYY, EZZ) and mean squareness C0Y, B0Z, A0Z over the volume.
 
     Scales hold at the temperature the machine had while it was measured: nothing is reduced to 20 degree C, and 1 K of a steel machine is
-    about 11 um/m. Least-squares slopes over equidistant positions; scales carry the laser's wavelength uncertainty, common to all readings.
+    about 11 um/m. Least-squares slopes over equidistant positions. The laser's wavelength is an unknown of every solution with a laser
+    (`laser_scale`) and so within its covariance; without one, scales carry its uncertainty all the same: none is known better.
     """
     slopes = {}
     for a in range(3):
@@ -44,7 +45,8 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
         p = np.linspace(first, last, positions)
         weight = (p - p.mean()) / np.sum((p - p.mean()) ** 2)
         slopes[a] = np.einsum("p,pik->ik", weight, main_effect(solution, a, p, nodes))
-    found = [_parameter(solution, f"E{AXES[a]}{AXES[a]}", slopes[a][a], U_WAVELENGTH) for a in range(3)]
+    common = 0.0 if "laser_scale" in solution.setup.names else U_WAVELENGTH
+    found = [_parameter(solution, f"E{AXES[a]}{AXES[a]}", slopes[a][a], common) for a in range(3)]
     found += [_parameter(solution, name, sign * (slopes[a][b] + slopes[b][a])) for name, a, b, sign in SQUARENESS]
     return tuple(found)
 
