@@ -1,0 +1,10 @@
+"""What every kind of table is in the end: commanded positions to what is added to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from models.arrays import F2
+
+Correction = Callable[[F2], F2]
+"""Commanded positions, shape (n, 3), to corrections added to the command, shape (n, 3), mm."""

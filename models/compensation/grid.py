@@ -1,0 +1,156 @@
+"""3-D grid of corrections with trilinear interpolation: the table that takes out what angles do at a distance.
+
+Frame: the best-fit rigid motion over the grid is left out of the corrections, because it moves no distance between two points of a part;
+then one constant is added so that the reference node is not moved at all (a controller's reference point must stay where it is).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import F1, F2, F3, F4
+from models.compensation.interpolation import fit_operator, fit_positions, trilinear
+from models.compensation.masking import blend
+from models.compensation.tables import grid_positions
+from models.geometry.chain import design
+from models.solvers.joint import JointSolution
+from models.volumetric import remove_rigid, rigid_design
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class GridTable:
+    """Corrections at the nodes of a grid, added to the command.
+
+    Attributes
+    ----------
+    position_mm : three arrays
+        Nodes of X, Y, Z.
+    correction_mm : array, shape (nx, ny, nz, 3)
+        Zero at the reference node.
+    u_mm : array, shape (nx, ny, nz, 3)
+        Standard uncertainty of the deviation at each node, in the frame in which the deviation has no rigid motion over the grid.
+    compensated : array of bool, shape (nx, ny, nz)
+        False: the deviation there is not known well enough; all these nodes hold one and the same correction, so that no distance between
+        two of them is changed (`models.compensation.masking`).
+    reference : (int, int, int)
+        The node that is not moved.
+    """
+
+    position_mm: tuple[F1, F1, F1]
+    correction_mm: F4
+    u_mm: F4
+    compensated: Mask
+    reference: tuple[int, int, int]
+
+    def correction_at(self, axes_mm: F2) -> F2:
+        """Correction at commanded positions by trilinear interpolation, end values held, shape (n, 3), mm."""
+        return trilinear(self.position_mm, self.correction_mm, axes_mm)
+
+    @property
+    def largest_step_mm(self) -> float:
+        """Largest change of any axis' correction from one node to the next: what a controller limits, and what shows on a surface."""
+        return max(float(np.abs(np.diff(self.correction_mm, axis=a)).max()) for a in range(3))
+
+
+def nodes_mm(position_mm: tuple[F1, F1, F1]) -> F2:
+    """All nodes of a grid, X slowest, shape (nx ny nz, 3)."""
+    return np.stack(np.meshgrid(*position_mm, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def node_design(solution: JointSolution, position_mm: tuple[F1, F1, F1], *, fitted: bool = True) -> F3:
+    """Node values of the best trilinear field for each of the solution's terms, shape (nodes, 3, terms).
+
+    ``fitted``: least-squares fit of the trilinear interpolant over the volume of the grid; else the terms' own values at the nodes. Every
+    term bends along its own axis only and is at most linear in the others (rule G), where a trilinear field follows it exactly: so the fit
+    over the volume is the fit along the term's axis (tests/physics/test_tables_grid.py fits the whole volume and finds the same).
+    """
+    counts = tuple(p.size for p in position_mm)
+    out: F3 = np.empty((int(np.prod(counts)), 3, len(solution.terms)))
+    for a in range(3):
+        mine = [i for i, t in enumerate(solution.terms) if t.axis == a]
+        chosen = tuple(solution.terms[i] for i in mine)
+        if not fitted:
+            out[:, :, mine] = design(solution.machine, chosen, nodes_mm(position_mm))
+            continue
+        sampled = tuple(fit_positions(p) if k == a else p for k, p in enumerate(position_mm))
+        values = design(solution.machine, chosen, nodes_mm((sampled[0], sampled[1], sampled[2])))
+        cube = values.reshape(*(p.size for p in sampled), 3, len(mine))
+        out[:, :, mine] = np.moveaxis(np.tensordot(fit_operator(position_mm[a]), cube, (1, a)), 0, a).reshape(-1, 3, len(mine))
+    return out
+
+
+def grid_table(
+    solution: JointSolution,
+    counts: tuple[int, int, int],
+    *,
+    compensable: Mask | None = None,
+    reference: tuple[int, int, int] = (0, 0, 0),
+    fitted: bool = True,
+) -> GridTable:
+    """Best 3-D grid for the machine as identified.
+
+    Parameters
+    ----------
+    counts : (int, int, int)
+        Nodes of X, Y, Z.
+    compensable : array of bool, shape ``counts``, optional
+        Nodes at which to compensate, e.g. `models.compensation.masking.known_better_than_error`; none: all.
+    reference : (int, int, int)
+        Node that the corrections do not move.
+    fitted : bool
+        Fit the interpolant instead of sampling the field at the nodes: leaves about 0.4 of the rms between the nodes.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 2 nodes on an axis, a mask of another shape, or a reference outside the grid.
+    """
+    position = grid_positions(solution.machine, counts)
+    keep = np.ones(counts, dtype=bool) if compensable is None else np.asarray(compensable, dtype=bool)
+    if keep.shape != counts:
+        raise ValueError(f"grid table: mask of shape {keep.shape} for {counts} nodes")
+    if not all(0 <= r < n for r, n in zip(reference, counts, strict=True)):
+        raise ValueError(f"grid table: reference node {reference} is outside the grid of {counts} nodes")
+    full = node_design(solution, position, fitted=fitted)
+    error = (full @ solution.coefficients).reshape(*counts, 3)
+    correction, done = blend(position, error, keep)
+    u = node_uncertainty_mm(full, nodes_mm(position), solution.term_covariance).reshape(*counts, 3)
+    return GridTable(position, correction - correction[reference], u, done, reference)
+
+
+def node_uncertainty_mm(full: F3, points_mm: F2, covariance: F2) -> F2:
+    """Standard uncertainty of the field at each point with the best-fit rigid motion over all points taken out, shape (n, 3)."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = full.reshape(-1, covariance.shape[0]) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    rigid, _ = np.linalg.qr(rigid_design(points_mm).reshape(-1, 6))
+    free = root - rigid @ (rigid.T @ root)
+    return np.asarray(np.sqrt(np.sum(free**2, axis=1)).reshape(-1, 3))
+
+
+def known_better_than_error(solution: JointSolution, counts: tuple[int, int, int], coverage: float = 1.0) -> Mask:
+    """Nodes at which the deviation's length exceeds its uncertainty (times ``coverage``), rigid motion removed, shape ``counts``."""
+    position = grid_positions(solution.machine, counts)
+    points = nodes_mm(position)
+    full = node_design(solution, position)
+    size = np.linalg.norm(remove_rigid(points, full @ solution.coefficients), axis=1)
+    u = np.linalg.norm(node_uncertainty_mm(full, points, solution.term_covariance), axis=1)
+    return np.asarray((size > coverage * u).reshape(counts))
+
+
+def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:
+    """The grid as the controller will store it: every correction rounded to its unit; the reference stays zero."""
+    return replace(table, correction_mm=np.round(table.correction_mm / lsb_mm) * lsb_mm)
+
+
+def quantisation_mm(lsb_mm: float) -> float:
+    """Standard uncertainty that rounding to the unit adds to one axis' correction between the nodes, mm.
+
+    Each node is off by a uniform lsb / sqrt(12); trilinear interpolation averages eight of them, which leaves (2/3)^(3/2) of it as rms over
+    a cell. A distance sees two ends: sqrt(2) of that.
+    """
+    return float(lsb_mm / np.sqrt(12.0) * (2.0 / 3.0) ** 1.5)
