@@ -45,6 +45,7 @@ class Fixture:
         self._ops: dict[str, Callable[[Answer], Awaitable[Answer]]] = {
             "identify": self._identify,
             "mount_ballbar": self._mount_ballbar,
+            "change_ballbar": self._change_ballbar,
             "mount_laser": self._mount_laser,
             "unmount": self._unmount,
             "estop": self._estop,
@@ -107,6 +108,15 @@ class Fixture:
         if not 0.0 < radius_mm <= MAX_RADIUS_MM:
             raise FixtureError("radius_mm is out of range")
         self._world.ballbar.mount(radius_mm, self._standing())
+        return {}
+
+    async def _change_ballbar(self, request: Answer) -> Answer:
+        radius_mm = _number(request, "radius_mm")
+        if not 0.0 < radius_mm <= MAX_RADIUS_MM:
+            raise FixtureError("radius_mm is out of range")
+        self._standing()
+        if not self._world.ballbar.change(radius_mm):
+            raise FixtureError("no cup stands here")
         return {}
 
     async def _mount_laser(self, request: Answer) -> Answer:

@@ -10,10 +10,11 @@ from itertools import permutations, product
 
 import numpy as np
 
+from models.arrays import F1
 from models.machine import Machine
 from models.paths.lines import DIAGONALS
 from models.planning.instruments import Instruments
-from models.planning.measurements import CLEARANCE_MM, DiagonalTest, HelixTest, LineTest, Measurement
+from models.planning.measurements import CLEARANCE_MM, DiagonalTest, HelixTest, LineTest, Measurement, Point
 
 BAR_CLEARANCE_MM = 5.0
 """Hemispheres keep this distance from the ends of the strokes: approach, lost motion and cup offset need some."""
@@ -46,11 +47,26 @@ def candidates(machine: Machine, tools: Instruments, vertical: int = 2) -> tuple
     return tuple(found)
 
 
-def helix_centres(machine: Machine, radius_mm: float, vertical: int = 2) -> tuple[tuple[float, float, float], ...]:
-    """Cup places (whole mm) at which the whole upper hemisphere of a radius stays inside the strokes."""
+def _room(machine: Machine, radius_mm: float, vertical: int) -> tuple[F1, F1]:
+    """Lowest and highest cup place (whole mm) at which the upper hemisphere of a radius stays inside the strokes."""
     below = np.full(3, radius_mm + BAR_CLEARANCE_MM)
     below[vertical] = BAR_CLEARANCE_MM
-    lo, hi = np.ceil(machine.stroke_mm[:, 0] + below), np.floor(machine.stroke_mm[:, 1] - radius_mm - BAR_CLEARANCE_MM)
+    return np.ceil(machine.stroke_mm[:, 0] + below), np.floor(machine.stroke_mm[:, 1] - radius_mm - BAR_CLEARANCE_MM)
+
+
+def bars_that_fit(machine: Machine, tools: Instruments, centre_mm: Point, vertical: int = 2) -> tuple[float, ...]:
+    """Bars whose whole upper hemisphere about a cup stays inside the strokes."""
+    fit = []
+    for radius in tools.bar_lengths_mm:
+        lo, hi = _room(machine, radius, vertical)
+        if (lo <= centre_mm).all() and (centre_mm <= hi).all():
+            fit.append(radius)
+    return tuple(fit)
+
+
+def helix_centres(machine: Machine, radius_mm: float, vertical: int = 2) -> tuple[Point, ...]:
+    """Cup places (whole mm) at which the whole upper hemisphere of a radius stays inside the strokes."""
+    lo, hi = _room(machine, radius_mm, vertical)
     if (hi < lo).any():
         return ()
     places = []

@@ -7,12 +7,13 @@ nodes that leans on the worst node (power 1 would be the plain mean, an infinite
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import linalg
 
 from models.arrays import F1, F2
+from models.planning.candidates import bars_that_fit
 from models.planning.information import Problem, factor, field_rows, mounting_information
 from models.planning.instruments import SetupMinutes
 from models.planning.measurements import HelixTest, LineTest, Measurement, machine_seconds
@@ -30,7 +31,8 @@ def extra_minutes(minutes: SetupMinutes, machine_min: float, test: Measurement, 
     if isinstance(test, HelixTest):
         if not before:
             return minutes.cup + machine_min
-        same = any(isinstance(b, HelixTest) and b.radius_mm == test.radius_mm for b in before)
+        last = before[-1]
+        same = isinstance(last, HelixTest) and last.radius_mm == test.radius_mm
         return (0.0 if same else minutes.bar) + machine_min
     if before:
         return machine_min
@@ -47,12 +49,14 @@ class Search:
     share: float = 0.8
     tick: Callable[[float], None] = lambda _: None
     _rows: F2 = field(init=False)
+    _known: frozenset[Measurement] = field(init=False)
     _information: dict[tuple[Measurement, ...], F2] = field(init=False, default_factory=dict)
     _factors: dict[tuple[tuple[Measurement, ...], Measurement], F2] = field(init=False, default_factory=dict)
     _machine_min: dict[Measurement, float] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         """Lay out the nodes at which plans are judged."""
+        self._known = frozenset(self.candidates)
         self._rows = field_rows(self.what, self.share, SEARCH_NODES)
 
     def cost_min(self, test: Measurement, before: tuple[Measurement, ...]) -> float:
@@ -101,9 +105,9 @@ class Search:
         half = linalg.solve_triangular(lower, self._rows.T, lower=True)
         start = (half**2).sum(axis=0)
         now, best = self._judge(start), None
-        for test in self.candidates:
+        for test in (*self.candidates, *self._at_cups(chosen)):
             before = chosen.get(test.mounting, ())
-            if test in before:
+            if test in before or (before and isinstance(test, HelixTest) and not _follows(test, before)):
                 continue
             cost = self.cost_min(test, before)
             if cost > budget_min:
@@ -115,6 +119,17 @@ class Search:
             if gain > 1e-6 and (best is None or gain > best[1]):
                 best = (test, gain)
         return best
+
+    def _at_cups(self, chosen: Chosen) -> list[Measurement]:
+        """Other bars, and the way back with the same bar, at the cups that stand already."""
+        found: list[Measurement] = []
+        for tests in chosen.values():
+            last = tests[-1]
+            if isinstance(last, HelixTest):
+                others = bars_that_fit(self.what.machine, self.what.tools, last.centre_mm, last.axis)
+                found += [replace(last, radius_mm=r, direction=1) for r in others if r != last.radius_mm]
+                found.append(replace(last, direction=-last.direction))
+        return [t for t in found if t not in self._known]
 
     def fill(self, chosen: Chosen, budget_min: float) -> Chosen:
         """Add tests by gain per minute until nothing more fits."""
@@ -142,6 +157,14 @@ class Search:
             if not improved:
                 break
         return chosen
+
+
+def _follows(test: HelixTest, before: tuple[Measurement, ...]) -> bool:
+    """Whether a helix can come next at a cup: with the same bar only back, and no bar is hung in twice."""
+    last, used = before[-1], [b.radius_mm for b in before if isinstance(b, HelixTest)]
+    return isinstance(last, HelixTest) and (
+        test.radius_mm not in used or (test.radius_mm == last.radius_mm and test.direction != last.direction)
+    )
 
 
 def _without_one(chosen: Chosen) -> list[Chosen]:

@@ -12,6 +12,7 @@ from service.errors import StrokeError
 from service.sequences.steps import (
     MAX_PATH_POINTS,
     CampaignPlan,
+    ChangeBar,
     MountBar,
     MountLaser,
     MoveTo,
@@ -60,7 +61,7 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
             return length / feed * 60.0, points[-1]
         case ReadLaser(_, settle):
             return settle + 0.1, here
-        case MountBar() | MountLaser() | Unmount() | ZeroLaser():
+        case MountBar() | ChangeBar() | MountLaser() | Unmount() | ZeroLaser():
             return MOUNT_S, here
 
 

@@ -18,6 +18,7 @@ from models.paths.lines import diagonal_ends, step_diagonal, straight_line
 from service.errors import ConfigError
 from service.sequences.steps import (
     MAX_PATH_POINTS,
+    ChangeBar,
     MountBar,
     MountLaser,
     MoveTo,
@@ -55,6 +56,7 @@ class Helix:
     polyline then runs chord^2 / (8 radius) inside the sphere, and by the area law radius / (4 n) beside the pole: with 750 mm, 1.3 and
     23 um. That costs no accuracy: columns and solvers take the commanded position on the polyline, not on the sphere.
     ``mount`` and ``unmount`` are false where two helices in a row share one set-up: the second does not mount, the first leaves the bar.
+    ``change_bar``: the second has another radius; the cup stays, the bar is changed.
     """
 
     label: str
@@ -71,6 +73,7 @@ class Helix:
     chord_mm: float = 1.0
     mount: bool = True
     unmount: bool = True
+    change_bar: bool = False
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: to the centre, mount, out to the path's start, record the path, clear away.
@@ -92,6 +95,8 @@ class Helix:
         steps: list[Step] = []
         if self.mount:
             steps += [MoveTo(self.centre_mm, RAPID_MM_MIN), MountBar(self.radius_mm)]
+        elif self.change_bar:
+            steps.append(ChangeBar(self.radius_mm))
         steps += [MoveTo(_before(path, machine), RAPID_MM_MIN), MoveTo(path[0], self.feed_mm_min)]
         steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction))
         if self.unmount:
@@ -110,7 +115,10 @@ class Helix:
 
 @dataclass(frozen=True, slots=True)
 class Diagonal:
-    """Body diagonal by laser: sequential single-axis ``steps`` (Wang), or plain positions when ``order`` is empty; out and back."""
+    """Body diagonal by laser: sequential single-axis ``steps`` (Wang), or plain positions when ``order`` is empty; out and back.
+
+    ``mount`` and ``unmount`` are false where two orders in a row share one mirror: the second does not mount, the first leaves it.
+    """
 
     label: str
     setup_id: str
@@ -120,6 +128,8 @@ class Diagonal:
     order: str = "XYZ"
     feed_mm_min: float = RAPID_MM_MIN
     settle_s: float = 0.3
+    mount: bool = True
+    unmount: bool = True
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: approach, mount, zero, one reading after every move, clear away."""
@@ -140,20 +150,27 @@ class Diagonal:
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """Single-axis positioning by laser (ISO 230-2 line), ``n`` positions out and back, at relative place ``at`` of the other strokes."""
+    """Single-axis positioning by laser (ISO 230-2 line), ``n`` positions out and back, at relative place ``at`` of the other strokes.
+
+    ``at``: one place for both other axes, or one for each in the order X, Y, Z.
+    """
 
     label: str
     setup_id: str
     role: str
     axis: int
     n: int = 21
-    at: float = 0.15
+    at: float | tuple[float, float] = 0.15
     feed_mm_min: float = RAPID_MM_MIN
     settle_s: float = 0.3
+    mount: bool = True
+    unmount: bool = True
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: approach, mount, zero, one reading after every move, clear away."""
-        start = machine.stroke_mm[:, 0] + self.at * machine.length_mm
+        others = [a for a in range(3) if a != self.axis]
+        start = machine.stroke_mm[:, 0].copy()
+        start[others] += np.array(self.at) * machine.length_mm[others]
         end = start.copy()
         start[self.axis], end[self.axis] = machine.stroke_mm[self.axis] + np.array([CLEARANCE_MM, -CLEARANCE_MM])
         setup = {"setup_id": self.setup_id, "axis": "XYZ"[self.axis]}
@@ -177,11 +194,14 @@ def _laser_plan(recipe: Diagonal | Linear, test: str, setup: dict[str, Any], poi
     approach = start - APPROACH_MM * np.sign(end - start)
     half = len(path) // 2
     steps: list[Step] = [MoveTo(as_point(approach), RAPID_MM_MIN), MoveTo(path[0], recipe.feed_mm_min)]
-    steps += [MountLaser((float(beam[0]), float(beam[1]), float(beam[2]))), ZeroLaser(), ReadLaser(1, recipe.settle_s)]
+    if recipe.mount:
+        steps.append(MountLaser((float(beam[0]), float(beam[1]), float(beam[2]))))
+    steps += [ZeroLaser(), ReadLaser(1, recipe.settle_s)]
     for k, p in enumerate(path[1:], start=1):
         if p != path[k - 1]:
             steps.append(MoveTo(p, recipe.feed_mm_min))
         steps.append(ReadLaser(1 if k < half else -1, recipe.settle_s))
-    steps.append(Unmount())
+    if recipe.unmount:
+        steps.append(Unmount())
     setup |= {"start_mm": list(path[0]), "end_mm": list(as_point(end)), "nominal_beam": [float(v) for v in beam]}
     return TestPlan(recipe.label, test, recipe.role, setup, tuple(steps))

@@ -26,6 +26,13 @@ class MountBar:
 
 
 @dataclass(frozen=True, slots=True)
+class ChangeBar:
+    """The cup stays where it stands; the bar is taken out and another one hung in."""
+
+    radius_mm: float
+
+
+@dataclass(frozen=True, slots=True)
 class MountLaser:
     """The machine stands at the start of the line: laser and mirror are set up along ``beam``."""
 
@@ -60,7 +67,7 @@ class RecordPath:
     direction: int
 
 
-Step = MoveTo | MountBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath
+Step = MoveTo | MountBar | ChangeBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath
 
 
 @dataclass(frozen=True, slots=True)

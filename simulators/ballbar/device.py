@@ -65,6 +65,14 @@ class BallbarDevice:
         self._cup_mm = tool_mm + direction / np.linalg.norm(direction) * offset_mm
         self._radius_mm = radius_mm
 
+    def change(self, radius_mm: float) -> bool:
+        """Hang the bar of another nominal length in; the cup stays. False: no cup stands."""
+        self.settle()
+        if self._cup_mm is None:
+            return False
+        self._radius_mm = radius_mm
+        return True
+
     def unmount(self) -> None:
         """Take the bar away."""
         self.settle()

@@ -216,11 +216,14 @@ def test_fixture(start) -> None:
         assert first["ok"]
         assert second["ok"]
         assert second["time_us"] > first["time_us"]
+        assert fixture(sim, op="change_ballbar", radius_mm=100.0)["ok"]  # the cup stands
         assert fixture(sim, op="unmount")["ok"]
         for bad, error in (
             ({"op": "nonsense"}, "unknown op: nonsense"),
             ({"op": "mount_ballbar"}, "radius_mm: a number is expected"),
             ({"op": "mount_ballbar", "radius_mm": -1}, "radius_mm is out of range"),
+            ({"op": "change_ballbar", "radius_mm": 0}, "radius_mm is out of range"),
+            ({"op": "change_ballbar", "radius_mm": 100.0}, "no cup stands here"),
             ({"op": "mount_laser", "beam": [1, 1, 1]}, "beam is not a unit vector"),
             ({"op": "mount_laser", "beam": "X"}, "beam: three numbers are expected"),
             ({"op": "estop"}, "on: true or false is expected"),
