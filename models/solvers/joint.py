@@ -1,24 +1,36 @@
 """One joint solution of ball-bar and laser runs: 21 error motions, lost motion, and every set-up error as an unknown.
 
 Published methods solve the data sets one by one and take the set-ups as perfect (math.md 4.5, 5.4). Here cup offsets, bar lengths, mirror
-tilts, laser zeros and drifts are unknowns with documented priors (`models.solvers.priors`); what the data cannot separate is listed.
+tilts, laser zeros and drifts are unknowns with documented priors (`models.solvers.priors`); what the data cannot separate is listed. How
+noisy the instruments are and how large errors of each class are is estimated with them (docs/decisions/0011-sizes-from-the-data.md).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from scipy import linalg
 
 from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from models.geometry.chain import design
 from models.machine import Machine
+from models.solvers.engine import Fit, Problem, Progress, build, expected_noise, settle
 from models.solvers.identifiability import Identifiability, analyse, project_out
-from models.solvers.least_squares import Estimate, solve_map
+from models.solvers.information import KINDS, total
+from models.solvers.least_squares import Estimate
 from models.solvers.observations import RunData
-from models.solvers.observe import Setup, predict, run_design, setup_unknowns, with_tool
-from models.solvers.priors import Priors, term_prior_sd
+from models.solvers.observe import Setup, with_tool
+from models.solvers.order import RIGID6, OrderChoice, choose, term_levels
+from models.solvers.priors import Priors
+from models.solvers.residual_tests import ResidualTest, residual_tests
+from models.solvers.robust import Outlier
+
+HIGHEST_ORDER = 12
+"""Error motions of this order are still solved for, whatever order the runs support: the ones above as nuisance, held by their prior."""
+Model = Literal["rigid6", "rigid21", "auto"]
 
 
 @dataclass(frozen=True)
@@ -36,10 +48,31 @@ class RunFit:
 class JointSolution:
     """Error motions of the machine from all runs together.
 
-    ``estimate`` holds the smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns. ``tool_count``: how many
-    different tools the runs used; with one, what only another tool would show stays hidden (math.md 4.6). ``data``: the runs as they were
-    used; ``setup``: their set-up unknowns; ``prior_sd``: prior standard deviation of every unknown of ``estimate``; ``information``: what
-    the readings alone say of them (A^T W A, no prior), shape (p, p), in the unknowns' own units.
+    Attributes
+    ----------
+    estimate : Estimate
+        Smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns. Its covariance holds the noise as it was
+        estimated and the uncertainty of the estimated sizes.
+    tool_count : int
+        How many different tools the runs used; with one, what only another tool would show stays hidden (math.md 4.6).
+    data, setup : the runs as they were used; their set-up unknowns.
+    prior_sd : array, shape (p,)
+        Prior standard deviation of every unknown of ``estimate``, with the sizes estimated from these data.
+    information : array, shape (p, p)
+        What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
+    identifiability : Identifiability
+        Of the terms up to ``order`` only.
+    order : int
+        Highest Legendre order that held-out runs support (or the caller's). ``terms`` may go higher: the rest is nuisance, so that no
+        interval is too narrow because the basis was cut.
+    noise_mm, noise_repeats_mm : dict by kind
+        Standard deviation of one raw reading, as estimated with the solution and as repeats alone tell it (None: nothing was repeated).
+    outliers : readings that count less, largest first.
+    residual_tests : tests of the whitened residuals per run.
+    model : "rigid6" or "rigid21"
+    order_choice : scores of all orders on held-out runs; None when the caller chose.
+    size_factors : dict
+        Per class of unknowns: estimated over documented typical size.
     """
 
     machine: Machine
@@ -52,6 +85,14 @@ class JointSolution:
     setup: Setup
     prior_sd: F1
     information: F2
+    order: int
+    noise_mm: dict[str, float]
+    noise_repeats_mm: dict[str, float | None]
+    outliers: tuple[Outlier, ...]
+    residual_tests: tuple[ResidualTest, ...]
+    model: str
+    order_choice: OrderChoice | None
+    size_factors: dict[str, float]
 
     @property
     def coefficients(self) -> F1:
@@ -83,23 +124,31 @@ def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: floa
     return sorted(found, key=lambda item: -item[1])
 
 
-def solve_joint(
+def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller, all with a default
     machine: Machine,
     runs: tuple[RunData, ...],
     *,
-    order: int,
-    sigma_mm: dict[str, float],
-    floor_mm: dict[str, float],
+    order: int | None = None,
+    model: Model = "rigid21",
+    sigma_mm: dict[str, float] | None = None,
+    floor_mm: dict[str, float] | None = None,
     priors: Priors | None = None,
+    progress: Progress | None = None,
 ) -> JointSolution:
     """Solve all runs of a campaign together.
 
     Parameters
     ----------
-    order : int
-        Highest Legendre order of the error motions.
-    sigma_mm, floor_mm : dict with keys "bar", "laser"
-        Standard uncertainty of one raw reading; smallest uncertainty of an averaged value (what smooth functions cannot follow).
+    order : int, optional
+        Highest Legendre order of the error motions. Default: chosen by held-out runs, with the orders above up to 12 as nuisance. Given: no
+        term above it exists, so stated uncertainties hold for machines of that order only.
+    model : "rigid6", "rigid21" or "auto"
+        Three scales and three squareness errors; 21 error motions; or the six where held-out runs do not ask for more.
+    sigma_mm, floor_mm : dict with keys "bar", "laser", optional
+        Standard uncertainty of one raw reading and smallest one of an averaged value, where the estimation of the noise starts. Default:
+        from repeats, and the resolution.
+    progress : callable, optional
+        Called with one line of text per stage.
 
     Raises
     ------
@@ -108,41 +157,85 @@ def solve_joint(
     """
     if not runs:
         raise ValueError("joint solution: no runs")
-    terms, priors = smooth_terms(order), priors or Priors()
-    setup = setup_unknowns(runs, priors)
-    names, prior = _unknowns(machine, terms, setup, priors)
-    a = np.concatenate([run_design(machine, terms, run, setup) for run in runs])
-    sigma = np.concatenate([np.hypot(sigma_mm[r.kind] / np.sqrt(r.weight_n), floor_mm[r.kind]) for r in runs])
-    y = np.concatenate([r.deviation_mm for r in runs])
-
-    def reading(theta: F1) -> F1:
-        return np.concatenate([predict(machine, terms, r, setup, theta) for r in runs])
-
-    estimate = solve_map(names, a, y - reading(np.zeros(len(names))), sigma, prior)
-    for _ in range(2):  # the ball-bar is slightly non-linear: 0.01 um at 60 um of offset
-        estimate = solve_map(names, a, y - reading(estimate.theta) + a @ estimate.theta, sigma, prior)
-    rank = _rank(names[: len(terms)], a / sigma[:, None], prior[: len(terms)])
-    whitened = a / sigma[:, None]
-    fits = _fits(runs, y - reading(estimate.theta), sigma)
-    return JointSolution(machine, terms, estimate, rank, fits, _tools(machine, runs), runs, setup, prior, whitened.T @ whitened)
+    say = progress or _silent
+    noise = expected_noise(runs, sigma_mm, floor_mm)
+    terms = _six() if model == "rigid6" else smooth_terms(order or HIGHEST_ORDER)
+    problem = build(machine, terms, runs, priors or Priors(), noise)
+    fit = settle(problem, say)
+    if model == "rigid6":
+        return _solution(problem, fit, "rigid6", 1, None)
+    choice = choose(fit.parts, fit.components, problem.sizes, term_levels(terms, len(problem.names) - len(terms)))
+    if model == "auto" and choice.chosen == RIGID6:
+        say("held-out runs ask for no more than scales and squareness")
+        six = build(machine, _six(), runs, priors or Priors(), noise)
+        return _solution(six, settle(six, say), "rigid6", 1, choice)
+    chosen = order or max(choice.chosen, 1)
+    say(f"order {chosen}" + ("" if order else " chosen by held-out runs"))
+    return _solution(problem, fit, "rigid21", chosen, None if order else choice)
 
 
-def _unknowns(machine: Machine, terms: tuple[Term, ...], setup: Setup, priors: Priors) -> tuple[tuple[str, ...], F1]:
-    names = tuple(t.name for t in terms) + tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
-    return names, np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+def _silent(_: str) -> None:
+    return None
 
 
-def _rank(names: tuple[str, ...], whitened: F2, typical: F1) -> Identifiability:
-    """What the runs see of the first ``len(names)`` unknowns when all others are free."""
-    n = len(names)
-    return analyse(names, project_out(whitened[:, :n], whitened[:, n:]), typical)
+def _six() -> tuple[Term, ...]:
+    return tuple(t for t in smooth_terms(1) if t.order == 0 or t.component == t.axis)
 
 
-def _tools(machine: Machine, runs: tuple[RunData, ...]) -> int:
-    return len({tuple(np.round(with_tool(machine, r.tool_mm).tool_mm, 6)) for r in runs})
+def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderChoice | None) -> JointSolution:
+    whole, c = total(fit.parts), fit.components
+    information = np.einsum("k,kij->ij", np.exp(-c.eta), whole.gram) / np.outer(problem.reference, problem.reference)
+    factor = np.exp(0.5 * c.eta)
+    return JointSolution(
+        machine=problem.machine,
+        terms=problem.terms,
+        estimate=_estimate(problem, fit),
+        identifiability=_rank(problem, order),
+        runs=_fits(problem, fit),
+        tool_count=len({tuple(np.round(with_tool(problem.machine, r.tool_mm).tool_mm, 6)) for r in problem.runs}),
+        data=problem.runs,
+        setup=problem.setup,
+        prior_sd=fit.prior_sd,
+        information=information,
+        order=order,
+        noise_mm={k: float(problem.noise.sigma_mm[k] * factor[i]) for i, k in enumerate(KINDS) if whole.count[i] > 0},
+        noise_repeats_mm={k: v for i, (k, v) in enumerate(problem.noise.repeats_mm.items()) if whole.count[i] > 0},
+        outliers=_outliers(problem, fit),
+        residual_tests=residual_tests(problem.runs, problem.split(fit.size), problem.split(fit.weight)),
+        model=model,
+        order_choice=choice,
+        size_factors={n: float(np.exp(0.5 * v)) for n, v in zip(problem.sizes.names, c.psi, strict=True) if n not in ("fade", "cut")},
+    )
 
 
-def _fits(runs: tuple[RunData, ...], residual: F1, sigma: F1) -> tuple[RunFit, ...]:
-    ends = np.cumsum([r.deviation_mm.size for r in runs])[:-1]
-    parts = zip(runs, np.split(residual, ends), np.split(sigma, ends), strict=True)
+def _estimate(problem: Problem, fit: Fit) -> Estimate:
+    """The solution as an `Estimate`; its noise was estimated, so no factor is left to widen it by."""
+    effective = float(len(problem.names) - np.trace(fit.posterior.cov))
+    noise = np.exp(0.5 * fit.components.eta)[problem.readings.kind] * problem.sigma
+    chi2 = float(fit.weight @ (fit.residual_mm / noise) ** 2)
+    share = np.clip(1.0 - fit.covariance.diagonal() / fit.prior_sd**2, 0.0, 1.0)
+    dof = max(float(fit.weight.sum()) - effective, 1.0)
+    return Estimate(problem.names, fit.theta, fit.covariance, fit.residual_mm, chi2, dof, 1.0, share)
+
+
+def _rank(problem: Problem, order: int) -> Identifiability:
+    """What the runs see of the terms up to ``order`` when lost motion and set-up are free; the orders above are held by their prior."""
+    n = len(problem.terms)
+    inside = [i for i, t in enumerate(problem.terms) if t.order <= order]
+    columns = np.concatenate([problem.readings.a[:, inside], problem.readings.a[:, n:]], axis=1)
+    r = linalg.qr(columns, mode="r", check_finite=False)[0][: columns.shape[1]]
+    k = len(inside)
+    return analyse(tuple(problem.names[i] for i in inside), project_out(r[:, :k], r[:, k:]), np.ones(k))
+
+
+def _fits(problem: Problem, fit: Fit) -> tuple[RunFit, ...]:
+    noise = np.exp(0.5 * fit.components.eta)[problem.readings.kind] * problem.sigma
+    parts = zip(problem.runs, problem.split(fit.residual_mm), problem.split(noise), strict=True)
     return tuple(RunFit(r.label, r.kind, v, float(np.sqrt(np.mean(v**2))), float(np.sqrt(np.mean(s**2)))) for r, v, s in parts)
+
+
+def _outliers(problem: Problem, fit: Fit) -> tuple[Outlier, ...]:
+    found = []
+    for run, size, weight in zip(problem.runs, problem.split(fit.size), problem.split(fit.weight), strict=True):
+        found += [Outlier(run.label, int(i), float(size[i]), float(weight[i])) for i in np.flatnonzero(weight < 1.0)]
+    return tuple(sorted(found, key=lambda o: -abs(o.size)))

@@ -94,7 +94,7 @@ SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
 SPECTRUM_SD = 1.0
 """Hyperprior of the two numbers that bend how sizes fade with the order."""
-LEARNED_SETUP = ("cup", "tilt", "drift")
+LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift")
 """Set-up unknowns that hands and temperatures make, so that their size may be learned. Stated calibrations never are."""
 
 
@@ -147,5 +147,4 @@ def _class(term: Term) -> str:
 
 
 def _setup_class(name: str) -> str:
-    kind = name.partition("_")[0]
-    return kind if kind in (*LEARNED_SETUP, "backlash") else ""
+    return next((kind for kind in (*LEARNED_SETUP, "backlash") if name.startswith(f"{kind}_")), "")

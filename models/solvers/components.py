@@ -1,0 +1,135 @@
+"""Variance components: how noisy the instruments are and how large errors of each class typically are, from the readings themselves.
+
+Marginal likelihood of a linear normal model (restricted maximum likelihood with weak hyperpriors), maximised by Fisher scoring on the
+logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". Their own uncertainty is carried into the covariance of the
+unknowns (Kackar and Harville 1984). Deterministic: no random numbers, a fixed number of steps at most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.solvers.information import Sums
+from models.solvers.priors import SizeModel
+
+NOISE_SD = 2.0
+"""Hyperprior of an instrument's log noise variance about what its repeats say: a factor of e in the standard deviation, weak."""
+STEPS = 25
+TOLERANCE = 1e-3
+LARGEST_STEP = 1.5
+HALVINGS = 6
+
+
+@dataclass(frozen=True)
+class Components:
+    """Log variances over the documented ones (``psi``, of `SizeModel`) and over the expected noise (``eta``, per instrument)."""
+
+    psi: F1
+    eta: F1
+
+    def half(self, model: SizeModel) -> F1:
+        """Factor of every unknown's prior standard deviation, shape (p,)."""
+        return np.asarray(np.exp(0.5 * model.design @ self.psi))
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Solution for given components, in units of each unknown's prior standard deviation.
+
+    ``x`` (p,) most probable values; ``cov`` (p, p); ``log_evidence`` of the readings (constants left out).
+    """
+
+    x: F1
+    cov: F2
+    log_evidence: float
+
+
+def blend(sums: Sums, c: Components, half: F1) -> tuple[F2, F1, float]:
+    """Information, moment and sum of squares over all instruments in units of the prior: (p, p), (p,), scalar."""
+    w = np.exp(-c.eta)
+    gram = np.einsum("k,kij->ij", w, sums.gram) * half[:, None] * half
+    return gram, (w @ sums.moment) * half, float(w @ sums.square)
+
+
+def posterior(sums: Sums, c: Components, model: SizeModel) -> Posterior:
+    """Most probable unknowns, their covariance and the evidence."""
+    gram, moment, square = blend(sums, c, c.half(model))
+    np.fill_diagonal(gram, gram.diagonal() + 1.0)
+    low = linalg.cholesky(gram, lower=True)
+    z = linalg.solve_triangular(low, moment, lower=True)
+    x = linalg.solve_triangular(low, z, lower=True, trans=1)
+    inverse, _ = linalg.lapack.dpotri(low, lower=1)
+    cov = np.tril(inverse) + np.tril(inverse, -1).T
+    log_det = 2.0 * float(np.log(low.diagonal()).sum())
+    return Posterior(x, cov, -0.5 * (float(sums.count @ c.eta) + log_det + square - float(z @ z)))
+
+
+def slope(sums: Sums, c: Components, model: SizeModel, p: Posterior) -> tuple[F1, F2]:
+    """Gradient of the log evidence and its expected information with respect to (psi, eta)."""
+    half = c.half(model)
+    w: F1 = np.exp(-c.eta)
+    kinds = range(w.size)
+    hat = np.eye(p.x.size) - p.cov
+    by_size = 0.5 * (p.x**2 + p.cov.diagonal() - 1.0) @ model.design
+    grams = [w[k] * sums.gram[k] * half[:, None] * half for k in kinds]
+    seen = [g @ p.cov for g in grams]
+    left = [w[k] * sums.square[k] - 2.0 * w[k] * float((sums.moment[k] * half) @ p.x) + float(p.x @ grams[k] @ p.x) for k in kinds]
+    by_noise = [0.5 * (left[k] + float(seen[k].trace()) - float(sums.count[k])) for k in kinds]
+    h = model.design.shape[1]
+    info = np.zeros((h + w.size, h + w.size))
+    info[:h, :h] = 0.5 * model.design.T @ hat**2 @ model.design
+    for k in kinds:
+        info[h + k, :h] = info[:h, h + k] = 0.5 * np.einsum("ij,ji->i", p.cov, seen[k]) @ model.design
+        for m in kinds:
+            info[h + k, h + m] = 0.5 * float(np.einsum("ij,ji->", seen[k], seen[m]))
+        info[h + k, h + k] += 0.5 * (float(sums.count[k]) - 2.0 * float(seen[k].trace()))
+    return np.concatenate([by_size, by_noise]), info
+
+
+def estimate(sums: Sums, model: SizeModel, start: Components) -> tuple[Components, F2]:
+    """Most probable components from a start, and their covariance (psi first, then eta)."""
+    weight = np.concatenate([model.sd, np.full(start.eta.size, NOISE_SD)]) ** -2.0
+    h = model.sd.size
+
+    def objective(c: Components) -> tuple[float, Posterior]:
+        p = posterior(sums, c, model)
+        return p.log_evidence - 0.5 * float(weight @ np.concatenate([c.psi, c.eta]) ** 2), p
+
+    c = start
+    value, p = objective(c)
+    info = np.diag(weight)
+    for _ in range(STEPS):
+        gradient, info = slope(sums, c, model, p)
+        info = info + np.diag(weight)
+        step = linalg.solve(info, gradient - weight * np.concatenate([c.psi, c.eta]), assume_a="pos")
+        step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+        trial = Components(c.psi + step[:h], c.eta + step[h:])
+        better, found = objective(trial)
+        for _ in range(HALVINGS):  # expected information may overshoot
+            if better >= value - 1e-9:
+                break
+            step *= 0.5
+            trial = Components(c.psi + step[:h], c.eta + step[h:])
+            better, found = objective(trial)
+        c, value, p = trial, better, found
+        if np.abs(step).max() < TOLERANCE:
+            break
+    return c, np.asarray(linalg.inv(info))
+
+
+def widened(model: SizeModel, p: Posterior, spread: F2) -> F2:
+    """Covariance of the unknowns with the uncertainty of the sizes in it, shape (p, p), in units of the prior.
+
+    Second order in the log variances psi with covariance V: mean of the conditional covariance plus covariance of the conditional mean.
+    With Q = X V X^T (X the design of the sizes) both together are S + S [(S + x x^T) o Q - diag(Q)/2] S. A class of which the data say
+    little has a size that is known badly, and its unknowns become more uncertain by that.
+    """
+    h = model.design.shape[1]
+    q = model.design @ spread[:h, :h] @ model.design.T
+    inner = (p.cov + np.outer(p.x, p.x)) * q
+    np.fill_diagonal(inner, inner.diagonal() - 0.5 * q.diagonal())
+    return np.asarray(p.cov + p.cov @ inner @ p.cov)

@@ -1,0 +1,182 @@
+"""The inside of the joint solution: one campaign as scaled arrays, and its iteration to the exact model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.geometry.bases import DIRECTIONS, Term
+from models.machine import Machine
+from models.solvers import robust
+from models.solvers.components import Components, Posterior, blend, estimate, posterior, widened
+from models.solvers.information import I1, KINDS, Readings, Sums, grams, sums, total
+from models.solvers.noise import DEFAULT_SIGMA_MM, RESOLUTION_MM, repeat_noise_mm
+from models.solvers.observations import RunData
+from models.solvers.observe import Setup, predict, run_design, setup_unknowns
+from models.solvers.order import folds
+from models.solvers.priors import Priors, SizeModel, size_model, term_prior_sd
+from models.solvers.residual_tests import inflation
+
+ROUNDS = 8
+SETTLED = 0.01
+"""The iteration ends when no reading's prediction moves by more than this part of its noise and no weight changes."""
+HUBER = 1.5
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Expected noise per instrument before the fit: one raw reading, least of an averaged value, what repeats say (None: nothing)."""
+
+    sigma_mm: dict[str, float]
+    floor_mm: dict[str, float]
+    repeats_mm: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A campaign: unknowns with their reference sizes, and the linearised readings in units of noise and size."""
+
+    machine: Machine
+    runs: tuple[RunData, ...]
+    terms: tuple[Term, ...]
+    setup: Setup
+    names: tuple[str, ...]
+    reference: F1
+    sizes: SizeModel
+    noise: Noise
+    sigma: F1
+    readings: Readings
+
+    def predicted(self, theta: F1) -> F1:
+        """Exact readings of all runs, mm."""
+        return np.concatenate([predict(self.machine, self.terms, r, self.setup, theta) for r in self.runs])
+
+    @property
+    def measured(self) -> F1:
+        """Readings of all runs, mm."""
+        return np.concatenate([r.deviation_mm for r in self.runs])
+
+    def split(self, values: F1) -> tuple[F1, ...]:
+        """Per run."""
+        return tuple(np.split(values, np.cumsum([r.deviation_mm.size for r in self.runs])[:-1]))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The settled solution: unknowns, components, weights of the readings, whitened residuals, normal equations per fold."""
+
+    theta: F1
+    covariance: F2
+    prior_sd: F1
+    components: Components
+    posterior: Posterior
+    weight: F1
+    size: F1
+    residual_mm: F1
+    thinning: F1
+    parts: tuple[Sums, ...]
+
+
+def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None, floor_mm: dict[str, float] | None) -> Noise:
+    """What the caller states, else what repeats tell, else the makers' figures."""
+    repeats = {kind: repeat_noise_mm(runs, kind) for kind in KINDS}
+    sigma = {k: (sigma_mm or {}).get(k) or repeats[k] or DEFAULT_SIGMA_MM[k] for k in KINDS}
+    return Noise(sigma, {k: max((floor_mm or {}).get(k, 0.0), RESOLUTION_MM) for k in KINDS}, repeats)
+
+
+def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: Noise) -> Problem:
+    """Linearise all runs about the perfect machine."""
+    setup = setup_unknowns(runs, priors)
+    rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
+    reference = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+    sigma = np.concatenate([np.hypot(noise.sigma_mm[r.kind] / np.sqrt(r.weight_n), noise.floor_mm[r.kind]) for r in runs])
+    a = np.concatenate([run_design(machine, terms, r, setup) for r in runs])
+    a *= reference
+    a /= sigma[:, None]
+    n = [r.deviation_mm.size for r in runs]
+    rows = [np.repeat(v, n).astype(np.int64) for v in (np.arange(len(runs)), folds(runs), [KINDS.index(r.kind) for r in runs])]
+    names = tuple(t.name for t in terms) + rest
+    readings = Readings(a, np.zeros(len(sigma)), rows[0], rows[1], rows[2])
+    return Problem(machine, runs, terms, setup, names, reference, size_model(terms, rest), noise, sigma, readings)
+
+
+def settle(problem: Problem, say: Progress) -> Fit:
+    """Iterate weights, components and the exact model until nothing moves."""
+    r, kinds = problem.readings, len(KINDS)
+    gram = grams(r)
+    measured = problem.measured
+    theta, weight = np.zeros(len(problem.names)), np.ones(len(measured))
+    c = Components(np.zeros(len(problem.sizes.names)), np.zeros(kinds))
+    limit = robust.threshold(len(measured))
+    dirty = False
+    for step in range(ROUNDS):
+        z = (measured - problem.predicted(theta)) / problem.sigma + r.a @ (theta / problem.reference)
+        here = Readings(r.a, z, r.run, r.fold, r.kind)
+        whole = total(sums(here, gram, weight))
+        if step:
+            c, _ = estimate(whole, problem.sizes, c)
+        x = posterior(whole, c, problem.sizes).x * c.half(problem.sizes)
+        size = (z - r.a @ x) / np.exp(0.5 * c.eta)[r.kind]
+        if not step:
+            size = size / _robust_scale(size, r.kind)[r.kind]
+        dirty = dirty or bool(np.abs(size).max() > 0.7 * limit)
+        new = _weights(size / _spread(problem, whole, c, step) if dirty else size, limit, gentle=step < 3)
+        moved = float(np.abs(r.a @ (x - theta / problem.reference)).max())
+        changed = float(np.abs(new - weight).max())
+        theta, weight = x * problem.reference, new
+        say(f"round {step + 1}: readings move by {moved:.2g} sigma, {int((weight < 1).sum())} readings count less")
+        if step >= 2 and moved < SETTLED and changed < SETTLED:
+            break
+    return _finish(problem, theta, weight, c)
+
+
+def _robust_scale(size: F1, kind: I1) -> F1:
+    return np.array([robust.scale(size[kind == k]) if (kind == k).any() else 1.0 for k in range(len(KINDS))])
+
+
+def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
+    """First gently (Huber, when something is suspicious at all), so that a bad start rejects nothing good; then redescending."""
+    hard = robust.weights(size, limit)
+    if gentle and (hard < 1.0).any():
+        return np.asarray(np.minimum(1.0, HUBER / np.maximum(np.abs(size), HUBER)))
+    return hard
+
+
+def _spread(problem: Problem, whole: Sums, c: Components, step: int) -> F1:
+    """Standard deviation of each residual in units of its noise: what the fit took of it is missing."""
+    if step < 3:
+        return np.ones(len(problem.sigma))
+    half = c.half(problem.sizes)
+    information, _, _ = blend(whole, c, half)
+    np.fill_diagonal(information, information.diagonal() + 1.0)
+    low = linalg.cholesky(information, lower=True)
+    scaled = problem.readings.a * half / np.exp(0.5 * c.eta)[problem.readings.kind][:, None]
+    return np.asarray(np.sqrt(np.maximum(1.0 - robust.leverage(scaled, low), 0.05)))
+
+
+def _finish(problem: Problem, theta: F1, weight: F1, c: Components) -> Fit:
+    """Last solution with the exact residuals; neighbours that are alike count as fewer readings."""
+    r = problem.readings
+    residual = problem.measured - problem.predicted(theta)
+    z = residual / problem.sigma + r.a @ (theta / problem.reference)
+    parts = sums(Readings(r.a, z, r.run, r.fold, r.kind), grams(r), weight)
+    size = residual / problem.sigma / np.exp(0.5 * c.eta)[r.kind] / _spread(problem, total(parts), c, ROUNDS)
+    thinning = _thinning(problem, size, weight)
+    parts = tuple(s.thinned(thinning) for s in parts)
+    whole = total(parts)
+    c, spread = estimate(whole, problem.sizes, c)
+    p = posterior(whole, c, problem.sizes)
+    prior = problem.reference * c.half(problem.sizes)
+    cov = widened(problem.sizes, p, spread) * prior[:, None] * prior
+    theta = p.x * prior
+    return Fit(theta, cov, prior, c, p, weight, size, problem.measured - problem.predicted(theta), thinning, parts)
+
+
+def _thinning(problem: Problem, size: F1, weight: F1) -> F1:
+    per_run = problem.split(np.where(weight > 0.5, size, 0.0))
+    return np.array([inflation(tuple(z for z, run in zip(per_run, problem.runs, strict=True) if run.kind == kind)) for kind in KINDS])

@@ -1,0 +1,149 @@
+"""Are the residuals noise? Tests of whitened residuals per run: size, signs in sequence, likeness of neighbours, both directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import special
+
+from models.arrays import F1
+from models.solvers.observations import RunData
+
+LEVEL = 0.01
+"""A test is flagged when chance explains it with less than this, after correction for the number of tests (Holm)."""
+FEWEST = 10
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualTest:
+    """One test of one run's whitened residuals.
+
+    ``name``: "size", "signs", "time", "position X".., "direction X"..; ``statistic``: that of the test; ``p``: its p-value, ``p_adjusted``
+    corrected for the number of tests; ``text``: what was found, in words, empty where nothing was.
+    """
+
+    run: str
+    name: str
+    statistic: float
+    p: float
+    p_adjusted: float
+    flagged: bool
+    text: str
+
+
+def residual_tests(runs: tuple[RunData, ...], whitened: tuple[F1, ...], weight: tuple[F1, ...]) -> tuple[ResidualTest, ...]:
+    """Test the residuals of all runs (divided by their standard deviation and corrected for leverage; outliers left out).
+
+    Flagged lines say what a person should look at, e.g. "r07: residuals along X are alike over 12 mm: more than the model follows".
+    """
+    found = [t for run, z, w in zip(runs, whitened, weight, strict=True) for t in _of_run(run, z, w > 0.5)]
+    return _holm(found)
+
+
+def _of_run(run: RunData, z: F1, use: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[ResidualTest]:
+    z, axes, sign = z[use], run.axes_mm[use], run.sign[use]
+    if z.size < FEWEST:
+        return []
+    out = [_size(run.label, z), _signs(run.label, z), _alike(run.label, "time", z, np.asarray(run.t_s[use]), "s")]
+    moving = [a for a in range(3) if np.ptp(axes[:, a]) > 1e-3]
+    for a in moving:
+        order = np.argsort(axes[:, a], kind="stable")
+        out.append(_alike(run.label, f"position {'XYZ'[a]}", z[order], axes[order, a], "mm"))
+        out += _direction(run.label, "XYZ"[a], z, sign[:, a])
+    return out
+
+
+def _size(label: str, z: F1) -> ResidualTest:
+    chi2 = float(z @ z)
+    p = float(special.gammaincc(0.5 * z.size, 0.5 * chi2))
+    text = f"{label}: residuals are {np.sqrt(chi2 / z.size):.1f} times as large as those of the other runs of this instrument"
+    return ResidualTest(label, "size", chi2, p, p, False, text)
+
+
+def _signs(label: str, z: F1) -> ResidualTest:
+    """Runs test of Wald and Wolfowitz: how often the residuals change their sign."""
+    up = z > np.median(z)
+    n1, n2 = int(up.sum()), int((~up).sum())
+    count = 1 + int((np.diff(up.astype(int)) != 0).sum())
+    mean = 1.0 + 2.0 * n1 * n2 / (n1 + n2)
+    variance = (mean - 1.0) * (mean - 2.0) / (n1 + n2 - 1.0)
+    score = (count - mean) / np.sqrt(max(variance, 1e-12))
+    p = float(2.0 * special.ndtr(-abs(score)))
+    word = "seldom" if score < 0 else "often"
+    return ResidualTest(label, "signs", float(score), p, p, False, f"{label}: residuals change sign too {word} for noise")
+
+
+def autocorrelation(z: F1, lags: int) -> F1:
+    """Autocorrelation of lags 1 to ``lags`` about zero, shape (lags,)."""
+    power = float(z @ z)
+    return np.array([float(z[k:] @ z[:-k]) / power if power > 0 else 0.0 for k in range(1, lags + 1)])
+
+
+def _alike(label: str, name: str, z: F1, at: F1, unit: str) -> ResidualTest:
+    """Ljung and Box: whether neighbours are alike along time or a position."""
+    lags = max(1, min(10, z.size // 5))
+    r = autocorrelation(z, lags)
+    k = np.arange(1, lags + 1)
+    q = float(z.size * (z.size + 2.0) * np.sum(r**2 / (z.size - k)))
+    p = float(special.gammaincc(0.5 * lags, 0.5 * q))
+    small = np.flatnonzero(r < 2.0 / np.sqrt(z.size))
+    length = int(small[0]) if small.size else lags
+    span = float(np.median(at[max(length, 1) :] - at[: -max(length, 1)]))
+    along = "in time" if name == "time" else f"along {name[-1]}"
+    if length == 0:
+        text = f"{label}: neighbouring residuals {along} oppose each other"
+    else:
+        text = f"{label}: residuals {along} are alike over {span:.3g} {unit}: more than the model follows"
+    return ResidualTest(label, name, q, p, p, False, text)
+
+
+def _direction(label: str, axis: str, z: F1, sign: F1) -> list[ResidualTest]:
+    """Whether both directions of travel leave the same mean residual."""
+    plus, minus = z[sign > 0], z[sign < 0]
+    if min(plus.size, minus.size) < 5:
+        return []
+    gap = float(plus.mean() - minus.mean())
+    score = gap / float(np.sqrt(1.0 / plus.size + 1.0 / minus.size))
+    p = float(2.0 * special.ndtr(-abs(score)))
+    text = f"{label}: forward and backward travel of {axis} differ by {abs(gap):.1f} standard deviations more than one lost motion explains"
+    return [ResidualTest(label, f"direction {axis}", float(score), p, p, False, text)]
+
+
+def _holm(tests: list[ResidualTest]) -> tuple[ResidualTest, ...]:
+    order = sorted(range(len(tests)), key=lambda i: tests[i].p)
+    adjusted, running = dict[int, float](), 0.0
+    for rank, i in enumerate(order):
+        running = max(running, min(1.0, tests[i].p * (len(tests) - rank)))
+        adjusted[i] = running
+    out = []
+    for i, t in enumerate(tests):
+        bad = adjusted[i] < LEVEL
+        out.append(replace(t, p_adjusted=adjusted[i], flagged=bad, text=t.text if bad else ""))
+    return tuple(out)
+
+
+def inflation(z: tuple[F1, ...]) -> float:
+    """How many times more readings there are than independent ones: 1 + 2 sum of the autocorrelation, at least 1.
+
+    Summed over all runs of an instrument up to the first lag that noise explains.
+    """
+    sizes = [v.size for v in z if v.size >= FEWEST]
+    if not sizes:
+        return 1.0
+    lags = max(1, min(40, max(sizes) // 4))
+    top, power = np.zeros(lags), 0.0
+    count = np.zeros(lags)
+    for v in z:
+        if v.size < FEWEST:
+            continue
+        power += float(v @ v)
+        for k in range(1, min(lags, v.size - 1) + 1):
+            top[k - 1] += float(v[k:] @ v[:-k])
+            count[k - 1] += v.size - k
+    n = float(sum(sizes))
+    r = top / power * n / np.maximum(count, 1.0) if power > 0 else top
+    noise = 2.0 / np.sqrt(np.maximum(count, 1.0))
+    small = np.flatnonzero(r < noise)
+    end = int(small[0]) if small.size else lags
+    return 1.0 + 2.0 * float(r[:end].sum())
