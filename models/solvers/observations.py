@@ -10,6 +10,12 @@ import numpy as np
 from models.arrays import F1, F2
 
 Kind = Literal["bar", "laser"]
+Test = Literal["", "helix", "circle", "diagonal", "linear"]
+
+REJECT_SIGMA = 5.0
+"""A reading farther from the middle of its block than this many robust standard deviations is no part of the block's mean."""
+LEAST_SPREAD_MM = 1e-4
+"""Resolution of a usual ball-bar: readings that differ by rounding alone are no outliers of each other."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,10 @@ class RunData:
         Whether the bar's length was calibrated at all; None: the run does not say (`models.solvers.priors.bar_length_sd`).
     tool_mm : array, shape (3,), optional
         Spindle reference to functional point in this run; None: the machine's own.
+    test : "helix" | "circle" | "diagonal" | "linear" | ""
+        What was run, for people and for who compares runs; how it reads follows from ``kind`` and the positions alone.
+    rejected : int
+        How many raw readings `block_average` left out.
     """
 
     label: str
@@ -54,6 +64,8 @@ class RunData:
     u_length_mm: float | None = None
     length_calibrated: bool | None = None
     tool_mm: F1 | None = None
+    test: Test = ""
+    rejected: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what no solver could use, naming the run."""
@@ -66,8 +78,8 @@ class RunData:
             raise ValueError(f"run {self.label}: no finite readings")
         if self.kind == "bar" and (self.centre_mm is None or self.radius_mm is None):
             raise ValueError(f"run {self.label}: a ball-bar run needs centre_mm and radius_mm")
-        if self.kind == "laser" and self.beam is None:
-            raise ValueError(f"run {self.label}: a laser run needs its nominal beam")
+        if self.kind == "laser" and (self.beam is None or self.beam.shape != (3,) or not abs(np.linalg.norm(self.beam) - 1.0) < 1e-6):
+            raise ValueError(f"run {self.label}: a laser run needs its nominal beam, a unit vector")
         if self.tool_mm is not None and (self.tool_mm.shape != (3,) or not np.isfinite(self.tool_mm).all()):
             raise ValueError(f"run {self.label}: tool_mm must be three finite numbers")
         if self.u_length_mm is not None and not (np.isfinite(self.u_length_mm) and self.u_length_mm >= 0):
@@ -80,6 +92,12 @@ def block_average(run: RunData, blocks: int) -> RunData:
     Blocks never span a reversal, because lost motion would be averaged away there: every reversal may add one value to ``blocks``. What is
     averaged is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside it. A
     run of at most ``blocks`` readings is returned as it is.
+
+    Single outliers do not enter a mean. A reading is left out if it lies farther from the median of its block than `REJECT_SIGMA` times
+    the largest of three: the noise of the whole run (second differences), the block's own spread (median of the distances from its median,
+    as a standard deviation), so that what moves steadily through a block stays, and `LEAST_SPREAD_MM`. ``rejected`` counts what was left
+    out and ``weight_n`` what was averaged.
+    A block of one or two readings cannot tell which is wrong: nothing is left out there.
     """
     n = run.deviation_mm.size
     size = max(1, int(np.ceil(n / blocks)))
@@ -87,24 +105,49 @@ def block_average(run: RunData, blocks: int) -> RunData:
         return run
     turn = np.concatenate([[0], (np.diff(run.sign, axis=0) != 0).any(axis=1).cumsum()])
     key = np.concatenate([[0], ((np.diff(turn) != 0) | (np.arange(1, n) % size == 0)).cumsum()])
-    weight: F1 = np.bincount(key, run.weight_n).astype(np.float64)
+    above = run.deviation_mm - nominal_reading(run)
+    share = np.where(_belongs(above, key), run.weight_n, 0.0)
+    weight: F1 = np.bincount(key, share).astype(np.float64)
 
     def mean(v: F1) -> F1:
-        return np.asarray(np.bincount(key, v * run.weight_n) / weight)
+        return np.asarray(np.bincount(key, v * share) / weight)
 
     def columns(m: F2) -> F2:
         return np.column_stack([mean(m[:, k]) for k in range(m.shape[1])])
 
-    axes = columns(run.axes_mm)
     shorter = replace(
         run,
-        axes_mm=axes,
-        deviation_mm=mean(run.deviation_mm - nominal_reading(run)),
+        axes_mm=columns(run.axes_mm),
+        deviation_mm=mean(above),
         sign=np.sign(columns(run.sign)),
         t_s=mean(run.t_s),
         weight_n=weight,
+        rejected=run.rejected + int((share == 0.0).sum()),
     )
     return replace(shorter, deviation_mm=shorter.deviation_mm + nominal_reading(shorter))
+
+
+def reading_noise_mm(values_mm: F1) -> float:
+    """Standard deviation of one reading of a run, mm, from second differences of neighbours (robust; smooth motion cancels)."""
+    second = values_mm[2:] - 2 * values_mm[1:-1] + values_mm[:-2]
+    if second.size == 0:
+        return 0.0
+    return float(np.median(np.abs(second - np.median(second))) * 1.4826 / np.sqrt(6.0))
+
+
+def _belongs(values_mm: F1, key: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Which readings belong to their block; ``key`` counts the blocks and does not fall."""
+    away = np.abs(values_mm - _block_median(values_mm, key)[key])
+    spread = np.maximum(1.4826 * _block_median(away, key), max(reading_noise_mm(values_mm), LEAST_SPREAD_MM))
+    return np.asarray(away <= REJECT_SIGMA * spread[key])
+
+
+def _block_median(values: F1, key: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> F1:
+    """Median of each block, shape (blocks,)."""
+    ordered = values[np.lexsort((values, key))]
+    count = np.bincount(key)
+    first = np.cumsum(count) - count
+    return np.asarray(0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2]))
 
 
 def nominal_reading(run: RunData) -> F1:

@@ -6,66 +6,81 @@ from typing import Any
 
 import numpy as np
 
+from models.arrays import F1
 from models.geometry.chain import travel_sign
-from models.solvers.observations import RunData, block_average
+from models.solvers.observations import RunData, Test, block_average, reading_noise_mm
 from service.errors import MeasurementFault
 
 BLOCKS = 400
 """Values per ball-bar run that enter a solution: noise averages down, smooth errors stay."""
+LEAST = 10
+"""Fewer valid readings than this are no measurement of anything."""
+TESTS: dict[str, Test] = {"ballbar_helix": "helix", "ballbar_circle": "circle", "laser_diagonal": "diagonal", "laser_linear": "linear"}
+"""Tests of run-format.md 3; plain diagonals are laser_diagonal without an order."""
 
 
 def run_data(run: dict[str, Any], *, blocks: int = BLOCKS) -> RunData:
-    """Valid readings of an ``abbe-run/1`` object as arrays; long ball-bar runs are block-averaged.
+    """Valid readings of an ``abbe-run/1`` object as arrays; long ball-bar runs are block-averaged, single outliers left out and counted.
 
     Raises
     ------
     MeasurementFault
-        The run holds fewer than 10 valid readings, or its test is none that this solver knows.
+        The run holds fewer than 10 valid readings, or none at all because it is sealed, or its test is none that this solver knows.
     """
     columns, setup, label = run["columns"], run["setup"], run["run_id"]
+    if run["test"] not in TESTS:
+        raise MeasurementFault(f"run {label}: test {run['test']!r} is not one this solver knows")
+    if columns["deviation_mm"] is None:
+        raise MeasurementFault(f"run {label}: it is sealed, its readings are not there", "it can only be predicted")
     axes = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
-    sign = travel_sign(axes)
     valid = np.asarray(columns.get("valid", np.ones(len(axes)))).astype(bool)
-    if int(valid.sum()) < 10:
+    if int(valid.sum()) < LEAST:
         raise MeasurementFault(f"run {label}: only {int(valid.sum())} valid readings of {len(axes)}", "measure it again")
-    deviation = np.asarray(columns["deviation_mm"], dtype=np.float64)[valid]
     common: dict[str, Any] = {
+        "label": label,
+        "setup": setup["setup_id"],
         "axes_mm": axes[valid],
-        "deviation_mm": deviation,
-        "sign": sign[valid],
+        "deviation_mm": np.asarray(columns["deviation_mm"], dtype=np.float64)[valid],
+        "sign": travel_sign(axes)[valid],
         "t_s": np.asarray(columns["t_s"], dtype=np.float64)[valid],
         "weight_n": np.ones(int(valid.sum())),
         "tool_mm": _tool(setup),
+        "test": TESTS[run["test"]],
     }
-    if run["test"] in ("ballbar_helix", "ballbar_circle"):
-        centre = np.asarray(setup["centre_mm"], dtype=np.float64)
-        common |= {"u_length_mm": setup.get("u_length_mm"), "length_calibrated": setup.get("length_calibrated")}
-        bar = RunData(label, setup["setup_id"], "bar", **common, centre_mm=centre, radius_mm=float(setup["radius_mm"]))
-        return block_average(bar, blocks)
-    if run["test"] in ("laser_diagonal", "laser_linear"):
-        return RunData(label, setup["setup_id"], "laser", **common, beam=_beam(run))
-    raise MeasurementFault(f"run {label}: test {run['test']!r} is not one this solver knows")
+    if run["test"].startswith("laser"):
+        common["deviation_mm"] = _since_first(common["deviation_mm"], first_valid=bool(valid[0]))
+        return RunData(kind="laser", **common, beam=_beam(setup))
+    centre = np.asarray(setup["centre_mm"], dtype=np.float64)
+    common |= {"u_length_mm": setup.get("u_length_mm"), "length_calibrated": setup.get("length_calibrated")}
+    return block_average(RunData(kind="bar", **common, centre_mm=centre, radius_mm=float(setup["radius_mm"])), blocks)
 
 
-def _tool(setup: dict[str, Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+def _since_first(deviation_mm: F1, *, first_valid: bool) -> F1:
+    """Laser deviations since the first VALID record.
+
+    A laser run counts from its first record. Where that one is not valid the run begins with the next, and so must the counting: an offset
+    of everything after it would otherwise pass for an error of the zero.
+    """
+    return deviation_mm if first_valid else deviation_mm - deviation_mm[0]
+
+
+def _tool(setup: dict[str, Any]) -> F1 | None:
     """Tool of this run if its set-up names one, else None (the machine's own)."""
     tool = setup.get("tool_mm")
     return None if tool is None else np.asarray(tool, dtype=np.float64)
 
 
-def _beam(run: dict[str, Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    setup = run["setup"]
-    if "nominal_beam" in setup:
+def _beam(setup: dict[str, Any]) -> F1:
+    """Nominal beam, a unit vector: as stated, else along the test, from its start to its end (a laser_linear along its axis)."""
+    if setup.get("nominal_beam") is not None:
         beam = np.asarray(setup["nominal_beam"], dtype=np.float64)
     else:
-        beam = np.eye(3)["XYZ".index(setup["axis"])] * np.sign(float(np.sum(np.subtract(setup["end_mm"], setup["start_mm"]))))
+        beam = np.subtract(setup["end_mm"], setup["start_mm"]).astype(np.float64)
+        if setup.get("axis") is not None:
+            beam = beam * np.eye(3)["XYZ".index(setup["axis"])]
     return np.asarray(beam / np.linalg.norm(beam))
 
 
 def bar_noise_mm(run: dict[str, Any]) -> float:
-    """Standard deviation of one ball-bar reading, from second differences of neighbours (robust; smooth motion cancels)."""
-    values = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
-    second = values[2:] - 2 * values[1:-1] + values[:-2]
-    if second.size == 0:
-        return 0.0
-    return float(np.median(np.abs(second - np.median(second))) * 1.4826 / np.sqrt(6.0))
+    """Standard deviation of one ball-bar reading (`models.solvers.observations.reading_noise_mm`)."""
+    return reading_noise_mm(np.asarray(run["columns"]["deviation_mm"], dtype=np.float64))
