@@ -23,6 +23,7 @@ from models.solvers.information import KINDS, total
 from models.solvers.least_squares import Estimate
 from models.solvers.observations import RunData
 from models.solvers.observe import Setup, with_tool
+from models.solvers.observe_setup import STATED
 from models.solvers.order import RIGID6, OrderChoice, choose, term_levels
 from models.solvers.priors import Priors
 from models.solvers.residual_tests import ResidualTest, residual_tests
@@ -62,6 +63,8 @@ class JointSolution:
         What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
         Of the terms up to ``order`` only.
+    weight_per_mm2 : array, shape (n,)
+        Weight of every reading in ``information``, run by run: robust weight over noise variance, neighbours that are alike counting as fewer.
     order : int
         Highest Legendre order that held-out runs support (or the caller's). ``terms`` may go higher: the rest is nuisance, so that no
         interval is too narrow because the basis was cut.
@@ -85,6 +88,7 @@ class JointSolution:
     setup: Setup
     prior_sd: F1
     information: F2
+    weight_per_mm2: F1
     order: int
     noise_mm: dict[str, float]
     noise_repeats_mm: dict[str, float | None]
@@ -197,6 +201,7 @@ def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderC
         setup=problem.setup,
         prior_sd=fit.prior_sd,
         information=information,
+        weight_per_mm2=(np.exp(-c.eta) / fit.thinning)[problem.readings.kind] * fit.weight / problem.sigma**2,
         order=order,
         noise_mm={k: float(problem.noise.sigma_mm[k] * factor[i]) for i, k in enumerate(KINDS) if whole.count[i] > 0},
         noise_repeats_mm={k: v for i, (k, v) in enumerate(problem.noise.repeats_mm.items()) if whole.count[i] > 0},
@@ -222,7 +227,8 @@ def _rank(problem: Problem, order: int) -> Identifiability:
     """What the runs see of the terms up to ``order`` when lost motion and set-up are free; the orders above are held by their prior."""
     n = len(problem.terms)
     inside = [i for i, t in enumerate(problem.terms) if t.order <= order]
-    columns = np.concatenate([problem.readings.a[:, inside], problem.readings.a[:, n:]], axis=1)
+    free = [i for i in range(n, len(problem.names)) if not problem.names[i].startswith(STATED)]
+    columns = problem.readings.a[:, inside + free]
     r = linalg.qr(columns, mode="r", check_finite=False)[0][: columns.shape[1]]
     k = len(inside)
     return analyse(tuple(problem.names[i] for i in inside), project_out(r[:, :k], r[:, k:]), np.ones(k))

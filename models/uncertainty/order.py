@@ -25,24 +25,28 @@ def order_source(solution: JointSolution, r: Response, orders_above: int) -> tup
     The prediction stays the one of the chosen order, so what the residuals ask of the higher orders is no correction: it counts as one more
     column, in full.
     """
-    chosen = max((t.order for t in solution.terms), default=0)
-    above = omitted_terms(chosen, orders_above)
+    above = omitted_terms(max((t.order for t in solution.terms), default=0), orders_above)
     terms = (*solution.terms, *above)
     if not above:
         return terms, np.zeros((len(terms), 0))
     n = len(solution.terms)
     omitted = _design(solution, above)
-    carried = r.covariance @ (r.design.T @ (omitted / r.sigma_mm[:, None] ** 2))  # K B
-    white = omitted / r.sigma_mm[:, None]
-    seen = white.T @ white - (omitted / r.sigma_mm[:, None] ** 2).T @ r.design @ carried
+    weighted = omitted * r.weight[:, None]
+    carried = r.covariance @ (r.design.T @ weighted)  # K B
+    seen = omitted.T @ weighted - (weighted.T @ r.design) @ carried
     sd = omitted_prior_sd(solution, above)
     normal = np.eye(len(above)) + 0.5 * np.outer(sd, sd) * (seen + seen.T)
     lower = linalg.cholesky(normal, lower=True)
     root = sd[:, None] * linalg.solve_triangular(lower, np.eye(len(above)), lower=True).T
     residual = np.concatenate([fit.residual_mm for fit in solution.runs])
-    asked = root @ (root.T @ (omitted.T @ (residual / r.sigma_mm**2)))
+    asked = root @ (root.T @ (weighted.T @ residual))
     phi = np.concatenate([root, asked[:, None]], axis=1)
     return terms, np.concatenate([carried[:n] @ phi, -phi])
+
+
+def chosen_order(solution: JointSolution) -> int:
+    """Legendre order that the data support; terms of the solution above it are there only to be allowed for."""
+    return int(getattr(solution, "order", 0)) or max((t.order for t in solution.terms), default=0)
 
 
 def omitted_terms(order: int, orders_above: int) -> tuple[Term, ...]:

@@ -19,7 +19,7 @@ from models.machine import AXES
 from models.solvers.joint import JointSolution
 from models.solvers.observations import RunData
 from models.uncertainty.inputs import Inputs
-from models.uncertainty.order import order_source
+from models.uncertainty.order import chosen_order, order_source
 from models.uncertainty.response import Response, response
 
 WORDS = {
@@ -28,14 +28,18 @@ WORDS = {
     "repeatability": "repeatability of the machine",
     "bar_length": "calibration of the bar's length",
     "bar_temperature": "temperature of the bar (assumed)",
-    "wavelength": "calibration of the laser's wavelength (assumed)",
+    "wavelength": "calibration of the laser's wavelength (stated)",
     "setup": "set-up: cup, mirror, zero and drift, where the data leave them open",
     "scale_temperature": "temperature of the scales (assumed)",
     "model_order": "what orders above the chosen one may still do",
     "prior": "typical size of errors, where the data leave them open (assumed)",
-    "misfit": "residuals larger than the stated noise",
+    "estimated_sizes": "noise and typical sizes are themselves estimated",
 }
 """Every source of a budget in the user's words."""
+
+
+LASER_SCALE = "laser_scale"
+"""Unknown of the solution that stands for the wavelength, held by its prior; a solution without it gets `Inputs.u_wavelength`."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,7 @@ def error_sources(solution: JointSolution, inputs: Inputs | None = None) -> Erro
     inputs = inputs or Inputs()
     r = response(solution)
     n = len(solution.terms)
-    found = [*_noise(solution, r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
+    found = [*_noise(r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
     if inputs.single_approach:
         found.append(Source("repeatability", np.zeros((n, 0)), inputs.repeatability_dof, inputs.repeatability_mm))
     found = _merged([Source(s.name, s.factor[:n], s.dof, s.scatter_mm) for s in found])
@@ -108,7 +112,7 @@ def error_sources(solution: JointSolution, inputs: Inputs | None = None) -> Erro
     above = len(terms) - n
     sources = [Source(s.name, np.pad(s.factor, ((0, above), (0, 0))), s.dof, s.scatter_mm) for s in found]
     if above:
-        sources.append(Source("model_order", extra))
+        sources = _merged([*sources, Source("model_order", extra)])
     return ErrorSources(solution, inputs, terms, np.concatenate([solution.coefficients, np.zeros(above)]), tuple(sources))
 
 
@@ -132,30 +136,35 @@ def _compressed(factor: F2) -> F2:
     return np.asarray(linalg.qr(factor.T, mode="r")[0][: factor.shape[0]].T)
 
 
-def _noise(solution: JointSolution, r: Response, inputs: Inputs) -> list[Source]:
-    """Scatter of the readings per instrument, the machine's repeatability told apart, and what the residuals say on top."""
+def _noise(r: Response, inputs: Inputs) -> list[Source]:
+    """Scatter of the readings per instrument, the machine's repeatability told apart, and that sizes were estimated at all."""
     out = []
-    share = np.full(r.sigma_mm.size, inputs.repeatability_mm**2)
-    kinds = np.concatenate([np.full(run.deviation_mm.size, run.kind) for run in solution.data])
+    dof = r.dof if r.noise_estimated else float("inf")
+    everywhere = np.ones(r.weight.size, dtype=np.bool_)
+    variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
+    share = np.full(r.weight.size, inputs.repeatability_mm**2)
     for kind in ("bar", "laser"):
-        seen = kinds == kind
+        seen = r.kind == kind
         if seen.any():
-            variance = np.where(seen, np.maximum(r.sigma_mm**2 - share, 0.0), 0.0)
-            out.append(Source(f"{kind}_noise", r.noise_factor(variance), r.noise_dof))
+            left = None if inputs.repeatability_mm == 0 else np.maximum(variance - share, 0.0)
+            out.append(Source(f"{kind}_noise", r.noise_factor(left, seen), dof))
     if inputs.repeatability_mm > 0:
-        out.append(Source("repeatability", r.noise_factor(share), inputs.repeatability_dof))
-    if r.misfit > 1.0:
-        out.append(Source("misfit", np.sqrt(r.misfit - 1.0) * r.covariance_root, solution.estimate.dof))
+        out.append(Source("repeatability", r.noise_factor(share, everywhere), inputs.repeatability_dof))
+    if r.widening.shape[1]:
+        out.append(Source("estimated_sizes", r.widening, r.dof))
     return out
 
 
 def _priors(solution: JointSolution, r: Response) -> list[Source]:
     """Influence of every unknown's prior mean on the estimate, C e_i / p_i per standard deviation p_i of the prior."""
-    names = [_prior_source(name, i < len(solution.terms)) for i, name in enumerate(solution.estimate.names)]
+    order = chosen_order(solution)
+    above = {t.name for t in solution.terms if t.order > order}
+    terms = {t.name for t in solution.terms}
+    names = np.array(["model_order" if n in above else _prior_source(n, n in terms) for n in solution.estimate.names])
     known = np.isfinite(solution.prior_sd)
     per_sd = r.covariance[:, known] / solution.prior_sd[known]
-    which = np.array(names)[known]
-    return [Source(s, per_sd[:, which == s]) for s in ("bar_length", "wavelength", "setup", "prior") if (which == s).any()]
+    which = names[known]
+    return [Source(s, per_sd[:, which == s]) for s in ("bar_length", "wavelength", "setup", "prior", "model_order") if (which == s).any()]
 
 
 def _prior_source(name: str, is_term: bool) -> str:
@@ -163,14 +172,14 @@ def _prior_source(name: str, is_term: bool) -> str:
         return "prior"
     if name.startswith("bar_length"):
         return "bar_length"
-    return "wavelength" if name.startswith(("wavelength", "laser_scale")) else "setup"
+    return "wavelength" if name == LASER_SCALE else "setup"
 
 
 def _calibration(solution: JointSolution, r: Response, inputs: Inputs) -> list[Source]:
     """Errors that all readings of one instrument share: the laser's wavelength, the bar's temperature."""
     out = []
     lasers = any(run.kind == "laser" for run in solution.data)
-    if lasers and inputs.u_wavelength > 0 and not any(n.startswith(("wavelength", "laser_scale")) for n in solution.estimate.names):
+    if lasers and inputs.u_wavelength > 0 and LASER_SCALE not in solution.estimate.names:
         moved = np.concatenate([_travel(run) for run in solution.data])
         out.append(Source("wavelength", inputs.u_wavelength * r.of_readings(moved)[:, None]))
     u_bar = inputs.u_bar_temperature_k * inputs.bar_expansion_per_k

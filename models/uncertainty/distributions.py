@@ -1,0 +1,71 @@
+"""What is known of an input as a distribution (GUM-S1 6): normal, rectangular, or Student's t for a figure from few repeats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Shape = Literal["normal", "rectangular", "t"]
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """A distribution about zero.
+
+    Attributes
+    ----------
+    shape : "normal" | "rectangular" | "t"
+        Normal: a standard uncertainty is known. Rectangular: only limits are known. t: mean of few repeats (GUM-S1 6.4.9).
+    u : float
+        Normal, rectangular: standard deviation (half-width of the rectangle: u sqrt 3). t: scale, s / sqrt(n) of the repeats; the standard
+        deviation is then u sqrt(dof / (dof - 2)).
+    dof : float
+        Degrees of freedom of t, above 2, so that it has a variance.
+
+    Raises
+    ------
+    ValueError
+        Another shape, a negative or infinite u, or t with 2 degrees of freedom or fewer.
+    """
+
+    shape: Shape = "normal"
+    u: float = 1.0
+    dof: float = float("inf")
+
+    def __post_init__(self) -> None:
+        """Refuse what has no variance."""
+        if self.shape not in ("normal", "rectangular", "t"):
+            raise ValueError(f"distribution {self.shape!r}: must be 'normal', 'rectangular' or 't'")
+        if not (np.isfinite(self.u) and self.u >= 0):
+            raise ValueError(f"distribution: u is {self.u}, must be a number of 0 or more")
+        if self.shape == "t" and not self.dof > 2:
+            raise ValueError(f"distribution: t needs more than 2 degrees of freedom to have a variance, got {self.dof}")
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation."""
+        if self.shape == "t" and np.isfinite(self.dof):
+            return float(self.u * np.sqrt(self.dof / (self.dof - 2.0)))
+        return self.u
+
+    def fill(self, rng: np.random.Generator, out: NDArray[Any]) -> None:
+        """Draw into an array of any shape, double or single precision, in place."""
+        kind: Any = out.dtype.type
+        if self.shape == "t" and np.isfinite(self.dof):
+            out[...] = rng.standard_t(self.dof, out.shape)
+            out *= self.u
+        elif self.shape == "rectangular":
+            rng.random(out=out, dtype=kind)
+            out -= 0.5
+            out *= float(self.u * np.sqrt(12.0))
+        else:
+            rng.standard_normal(out=out, dtype=kind)
+            if self.u != 1.0:
+                out *= self.u
+
+
+NORMAL = Distribution()
+"""Standard normal."""
