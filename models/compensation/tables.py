@@ -1,7 +1,7 @@
 """Nine one-axis tables: correction of each axis as a function of each axis, on the controller's grid.
 
 The best nine tables for a deviation field are its best sum of functions of one axis (`models.compensation.additive`). What angles do at a
-distance that depends on two axes at once is left over; a 3-D grid (another kind of table) would take it.
+distance that depends on two axes at once is left over; a 3-D grid (`models.compensation.grid`) takes it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
+from models.arrays import F1, F2, F3
 from models.compensation.additive import additive_design
 from models.geometry.chain import design
 from models.machine import AXES, Machine
@@ -66,14 +66,19 @@ def nine_tables(solution: JointSolution, counts: tuple[int, int, int], *, nodes:
     grids = grid_positions(machine, counts)
     corrections, uncertainties = [], []
     rotation = frame_rotation(machine, solution, nodes)
-    for a, effect in enumerate(additive_design(solution, grids, nodes)):
-        relative = effect - effect[0]
+    for a, relative in enumerate(table_design(solution, grids, nodes)):
         corrections.append(-(relative @ solution.coefficients))
         turned = np.cross(rotation.T, np.eye(3)[a]).T  # slope over axis a that a rotation of the frame gives every output
         fixed = relative - (grids[a] - grids[a][0])[:, None, None] * turned
         variance = np.einsum("nik,kl,nil->ni", fixed, solution.term_covariance, fixed)
         uncertainties.append(np.sqrt(np.maximum(variance, 0.0)))
     return NineTables(grids, (corrections[0], corrections[1], corrections[2]), (uncertainties[0], uncertainties[1], uncertainties[2]))
+
+
+def table_design(solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int) -> tuple[F3, F3, F3]:
+    """Best nine tables of the deviation per unit of every coefficient, first entries zero: per axis shape (len(grid), 3, terms)."""
+    x, y, z = (effect - effect[0] for effect in additive_design(solution, grids_mm, nodes))
+    return x, y, z
 
 
 def frame_rotation(machine: Machine, solution: JointSolution, nodes: int) -> F2:

@@ -29,18 +29,14 @@ def bound_mm(case: Case, pairs: Pairs) -> float:
         backlash_mm=float(np.mean(magnitudes.backlash_um)) * 1e-3,
         cup_mm=_rms(magnitudes.cup_offset_um) * 1e-3 / np.sqrt(3.0),
         tilt_rad=_rms(magnitudes.mirror_tilt_urad) * 1e-6 / np.sqrt(2.0),
+        laser_scale=conditions.wavelength_sd,
     )
     terms = smooth_terms(ORDER)
     setup = setup_unknowns(case.runs, priors)
-    blocks, scale = [], []
-    for run in case.runs:
-        noise = conditions.bar_noise_mm if run.kind == "bar" else conditions.laser_noise_mm
-        w = np.sqrt(run.weight_n) / noise
-        blocks.append(run_design(case.machine, terms, run, setup) * w[:, None])
-        along = np.zeros(len(w)) if run.beam is None else (run.axes_mm - run.axes_mm[0]) @ run.beam
-        scale.append(along * w)
-    a = np.concatenate([np.concatenate(blocks), np.concatenate(scale)[:, None]], axis=1)
-    sd = np.concatenate([np.full(3, priors.backlash_mm), setup.prior_sd, [conditions.wavelength_sd]])
+    noise = {"bar": conditions.bar_noise_mm, "laser": conditions.laser_noise_mm}
+    blocks = [run_design(case.machine, terms, r, setup) * (np.sqrt(r.weight_n) / noise[r.kind])[:, None] for r in case.runs]
+    a = np.concatenate(blocks)
+    sd = np.concatenate([np.full(3, priors.backlash_mm), setup.prior_sd])
     n = len(terms)
     root = np.zeros((a.shape[1], a.shape[1]))  # unknowns = root @ independent unit normals: the prior becomes the unit matrix
     root[:n, :n] = _term_root(case, terms)

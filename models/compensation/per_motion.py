@@ -1,0 +1,165 @@
+"""Tables of single error motions, for controls that hold up to 21 of them and work out the deviation by their own kinematic model.
+
+One campaign with one tool does not see every motion by itself: turning and shifting a carriage look alike at one tool length (math.md 4.6).
+A motion that the data do not tell apart is not written under its name. Two ways are left, and the caller chooses by naming the motions:
+
+- only motions that are observable by themselves (`models.solvers.observability`, or `seen_by_rank`): true for every tool, but what is only
+  known together with a hidden motion stays uncorrected;
+- `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Right at this tool length only, and so labelled.
+
+Either way the values of the motions that are written are those that reproduce the identified deviation best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.compensation.tables import grid_positions
+from models.functions.motions import PLACES, SQUARENESS
+from models.geometry.bases import term_values
+from models.geometry.chain import design, deviation_mm
+from models.geometry.jacobian import squareness_motions
+from models.machine import Machine
+from models.solvers.joint import JointSolution
+from models.volumetric import rigid_design, volume_grid
+
+NODES = 7
+RANK_TOLERANCE = 1e-7
+TOWARDS_ESTIMATE = 1e-6
+"""Weight with which a motion keeps its own estimate, against reproducing the deviation: it decides only what the deviation leaves open."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTables:
+    """Error motions (not corrections: the control changes the sign) at the grid of their axis.
+
+    Attributes
+    ----------
+    machine : Machine
+        Nominal machine, with the tool for which the tables hold.
+    position_mm : three arrays
+    motions, u : dict
+        ``"EXX"`` ..: values at the grid of the moving axis, mm or rad, and their standard uncertainty. Motions that are missing are zero.
+    squareness_rad, u_squareness_rad : dict
+        ``"C0Y"`` ..; travel counts from the start of the stroke.
+    left_out : tuple of str
+        Motions that are not written.
+    any_tool : bool
+        Whether every motion in the tables is observable by itself, so that they hold for any tool.
+    """
+
+    machine: Machine
+    position_mm: tuple[F1, F1, F1]
+    motions: dict[str, F1]
+    u: dict[str, F1]
+    squareness_rad: dict[str, float]
+    u_squareness_rad: dict[str, float]
+    left_out: tuple[str, ...]
+    any_tool: bool
+
+    def correction_at(self, axes_mm: F2, tool_mm: F1 | None = None) -> F2:
+        """What a control adds to commanded positions, shape (n, 3), mm: straight lines between nodes, rule G for the levers."""
+        values = np.zeros((axes_mm.shape[0], 3, 6))
+        for name, table in self.motions.items():
+            axis, component = PLACES[name]
+            values[:, axis, component] = np.interp(axes_mm[:, axis], self.position_mm[axis], table)
+        angles = np.array([self.squareness_rad.get(name, 0.0) for name in SQUARENESS])
+        values += squareness_motions(axes_mm, self.machine.stroke_mm[:, 0]) @ angles
+        return -deviation_mm(self.machine, axes_mm, values, tool_mm)
+
+
+def motion_tables(
+    solution: JointSolution, counts: tuple[int, int, int], motions: frozenset[str] | set[str], *, any_tool: bool = True
+) -> MotionTables:
+    """Tables of the named motions only, at their best values for the identified deviation with the machine's own tool.
+
+    Parameters
+    ----------
+    counts : (int, int, int)
+        Grid points of X, Y, Z.
+    motions : set of str
+        What may be written: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``.
+    any_tool : bool
+        Whether these motions are observable by themselves; False for `enough_for_the_field`.
+
+    Raises
+    ------
+    ValueError
+        A name that is no motion of the solution, or none at all.
+    """
+    known = {t.motion for t in solution.terms}
+    if not motions or not motions <= known:
+        raise ValueError(f"motion tables: {', '.join(sorted(set(motions) - known)) or 'no motion'} cannot be written")
+    machine, keep = solution.machine, [i for i, t in enumerate(solution.terms) if t.motion in motions]
+    grids = grid_positions(machine, counts)
+    operator = _refit(solution, keep) if motions < known else np.eye(len(solution.terms))
+    chosen = tuple(solution.terms[i] for i in keep)
+    values: dict[str, F1] = {}
+    u: dict[str, F1] = {}
+    for name in sorted(motions):
+        mine = [k for k, t in enumerate(chosen) if t.motion == name]
+        axis = chosen[mine[0]].axis
+        points = np.tile(machine.centre_mm, (grids[axis].size, 1))
+        points[:, axis] = grids[axis]
+        rows = np.ones((1, 1)) if name in SQUARENESS else term_values(tuple(chosen[k] for k in mine), points, machine.stroke_mm)
+        gradient = rows @ operator[mine]
+        values[name] = gradient @ solution.coefficients
+        u[name] = np.sqrt(np.maximum(np.einsum("nk,kl,nl->n", gradient, solution.term_covariance, gradient), 0.0))
+    square = [n for n in SQUARENESS if n in motions]
+    return MotionTables(
+        machine,
+        grids,
+        {n: v for n, v in values.items() if n not in square},
+        {n: v for n, v in u.items() if n not in square},
+        {n: float(values[n][0]) for n in square},
+        {n: float(u[n][0]) for n in square},
+        tuple(sorted(known - motions)),
+        any_tool,
+    )
+
+
+def seen_by_rank(solution: JointSolution) -> frozenset[str]:
+    """Motions no order of which is part of a combination that the data do not see (`models.solvers.identifiability`)."""
+    hidden = {name.split(".")[0] for c in solution.identifiability.hidden for name, _ in c.weights}
+    return frozenset({t.motion for t in solution.terms} - hidden)
+
+
+def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
+    """Motions that carry the deviation with the machine's own tool when all others are zero; angles are given up first."""
+    field = _field(solution)
+    triangle = linalg.qr(field / np.maximum(np.linalg.norm(field, axis=0), 1e-300), mode="r")[0][: field.shape[1]]
+    names = [*[t.motion for t in solution.terms], *["rigid"] * 6]
+
+    def rank(motions: set[str]) -> int:
+        at = [i for i, n in enumerate(names) if n == "rigid" or n in motions]
+        return int(np.linalg.matrix_rank(triangle[:, at], tol=RANK_TOLERANCE * np.sqrt(len(names))))
+
+    kept = {t.motion for t in solution.terms}
+    whole = rank(kept)
+    for t in sorted(solution.terms, key=lambda t: (-t.component, -t.axis)):
+        if t.motion in kept and t.order > 0 and rank(kept - {t.motion}) == whole:
+            kept = kept - {t.motion}
+    return frozenset(kept)
+
+
+def _field(solution: JointSolution) -> F2:
+    """Deviation over the volume per unit of every coefficient, then of the six rigid motions, shape (3 points, terms + 6)."""
+    grid = volume_grid(solution.machine.stroke_mm, max(NODES, max(t.order for t in solution.terms) + 2))
+    full = design(solution.machine, solution.terms, grid).reshape(3 * len(grid), -1)
+    return np.concatenate([full, rigid_design(grid).reshape(-1, 6)], axis=1)
+
+
+def _refit(solution: JointSolution, keep: list[int]) -> F2:
+    """Coefficients of the kept terms that reproduce the whole deviation best, per unit of every coefficient, shape (kept, terms)."""
+    n = len(solution.terms)
+    field = _field(solution)
+    weight = TOWARDS_ESTIMATE * np.sqrt(len(field))
+    near = np.zeros((len(keep), n))
+    near[np.arange(len(keep)), keep] = weight * np.linalg.norm(field[:, keep], axis=0) / np.sqrt(len(field))
+    a = np.concatenate([field[:, keep], field[:, n:]], axis=1)
+    ridge = np.concatenate([near[:, keep], np.zeros((len(keep), 6))], axis=1)
+    return np.asarray(np.linalg.lstsq(np.concatenate([a, ridge]), np.concatenate([field[:, :n], near]), rcond=None)[0][: len(keep)])
