@@ -1,0 +1,302 @@
+"""Which run of a campaign cannot be what it says: another unit, another sign, swapped axes, another machine.
+
+All runs are looked at together, as one linear model with wide priors. For every run and every way in which a file goes wrong the evidence
+of the whole campaign is computed with that run corrected in that way, and with that run taken to have nothing to do with the others. What
+is best explains the readings; it counts only if it is better by far (`STRONG`). Source: marginal likelihood of a linear model with normal
+priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong", the limit here is far above it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from models.machine import Machine
+from models.solvers.observations import RunData, block_average, nominal_reading
+from models.solvers.observe import Setup, run_design, setup_unknowns
+from models.solvers.priors import Priors, term_prior_sd
+
+WIDE = Priors(
+    scale_rad=200e-6,
+    squareness_rad=200e-6,
+    positioning_mm=10e-3,
+    straightness_mm=10e-3,
+    angle_rad=30e-6,
+    angle_slope_rad=40e-6,
+    backlash_mm=20e-3,
+    cup_mm=0.2,
+    bar_unknown_mm=0.2,
+    tilt_rad=1e-3,
+    zero_mm=0.1,
+)
+"""Wider than those of the solution: a bad machine or a clumsy set-up is no reason to suspect a file."""
+ORDER = 10
+BLOCKS = 120
+STRONG = 25.0
+"""Difference of log evidence (natural) above which a cause is named."""
+FACTORS = {"um": 1e-3, "inch": 25.4, "sign": -1.0, "mm_as_um": 1e3, "mm_as_inch": 1.0 / 25.4}
+"""What the deviations of a run would have to be multiplied by, if they were written in another unit or with the other sign."""
+SWAPS = {"swap_xy": (0, 1), "swap_yz": (1, 2), "swap_xz": (0, 2)}
+ON_SPHERE_MM = 1.5
+GROSS, GROSS_MM = 4.0, 2e-3
+"""A run that merely does not fit is named if it misses the others' prediction by so many times what is expected, and by so much."""
+SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
+OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
+"""A reading that the rest of its run misses by so many standard deviations does not count here; at most this share of a run."""
+OUTLIER_MM = 0.1
+"""Width of the range in which an outlier may lie."""
+LARGE_MM = 0.3
+"""Only readings below this can be a machine's; among larger ones outliers are not looked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Suspect:
+    """A run that does not fit the others.
+
+    Attributes
+    ----------
+    run : str
+    cause : str
+        Key of `FACTORS` or `SWAPS`: with that mistake undone the run fits. "other": nothing makes it fit.
+    gain : float
+        By how much the log evidence of the campaign grows.
+    misfit_mm, expected_mm : float
+        Rms by which the other runs' prediction misses the run (its own set-up refitted), and what it should be.
+    tied : tuple of str
+        Other runs that explain the contradiction as well: with two runs nobody can say which is wrong.
+    """
+
+    run: str
+    cause: str
+    gain: float
+    misfit_mm: float
+    expected_mm: float
+    tied: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One run without its outliers: design in units of the prior and readings, both over the noise; what the units add to the evidence."""
+
+    a: F2
+    y: F1
+    log_sigma: float
+
+    @property
+    def information(self) -> F2:
+        return np.asarray(self.a.T @ self.a)
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """A run as it is and with each possible mistake undone; ``first_setup``: where the unknowns of the set-ups begin."""
+
+    label: str
+    as_is: _Part
+    undone: dict[str, _Part]
+    sigma_mm: float
+    first_setup: int
+
+
+@dataclass(frozen=True)
+class _Model:
+    """What all runs share: unknowns in units of their prior."""
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    setup: Setup
+    scale: F1
+
+    def design(self, run: RunData) -> F2:
+        return run_design(self.machine, self.terms, _shortened(run), self.setup) * self.scale
+
+
+def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG) -> tuple[Suspect, ...]:
+    """Runs that contradict the others, worst first; each is set aside before the next is looked for.
+
+    Parameters
+    ----------
+    runs : sequence of RunData
+        One run alone contradicts nobody.
+    limit : float
+        Least gain of log evidence.
+    """
+    if len(runs) < 2:
+        return ()
+    left, found = _prepared(machine, runs), list[Suspect]()
+    while len(left) > 1 and len(found) < len(runs) // 2:
+        worst = _worst(left, limit)
+        if worst is None:
+            break
+        found.append(worst)
+        left = [r for r in left if r.label != worst.run]
+    return tuple(found)
+
+
+def _prepared(machine: Machine, runs: Sequence[RunData]) -> list[_Run]:
+    """Every run over the noise that is usual for its instrument in this campaign, without its outliers."""
+    model = _model(machine, runs)
+    designs = [model.design(r) for r in runs]
+    found = [scatter(a, _readings(r)) for a, r in zip(designs, runs, strict=True)]
+    usual = {
+        kind: float(np.median([s for (s, _), r in zip(found, runs, strict=True) if r.kind == kind])) for kind in {r.kind for r in runs}
+    }
+    first = len(model.terms) + len(DIRECTIONS)
+    out = []
+    for run, a, (_, drop) in zip(runs, designs, found, strict=True):
+        sigma = usual[run.kind]
+        undone = {name: _part(a, _readings(run, f), drop, sigma, f) for name, f in FACTORS.items()}
+        undone |= {name: _part(model.design(r), _readings(r), drop, sigma) for name, r in _swapped(run).items()}
+        out.append(_Run(run.label, _part(a, _readings(run), drop, sigma), undone, sigma, first))
+    return out
+
+
+def _model(machine: Machine, runs: Sequence[RunData]) -> _Model:
+    terms = smooth_terms(ORDER)
+    setup = setup_unknowns(tuple(replace(r, u_length_mm=None, length_calibrated=False) for r in runs), WIDE)
+    scale = np.concatenate([term_prior_sd(machine, terms, WIDE), np.full(len(DIRECTIONS), WIDE.backlash_mm), setup.prior_sd])
+    return _Model(machine, terms, setup, scale)
+
+
+def _shortened(run: RunData) -> RunData:
+    return block_average(run, BLOCKS) if run.kind == "bar" else run
+
+
+def _readings(run: RunData, factor: float = 1.0) -> F1:
+    """Readings less the nominal ones, after the deviations were multiplied: the nominal reading is never in another unit."""
+    short = _shortened(replace(run, deviation_mm=factor * run.deviation_mm))
+    return np.asarray(short.deviation_mm - nominal_reading(short))
+
+
+def _part(a: F2, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1.0) -> _Part:
+    """A run over its noise. Readings that were multiplied answer for it in their density; an outlier may lie anywhere (`OUTLIER_MM`)."""
+    if np.abs(y).max() < LARGE_MM and abs(factor) != 1.0:
+        drop = scatter(a, y)[1]
+    log_sigma = float(np.log(np.where(drop, OUTLIER_MM, sigma)).sum() - y.size * np.log(abs(factor)))
+    return _Part(a[~drop] / sigma, y[~drop] / sigma, log_sigma)
+
+
+def scatter(a: F2, y: F1) -> tuple[float, NDArray[np.bool_]]:
+    """Noise that the model leaves in one run, mm, and which of its readings are outliers, bool, shape (n,).
+
+    The noise is the most probable of `SIGMA_GRID_MM`; each reading is compared with what all others of the run predict.
+    """
+    drop = np.zeros(y.size, dtype=bool)
+    while True:
+        sigma, z = _against_the_rest(a[~drop], y[~drop])
+        bad = np.abs(z) > OUTLIER_SIGMA
+        if not bad.any() or drop.sum() + bad.sum() > OUTLIER_SHARE * drop.size:
+            return sigma, drop
+        drop[np.flatnonzero(~drop)[bad]] = True
+
+
+def _against_the_rest(a: F2, y: F1) -> tuple[float, F1]:
+    """Most probable noise, and every reading's distance from the prediction of the others in standard deviations.
+
+    Source: Rasmussen and Williams, Gaussian Processes, eqs 5.8 and 5.12.
+    """
+    values, vectors = linalg.eigh(a @ a.T)
+    values, turned = np.clip(values, 0.0, None), vectors.T @ y
+    spread = values[:, None] + SIGMA_GRID_MM**2
+    log_p = -0.5 * (turned[:, None] ** 2 / spread + np.log(spread)).sum(axis=0)
+    sigma = float(SIGMA_GRID_MM[int(np.argmax(log_p))])
+    over = 1.0 / (values + sigma**2)
+    return sigma, (vectors @ (over * turned)) / np.sqrt((vectors**2) @ over)
+
+
+@dataclass(frozen=True, slots=True)
+class _Posterior:
+    """What some parts together say: Cholesky factor of the information with the prior, and its log evidence."""
+
+    factor: F2
+    theta: F1
+    log_evidence: float
+
+
+def _posterior(information: F2, projection: F1, energy: float, log_sigma: float) -> _Posterior:
+    """Log evidence without the constant n log(2 pi) / 2, which all hypotheses share."""
+    lower = linalg.cholesky(information + np.eye(len(information)), lower=True)
+    half = linalg.solve_triangular(lower, projection, lower=True)
+    theta = linalg.solve_triangular(lower, half, lower=True, trans=1)
+    log_p = -0.5 * (energy - float(half @ half)) - float(np.log(np.diag(lower)).sum()) - log_sigma
+    return _Posterior(lower, theta, log_p)
+
+
+def _together(parts: Sequence[_Part]) -> _Posterior:
+    return _posterior(
+        sum((p.information for p in parts), np.zeros((parts[0].a.shape[1],) * 2)),
+        sum((p.a.T @ p.y for p in parts), np.zeros(parts[0].a.shape[1])),
+        sum(float(p.y @ p.y) for p in parts),
+        sum(p.log_sigma for p in parts),
+    )
+
+
+def _worst(runs: Sequence[_Run], limit: float) -> Suspect | None:
+    as_is = _together([r.as_is for r in runs]).log_evidence
+    found = [_judged(run, [r.as_is for r in runs if r is not run], as_is) for run in runs]
+    found = [s for s in found if s.gain > limit and (s.cause != "other" or s.misfit_mm > max(GROSS * s.expected_mm, GROSS_MM))]
+    if not found:
+        return None
+    worst = max(found, key=lambda s: s.gain)
+    return replace(worst, tied=tuple(s.run for s in found if s.run != worst.run and worst.gain - s.gain < limit))
+
+
+def _judged(run: _Run, rest: list[_Part], as_is: float) -> Suspect:
+    """A run taken to be wrong in the way that explains the campaign best."""
+    others = _together(rest)
+    best, cause = others.log_evidence + _together([run.as_is]).log_evidence, "other"
+    for name, log_p in _conditional(others, run.undone).items():
+        if others.log_evidence + log_p > best + STRONG * (cause == "other"):
+            best, cause = others.log_evidence + log_p, name
+    misfit, expected = _misfit(others, run)
+    return Suspect(run.label, cause, best - as_is, misfit, expected)
+
+
+def _conditional(others: _Posterior, variants: dict[str, _Part]) -> dict[str, float]:
+    """Log evidence of each variant of a run given what the others say; variants with one design share its factorisation."""
+    out: dict[str, float] = {}
+    known: list[tuple[F2, F2, F2]] = []
+    for name, part in variants.items():
+        found = next((k for k in known if np.array_equal(k[0], part.a)), None)
+        if found is None:
+            spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
+            found = (part.a, spread, linalg.cholesky(spread @ spread.T + np.eye(len(spread)), lower=True))
+            known.append(found)
+        left = linalg.solve_triangular(found[2], part.y - part.a @ others.theta, lower=True)
+        out[name] = -0.5 * float(left @ left) - float(np.log(np.diag(found[2])).sum()) - part.log_sigma
+    return out
+
+
+def _swapped(run: RunData) -> dict[str, RunData]:
+    """The run with two axes exchanged, wherever it would still lie on its sphere (elsewhere geometry alone tells)."""
+    if run.centre_mm is None or run.radius_mm is None:
+        return {}
+    out = {}
+    for name, (i, j) in SWAPS.items():
+        order = [0, 1, 2]
+        order[i], order[j] = j, i
+        axes = run.axes_mm[:, order]
+        off = np.abs(np.linalg.norm(axes - run.centre_mm, axis=1) - run.radius_mm).max()
+        if off < ON_SPHERE_MM:
+            out[name] = replace(run, axes_mm=axes, sign=run.sign[:, order])
+    return out
+
+
+def _misfit(others: _Posterior, run: _Run) -> tuple[float, float]:
+    """Rms of what the others' prediction leaves once the run's own set-up is refitted, and its expected rms, mm."""
+    part, first = run.as_is, run.first_setup
+    r = part.y - part.a[:, :first] @ others.theta[:first]
+    own = part.a[:, first:]
+    own = own[:, np.abs(own).max(axis=0) > 0]
+    q, _ = linalg.qr(own, mode="economic")
+    left = r - q @ (q.T @ r)
+    spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
+    spread = spread - q @ (q.T @ spread)
+    expected = 1.0 + float((spread**2).sum()) / len(r)
+    return run.sigma_mm * float(np.sqrt(np.mean(left**2))), run.sigma_mm * float(np.sqrt(expected))
