@@ -64,7 +64,7 @@ class JointSolution:
     identifiability : Identifiability
         Of the terms up to ``order`` only.
     weight_per_mm2 : array, shape (n,)
-        Weight of every reading in ``information``, run by run: robust weight over noise variance, neighbours that are alike counting as fewer.
+        Weight of every reading in ``information``, run by run: robust weight over noise variance, alike neighbours counting as fewer.
     order : int
         Highest Legendre order that held-out runs support (or the caller's). ``terms`` may go higher: the rest is nuisance, so that no
         interval is too narrow because the basis was cut.

@@ -1,0 +1,149 @@
+"""Trials of a whole campaign: readings, calibrations, temperatures and omitted orders drawn anew, solved anew, predicted anew.
+
+Linear: the solver's own gain, applied to all trials of a batch at once. Exact: every trial is iterated with the exact reading of every run
+(finite rotations, length of the bar, tilted mirror) as the solver iterates; slow, and there to show that the linear one is good enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import F1, F2
+from models.solvers.joint import JointSolution
+from models.solvers.observe import predict
+from models.uncertainty.distributions import NORMAL, Distribution
+from models.uncertainty.frame import RigidFree, field
+from models.uncertainty.monte_carlo import Draw
+from models.uncertainty.response import Response, response
+from models.uncertainty.sources import ErrorSources
+
+READINGS = ("bar_noise", "laser_noise")
+LIMITS: Mapping[str, Distribution] = MappingProxyType(
+    {name: Distribution("rectangular") for name in ("wavelength", "bar_temperature", "scale_temperature")}
+)
+"""For inputs that were stated as limits: rectangular, of unit standard deviation. What no distribution is given for is normal."""
+EXACT_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class CampaignTrials:
+    """Inputs of a solution and how a prediction at points answers to them.
+
+    Attributes
+    ----------
+    sources : ErrorSources
+    response : Response
+    predict_per_unit : array, shape (3 m, len(sources.terms))
+        Deviation at the points per unit of each coefficient, x y z of the first point first.
+    distributions : dict
+        Per source name.
+    """
+
+    sources: ErrorSources
+    response: Response
+    predict_per_unit: F2
+    distributions: Mapping[str, Distribution]
+
+    def value(self) -> F1:
+        """Prediction at the estimate, shape (3 m,)."""
+        return np.asarray(self.predict_per_unit @ self.sources.coefficients)
+
+    def linear(self) -> Draw:
+        """Trials through the solver's gain, results (trials, 3 m)."""
+        n = len(self.sources.solution.terms)
+        readings = ((self.predict_per_unit[:, :n] @ self.response.gain[:n]).T * self._reading_sd()[:, None]).astype(np.float32)
+        others = [(s.name, (self.predict_per_unit @ s.factor).T) for s in self._others()]
+
+        def draw(rng: np.random.Generator, trials: int) -> F2:
+            out: F2 = (self._readings(rng, trials) @ readings).astype(np.float64)  # single precision: seven digits of what is random
+            for name, factor in others:
+                out += self._drawn(name, rng, (trials, factor.shape[0])) @ factor
+            return self._scattered(out, rng) + self.value()
+
+        return draw
+
+    def exact(self) -> Draw:
+        """Trials through the exact readings, iterated; everything that is no reading and no set-up stays linear."""
+        solution, r = self.sources.solution, self.response
+        n, gain, sd = len(solution.terms), self.response.gain, self._reading_sd()
+        measured = np.concatenate([run.deviation_mm for run in solution.data])
+        others = self._others()
+        resting = self._settled(measured, gain, solution.estimate.theta)
+
+        def draw(rng: np.random.Generator, trials: int) -> F2:
+            noise = self._readings(rng, trials) * sd
+            shift = np.zeros((trials, len(self.sources.terms)))
+            for source in others:
+                shift += self._drawn(source.name, rng, (trials, source.factor.shape[1])) @ source.factor.T
+            for t in range(trials):
+                start = resting + gain @ noise[t]
+                shift[t, :n] += self._settled(measured + noise[t], gain, start)[:n] - resting[:n]
+            return self._scattered(shift @ self.predict_per_unit.T, rng) + self.value()
+
+        assert r.weight.size == measured.size
+        return draw
+
+    def _settled(self, measured: F1, gain: F2, theta: F1) -> F1:
+        """The solver's iteration to the exact model, with its weights and sizes."""
+        for _ in range(EXACT_ROUNDS):
+            theta = gain @ (measured - _predicted(self.sources.solution, theta) + self.response.design @ theta)
+        return np.asarray(theta)
+
+    def _others(self) -> list[_Factor]:
+        return [_Factor(s.name, s.factor) for s in self.sources.sources if s.name not in (*READINGS, "repeatability")]
+
+    def _reading_sd(self) -> F1:
+        w = self.response.weight
+        return np.where(w > 0, 1.0 / np.sqrt(np.where(w > 0, w, 1.0)), 0.0)
+
+    def _readings(self, rng: np.random.Generator, trials: int) -> NDArray[np.float32]:
+        """Errors of all readings in units of their standard deviation, shape (trials, n)."""
+        out = np.empty((trials, self.response.weight.size), dtype=np.float32)
+        for name in READINGS:
+            seen = self.response.kind == name.removesuffix("_noise")
+            drawn = np.empty((trials, int(seen.sum())), dtype=np.float32)
+            self.distributions.get(name, NORMAL).fill(rng, drawn)
+            out[:, seen] = drawn
+        return out
+
+    def _drawn(self, name: str, rng: np.random.Generator, shape: tuple[int, int]) -> F2:
+        out = np.empty(shape)
+        self.distributions.get(name, NORMAL).fill(rng, out)
+        return out
+
+    def _scattered(self, out: F2, rng: np.random.Generator) -> F2:
+        """Repeatability of one approach on top, where the prediction is of one."""
+        scatter = self.sources.inputs.repeatability_mm if self.sources.inputs.single_approach else 0.0
+        return out + scatter * self._drawn("repeatability", rng, (out.shape[0], out.shape[1])) if scatter else out
+
+
+@dataclass(frozen=True)
+class _Factor:
+    name: str
+    factor: F2
+
+
+def _predicted(solution: JointSolution, theta: F1) -> F1:
+    return np.concatenate([predict(solution.machine, solution.terms, run, solution.setup, theta) for run in solution.data])
+
+
+def campaign_trials(
+    sources: ErrorSources,
+    points_mm: F2,
+    *,
+    tool_mm: F1 | None = None,
+    frame: RigidFree | None = None,
+    distributions: Mapping[str, Distribution] | None = None,
+) -> CampaignTrials:
+    """Make trials of a solution for a prediction at points, shape (m, 3); tool and frame as in `predict_deviation`.
+
+    ``distributions``: per source name, of unit standard deviation (``u`` 1 for normal and rectangular), e.g. `LIMITS`; normal where none
+    is given. The repeatability of the machine is drawn with the readings it is part of.
+    """
+    d = field(sources.solution.machine, sources.terms, points_mm, tool_mm, frame)
+    return CampaignTrials(sources, response(sources.solution), d.reshape(-1, d.shape[2]), distributions or {})
