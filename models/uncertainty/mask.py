@@ -43,8 +43,8 @@ class CompensableMask:
         left = 1.0 - self.share
         if left == 0.0:
             return "The deviation is larger than its uncertainty everywhere."
-        return f"At {left:.0%} of the points the uncertainty (k = {np.median(self.coverage_factor):.2f}) is larger than the error: not
-        compensated."
+        k = np.median(self.coverage_factor)
+        return f"At {left:.0%} of the points the uncertainty (k = {k:.2f}) is larger than the error: not compensated."
 
 
 def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest_mm: float = 0.0) -> CompensableMask:

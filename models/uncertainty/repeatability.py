@@ -69,8 +69,8 @@ def machine_repeatability(runs: tuple[RunData, ...], kind: str, sensor_mm: float
 def _places(runs: list[RunData]) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
     """Number of the place of every reading: set-up, commanded position (to 0.1 um) and directions of approach."""
     setups = {name: i for i, name in enumerate(dict.fromkeys(r.setup for r in runs))}
-    key = np.concatenate([np.column_stack([np.full(len(r.axes_mm), setups[r.setup]), np.round(r.axes_mm, 4), np.sign(r.sign)]) for r in
-    runs]) return np.asarray(np.unique(key, axis=0, return_inverse=True)[1]).reshape(-1)
+    parts = [np.column_stack([np.full(len(r.axes_mm), setups[r.setup]), np.round(r.axes_mm, 4), np.sign(r.sign)]) for r in runs]
+    return np.asarray(np.unique(np.concatenate(parts), axis=0, return_inverse=True)[1]).reshape(-1)
 
 
 def _run_effects(runs: list[RunData]) -> F2:
