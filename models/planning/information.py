@@ -24,6 +24,8 @@ from models.solvers.priors import Priors, term_prior_sd
 from models.volumetric import rigid_design, volume_grid
 
 LASER_SCALE = "laser_scale"
+PAUSE_S = 60.0
+"""Between two runs of one mounting: drifts go on."""
 SEARCH_VALUES = 120
 """Points that stand for the block means of a helix while searching: 24 a turn follow every smooth term; the weight stays the run's."""
 
@@ -56,7 +58,7 @@ def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | N
 
 def mounting_information(what: Problem, tests: tuple[Measurement, ...]) -> F2:
     """Information of all tests of one mounting on the shared unknowns, shape (size, size), in units of their priors."""
-    runs = tuple(_search_run(what, t) for t in tests)
+    runs = _search_runs(what, tests)
     setup = setup_unknowns(runs, what.priors)
     own = [i for i, n in enumerate(setup.names) if n not in what.names]
     shared, nuisance = [], []
@@ -69,8 +71,14 @@ def mounting_information(what: Problem, tests: tuple[Measurement, ...]) -> F2:
     return np.asarray(a.T @ a - cross.T @ linalg.solve(b.T @ b + np.eye(len(own)), cross, assume_a="pos"))
 
 
-def _search_run(what: Problem, test: Measurement) -> RunData:
-    return expected_run(what.machine, test, what.tools, values=SEARCH_VALUES if isinstance(test, HelixTest) else BAR_VALUES)
+def _search_runs(what: Problem, tests: tuple[Measurement, ...]) -> tuple[RunData, ...]:
+    """The runs of one mounting, one after the other: drifts go on while it stands."""
+    runs: list[RunData] = []
+    for test in tests:
+        start_s = float(runs[-1].t_s[-1]) + PAUSE_S if runs else 0.0
+        values = SEARCH_VALUES if isinstance(test, HelixTest) else BAR_VALUES
+        runs.append(expected_run(what.machine, test, what.tools, values=values, start_s=start_s))
+    return tuple(runs)
 
 
 def _sigma(what: Problem, run: RunData) -> F1:
@@ -90,8 +98,6 @@ def _shared_columns(what: Problem, run: RunData, full: F2, setup_names: tuple[st
     for i, name in enumerate(setup_names):
         if name in what.names:
             out[:, what.names.index(name)] = full[:, first + i]
-    if run.beam is not None:
-        out[:, -1] = (run.axes_mm - run.axes_mm[0]) @ run.beam / _sigma(what, run)
     return np.asarray(out * what.prior_sd)
 
 

@@ -2,49 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from models.solvers.priors import U_WAVELENGTH
 
 BAR_LENGTHS_MM = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 """Bars that exist as a bar with extensions."""
-
-
-@dataclass(frozen=True, slots=True)
-class Instruments:
-    """What there is to measure with, and how well it reads.
-
-    Attributes
-    ----------
-    bar_lengths_mm : tuple of float
-        Nominal lengths of the ball-bars at hand; empty: no ball-bar.
-    laser : bool
-        Whether there is a laser with a flat mirror.
-    bar_noise_mm, laser_noise_mm : float
-        Standard deviation of one reading.
-    floor_mm : float
-        Smallest uncertainty of an averaged value: what smooth error functions do not follow (as in the joint solution).
-    u_bar_length_mm : float
-        Standard uncertainty of each bar's calibrated length.
-    u_wavelength : float
-        Relative standard uncertainty of the laser's wavelength, common to all laser runs.
-    """
-
-    bar_lengths_mm: tuple[float, ...] = BAR_LENGTHS_MM
-    laser: bool = True
-    bar_noise_mm: float = 0.5e-3
-    laser_noise_mm: float = 0.3e-3
-    floor_mm: float = 0.3e-3
-    u_bar_length_mm: float = 2e-3
-    u_wavelength: float = U_WAVELENGTH
-
-    def __post_init__(self) -> None:
-        """Refuse what no instrument has, in one line."""
-        sizes = (*self.bar_lengths_mm, self.bar_noise_mm, self.laser_noise_mm, self.u_bar_length_mm, self.u_wavelength)
-        if not all(0 < v < float("inf") for v in sizes) or not 0 <= self.floor_mm < float("inf"):
-            raise ValueError("instruments: lengths, noise and uncertainties must be positive numbers")
-        if not self.bar_lengths_mm and not self.laser:
-            raise ValueError("instruments: neither a ball-bar nor a laser")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +31,43 @@ class SetupMinutes:
         """Refuse negative times."""
         if not all(0 <= v < float("inf") for v in (self.cup, self.bar, self.line, self.diagonal)):
             raise ValueError("set-up minutes: every time must be 0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class Instruments:
+    """What there is to measure with, and how well it reads.
+
+    Attributes
+    ----------
+    bar_lengths_mm : tuple of float
+        Nominal lengths of the ball-bars at hand; empty: no ball-bar.
+    laser : bool
+        Whether there is a laser with a flat mirror.
+    bar_noise_mm, laser_noise_mm : float
+        Standard deviation of one reading.
+    floor_mm : float
+        Smallest uncertainty of an averaged value: what smooth error functions do not follow (as in the joint solution).
+    u_bar_length_mm : float
+        Standard uncertainty of each bar's calibrated length.
+    u_wavelength : float
+        Relative standard uncertainty of the laser's wavelength, common to all laser runs.
+    setup : SetupMinutes
+        How long set-ups take.
+    """
+
+    bar_lengths_mm: tuple[float, ...] = BAR_LENGTHS_MM
+    laser: bool = True
+    bar_noise_mm: float = 0.5e-3
+    laser_noise_mm: float = 0.3e-3
+    floor_mm: float = 0.3e-3
+    u_bar_length_mm: float = 2e-3
+    u_wavelength: float = U_WAVELENGTH
+    setup: SetupMinutes = field(default_factory=SetupMinutes)
+
+    def __post_init__(self) -> None:
+        """Refuse what no instrument has, in one line."""
+        sizes = (*self.bar_lengths_mm, self.bar_noise_mm, self.laser_noise_mm, self.u_bar_length_mm, self.u_wavelength)
+        if not all(0 < v < float("inf") for v in sizes) or not 0 <= self.floor_mm < float("inf"):
+            raise ValueError("instruments: lengths, noise and uncertainties must be positive numbers")
+        if not self.bar_lengths_mm and not self.laser:
+            raise ValueError("instruments: neither a ball-bar nor a laser")

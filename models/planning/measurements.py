@@ -15,7 +15,7 @@ from models.machine import AXES, Machine
 from models.paths.helix import helix_points
 from models.paths.lines import diagonal_ends, step_diagonal, straight_line
 from models.planning.instruments import Instruments
-from models.solvers.observations import RunData
+from models.solvers.observations import RunData, Test
 
 Point = tuple[float, float, float]
 RAPID_MM_MIN = 6000.0
@@ -131,9 +131,10 @@ def expected_run(machine: Machine, test: Measurement, tools: Instruments, *, val
         return _expected_helix(machine, test, tools, values, start_s)
     path, beam = laser_path(machine, test)
     n = len(path)
+    kind: Test = "diagonal" if isinstance(test, DiagonalTest) else "linear"
     moved = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1)])
     t_s = start_s + np.cumsum(moved / RAPID_MM_MIN * 60.0 + READING_S)
-    return RunData(test.label, test.mounting, "laser", path, np.zeros(n), travel_sign(path), t_s, np.ones(n), beam=beam)
+    return RunData(test.label, test.mounting, "laser", path, np.zeros(n), travel_sign(path), t_s, np.ones(n), beam=beam, test=kind)
 
 
 def _expected_helix(machine: Machine, test: HelixTest, tools: Instruments, values: int, start_s: float) -> RunData:
@@ -156,4 +157,5 @@ def _expected_helix(machine: Machine, test: HelixTest, tools: Instruments, value
         test.radius_mm,
         u_length_mm=tools.u_bar_length_mm,
         length_calibrated=True,
+        test="helix",
     )

@@ -15,9 +15,11 @@ from scipy import linalg
 from models.arrays import F2
 from models.machine import AXES, Machine
 from models.planning.candidates import candidates
+from models.planning.goal import Goal, limit, minutes_needed, shortest
 from models.planning.information import field_rows, problem
-from models.planning.instruments import Instruments, SetupMinutes
+from models.planning.instruments import Instruments
 from models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
+from models.planning.open_questions import not_observable
 from models.planning.search import Chosen, Search
 from models.solvers.observations import RunData
 from models.solvers.priors import Priors
@@ -68,6 +70,10 @@ class Plan:
         What a perfect machine would record, deviations zero: positions, directions, times, weights of the block means.
     u_before_mm : (worst, mean)
         From the priors alone.
+    open_questions : tuple of str
+        What stays not observable, in words.
+    goal : Goal or None
+        What became of the wanted uncertainty, if one was given.
     """
 
     machine: Machine
@@ -75,6 +81,8 @@ class Plan:
     steps: tuple[Step, ...]
     runs: tuple[RunData, ...]
     u_before_mm: tuple[float, float]
+    open_questions: tuple[str, ...] = ()
+    goal: Goal | None = None
 
     @property
     def recipes(self) -> tuple[Measurement, ...]:
@@ -96,8 +104,8 @@ def plan_campaign(
     machine: Machine,
     *,
     minutes: float = 60.0,
+    goal_mm: float | None = None,
     tools: Instruments | None = None,
-    setup_minutes: SetupMinutes | None = None,
     priors: Priors | None = None,
     vertical: int = 2,
     progress: Callable[[float], None] = lambda _: None,
@@ -108,6 +116,8 @@ def plan_campaign(
     ----------
     minutes : float
         Set-up and machine time together.
+    goal_mm : float, optional
+        Wanted expanded uncertainty U = 2 u (mm) at the worst node: a plan that reaches it is cut to the minutes that this takes.
     vertical : int
         Index of the vertical axis.
     progress : callable
@@ -118,14 +128,27 @@ def plan_campaign(
     ValueError
         Nothing fits into the strokes or into the minutes.
     """
-    if not 0 < minutes < np.inf:
-        raise ValueError(f"planner: {minutes:g} minutes, expected a positive number")
-    tools, setup_minutes = tools or Instruments(), setup_minutes or SetupMinutes()
-    search = Search(problem(machine, tools, PLAN_ORDER, priors), candidates(machine, tools, vertical), setup_minutes, INNER_SHARE)
-    chosen = search.fill({}, minutes)
+    if not 0 < minutes < np.inf or (goal_mm is not None and not 0 < goal_mm < np.inf):
+        raise ValueError("planner: minutes and goal must be positive numbers")
+    tools = tools or Instruments()
+    what = problem(machine, tools, PLAN_ORDER, priors)
+    search = Search(what, candidates(machine, tools, vertical), INNER_SHARE, progress)
+    rows = field_rows(what, INNER_SHARE, REPORT_NODES)
+    if goal_mm is None:
+        chosen, reached = search.exchange(search.fill({}, minutes), minutes, PASSES), False
+    else:
+        chosen, reached = shortest(search, rows, goal_mm, minutes, PASSES)
     if not chosen:
         raise ValueError(f"planner: no measurement fits into {minutes:g} minutes")
-    return laid_out(search, search.exchange(chosen, minutes, PASSES))
+    plan = laid_out(search, chosen)
+    if goal_mm is None:
+        return plan
+    floor_mm, limit_by = limit(search, rows)
+    if reached:
+        needed: float | None = plan.minutes
+    else:
+        needed = minutes_needed(search, rows, goal_mm, chosen) if floor_mm < goal_mm else None
+    return replace(plan, goal=Goal(goal_mm, reached, needed, floor_mm, limit_by))
 
 
 def laid_out(search: Search, chosen: Chosen) -> Plan:
@@ -149,7 +172,7 @@ def laid_out(search: Search, chosen: Chosen) -> Plan:
         replace(expected_run(machine, s.test, tools, start_s=t), label=s.label, setup=s.setup_id)
         for s, t in zip(steps, starts, strict=True)
     )
-    return Plan(machine, tools, tuple(steps), runs, before)
+    return Plan(machine, tools, tuple(steps), runs, before, not_observable(search, chosen))
 
 
 def uncertainty_mm(information: F2, rows: F2) -> tuple[float, float]:

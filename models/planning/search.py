@@ -21,6 +21,8 @@ from models.planning.measurements import HelixTest, LineTest, Measurement, machi
 POWER = 4.0
 """Of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
 SEARCH_NODES = 4
+LOOK_AT_ALL = 4
+"""Every so many additions all candidates are looked at again, else only the best third of the last look."""
 
 Chosen = dict[str, tuple[Measurement, ...]]
 """Mounting to its tests, in the order in which they were chosen."""
@@ -45,7 +47,6 @@ class Search:
 
     what: Problem
     candidates: tuple[Measurement, ...]
-    minutes: SetupMinutes
     share: float = 0.8
     tick: Callable[[float], None] = lambda _: None
     _rows: F2 = field(init=False)
@@ -63,7 +64,7 @@ class Search:
         """Minutes that a test takes after the others on its mounting."""
         if test not in self._machine_min:
             self._machine_min[test] = machine_seconds(self.what.machine, test) / 60.0
-        return extra_minutes(self.minutes, self._machine_min[test], test, before)
+        return extra_minutes(self.what.tools.setup, self._machine_min[test], test, before)
 
     def total_min(self, chosen: Chosen) -> float:
         """Minutes of a whole plan."""
@@ -99,13 +100,18 @@ class Search:
         v = variance.reshape(-1, 3).sum(axis=1)
         return float(0.5 / POWER * np.log(np.mean(v**POWER)))
 
-    def best_addition(self, chosen: Chosen, budget_min: float) -> tuple[Measurement, float] | None:
-        """The affordable test with the largest gain per minute, and that gain; None: nothing fits or gains."""
+    def best_addition(self, chosen: Chosen, budget_min: float) -> Measurement | None:
+        """The affordable test with the largest gain per minute; None: nothing fits or gains."""
+        ranked = self.ranking(chosen, budget_min, self.candidates)
+        return ranked[0] if ranked else None
+
+    def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...]) -> list[Measurement]:
+        """Affordable tests of the pool, and what fits to the cups that stand, by gain per minute, the best first."""
         lower = linalg.cholesky(self.information(chosen), lower=True)
         half = linalg.solve_triangular(lower, self._rows.T, lower=True)
         start = (half**2).sum(axis=0)
-        now, best = self._judge(start), None
-        for test in (*self.candidates, *self._at_cups(chosen)):
+        now, rates = self._judge(start), dict[Measurement, float]()
+        for test in (*pool, *self._at_cups(chosen)):
             before = chosen.get(test.mounting, ())
             if test in before or (before and isinstance(test, HelixTest) and not _follows(test, before)):
                 continue
@@ -115,10 +121,8 @@ class Search:
             b = linalg.solve_triangular(lower, self._gain_factor(before, test).T, lower=True).T
             s = linalg.cholesky(np.eye(len(b)) + b @ b.T, lower=True)
             less = linalg.solve_triangular(s, b @ half, lower=True)
-            gain = (now - self._judge(start - (less**2).sum(axis=0))) / cost
-            if gain > 1e-6 and (best is None or gain > best[1]):
-                best = (test, gain)
-        return best
+            rates[test] = (now - self._judge(start - (less**2).sum(axis=0))) / cost
+        return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
 
     def _at_cups(self, chosen: Chosen) -> list[Measurement]:
         """Other bars, and the way back with the same bar, at the cups that stand already."""
@@ -135,19 +139,27 @@ class Search:
         """Add tests by gain per minute until nothing more fits."""
         chosen = dict(chosen)
         left = budget_min - self.total_min(chosen)
-        while (found := self.best_addition(chosen, left)) is not None:
-            test = found[0]
+        pool, looks = self.candidates, 0
+        while ranked := self.ranking(chosen, left, pool):
+            test = ranked[0]
             before = chosen.get(test.mounting, ())
             left -= self.cost_min(test, before)
             chosen[test.mounting] = (*before, test)
-            self.tick(1.0 - max(left, 0.0) / budget_min)
+            looks += 1
+            # Gains fall from step to step for all alike: between two looks at everything the best are enough.
+            pool = (
+                self.candidates if looks % LOOK_AT_ALL == 0 else tuple(t for t in ranked[: len(self.candidates) // 3] if t in self._known)
+            )
+        if pool is not self.candidates and self.best_addition(chosen, left) is not None:
+            return self.fill(chosen, budget_min)
         return chosen
 
     def exchange(self, chosen: Chosen, budget_min: float, passes: int) -> Chosen:
         """Take every mounting, and every last test of one, out in turn; fill the time again; keep what is better."""
         best = self.criterion(chosen)
-        for _ in range(passes):
+        for number in range(passes):
             improved = False
+            self.tick(number / passes)
             for smaller in _without_one(chosen):
                 trial = self.fill(smaller, budget_min)
                 value = self.criterion(trial)
