@@ -43,6 +43,17 @@ class Truth:
         motion, _, k = name.partition(".")
         return float(self.series("XYZ".index(motion[2]), int(k))[int(k), COMPONENTS.index(motion[1])])
 
+    def parameters(self, names: list[str], order: int | None = None) -> np.ndarray:
+        """True values of many parameters, shape (len(names),)."""
+        highest = max((int(n.partition(".")[2] or 0) for n in names), default=0)
+        series = [self.series(axis, highest) for axis in range(3)]
+        out = np.empty(len(names))
+        for i, name in enumerate(names):
+            motion, _, k = name.partition(".")
+            smooth = bool(k) and "_" not in motion
+            out[i] = series["XYZ".index(motion[2])][int(k), COMPONENTS.index(motion[1])] if smooth else self.parameter(name, order)
+        return out
+
     def series(self, axis: int, order: int) -> np.ndarray:
         """Legendre coefficients of the six motions of one carriage (squareness left out), shape (order + 1, 6)."""
         u, weight = legendre.leggauss(NODES)
