@@ -1,0 +1,208 @@
+"""What a campaign tells about a machine and what it does not, before it is measured and after it is solved.
+
+`observability` needs the runs' set-ups only (a planner's question), `observability_of` takes a solution. Both give rank and null space in
+words with a cause and a cure, what is known of every parameter and motion, and how well the deviation is known in the volume. Rank is of
+the readings and stated calibrations alone; uncertainties include the documented priors (`models.solvers.priors`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from models.machine import Machine
+from models.solvers.joint import JointSolution
+from models.solvers.observability_cures import Campaign
+from models.solvers.observability_hidden import Advice, HiddenGroup, picture
+from models.solvers.observability_parameters import Correlation, Motion, Parameter, correlations, hidden_terms, motions, parameters
+from models.solvers.observability_rank import (
+    Columns,
+    Knowledge,
+    Seen,
+    campaign_columns,
+    compressed,
+    hidden_lost_motion,
+    stated_knowledge,
+    what_is_seen,
+)
+from models.solvers.observability_volume import Knowing, Number, Volume, observability_number, volume_at, whole_volume
+from models.solvers.observations import RunData
+from models.solvers.observe import setup_unknowns
+from models.solvers.priors import Priors, term_prior_sd
+
+__all__ = ["Observability", "observability", "observability_of"]
+
+SIGMA_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
+FLOOR_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
+"""Noise of one reading and smallest uncertainty of an averaged one, mm, where a planner says nothing else (issue: 0.5 and 0.3 um)."""
+
+
+@dataclass(frozen=True)
+class Observability:
+    """The whole report.
+
+    Attributes
+    ----------
+    machine, terms
+        Nominal machine and coefficients of its error motions.
+    seen : Seen
+        Rank, effective rank, condition, null space (unit columns).
+    reachable : int
+        Rank that no run with the same tools could exceed: the whole deviation vector everywhere (math.md 4.6, "upper bound").
+    known : tuple of str
+        Set-up unknowns counted as known for the rank, because somebody states them.
+    hidden : tuple of HiddenGroup
+        The null space in words; groups that change nothing with the tools used come last.
+    advice : tuple of Advice
+        Additions to the campaign in the order in which they show most, with the rank after each.
+    parameters, correlations, motions
+        Every unknown; pairs with a correlation above 0.9; every error motion as a function.
+    volume : Volume
+        On a grid of 11 nodes per axis. Other points: `at`.
+    number : Number
+    """
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    seen: Seen
+    reachable: int
+    known: tuple[str, ...]
+    hidden: tuple[HiddenGroup, ...]
+    advice: tuple[Advice, ...]
+    parameters: tuple[Parameter, ...]
+    correlations: tuple[Correlation, ...]
+    motions: tuple[Motion, ...]
+    knowing: Knowing
+    volume: Volume
+    number: Number
+
+    @property
+    def rank(self) -> int:
+        """How many combinations of the coefficients the readings show."""
+        return self.seen.rank
+
+    def at(self, axes_mm: F2) -> Volume:
+        """Prior size, uncertainty and noise gain at commanded positions (n, 3), mm."""
+        return volume_at(self.machine, self.terms, self.knowing, axes_mm)
+
+    def lines(self) -> tuple[str, ...]:
+        """The report in short sentences, most important first."""
+        n, v, k = len(self.terms), self.volume, self.volume.worst_point
+        out = [self.number.text]
+        out.append(f"The readings show {self.seen.rank} of {n} coefficients, {self.seen.effective_rank} of them well; ")
+        out[-1] += f"with the tools used no run could show more than {self.reachable}."
+        place = ", ".join(f"{x:.0f}" for x in v.axes_mm[k])
+        out.append(
+            f"Largest standard uncertainty of the predicted deviation: {v.u_mm[k] * 1e3:.2g} µm at ({place}) mm; noise gain there "
+            f"{v.gain[k]:.2g} µm per µm."
+        )
+        out += [g.text for g in self.hidden]
+        return (*out, *(a.text for a in self.advice))
+
+
+def observability(
+    machine: Machine,
+    runs: tuple[RunData, ...],
+    *,
+    terms: int | tuple[Term, ...] = 5,
+    priors: Priors | None = None,
+    sigma_mm: dict[str, float] | None = None,
+    floor_mm: dict[str, float] | None = None,
+    known: Knowledge | None = None,
+) -> Observability:
+    """What runs could tell, from where they measure: no reading is looked at.
+
+    Parameters
+    ----------
+    terms : int or tuple of Term
+        The model: highest Legendre order of the 21 error motions, or its coefficients.
+    priors, sigma_mm, floor_mm
+        As in `models.solvers.joint.solve_joint`.
+    known : Knowledge, optional
+        What is known of the set-up, for the rank; default `stated_knowledge`: what the runs themselves state.
+
+    Raises
+    ------
+    ValueError
+        No runs, or runs that contradict each other (`setup_unknowns`).
+    """
+    if not runs:
+        raise ValueError("observability: no runs")
+    terms = smooth_terms(terms) if isinstance(terms, int) else terms
+    priors = priors or Priors()
+    setup = setup_unknowns(runs, priors)
+    sigma, floor = sigma_mm or SIGMA_MM, floor_mm or FLOOR_MM
+    prior = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+    u = np.concatenate([np.hypot(sigma[r.kind] / np.sqrt(r.weight_n), floor[r.kind]) for r in runs])
+    columns = campaign_columns(machine, terms, runs, setup)
+    whitened = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1) / u[:, None]
+    information = whitened.T @ whitened
+    covariance = posterior_covariance(information, prior)
+    beliefs = _Beliefs(None, covariance, prior, information, float(np.sqrt(np.mean(u**2))))
+    return _report(machine, terms, runs, columns, beliefs, known or stated_knowledge(terms, runs, setup))
+
+
+def observability_of(solution: JointSolution, known: Knowledge | None = None) -> Observability:
+    """What the runs of a solution told: as `observability`, with the solution's own estimates, covariance, priors and noise."""
+    e, s = solution.estimate, solution
+    noise = np.concatenate([np.full(r.residual_mm.size, r.expected_mm) for r in s.runs])
+    beliefs = _Beliefs(e.theta, e.covariance, s.prior_sd, s.information, float(np.sqrt(np.mean(noise**2))))
+    columns = campaign_columns(s.machine, s.terms, s.data, s.setup)
+    return _report(s.machine, s.terms, s.data, columns, beliefs, known or stated_knowledge(s.terms, s.data, s.setup))
+
+
+def posterior_covariance(information: F2, prior_sd: F1) -> F2:
+    """Covariance of all unknowns from the information of the readings, shape (p, p), and independent priors."""
+    scaled = information * np.outer(prior_sd, prior_sd) + np.eye(prior_sd.size)
+    inverse = linalg.cho_solve(linalg.cho_factor(scaled, check_finite=False), np.eye(prior_sd.size), check_finite=False)
+    return np.asarray(inverse * np.outer(prior_sd, prior_sd))
+
+
+@dataclass(frozen=True)
+class _Beliefs:
+    """Estimates (None before solving), their covariance, priors, information of the readings, rms noise of a reading in mm."""
+
+    theta: F1 | None
+    covariance: F2
+    prior_sd: F1
+    information: F2
+    noise_mm: float
+
+
+def _report(
+    machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], columns: Columns, beliefs: _Beliefs, known: Knowledge
+) -> Observability:
+    p, columns = len(terms), compressed(columns)
+    seen = what_is_seen(columns, known)
+    found = picture(Campaign(machine, terms, runs, columns, known), seen, beliefs.prior_sd[:p])
+    names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
+    secret = hidden_terms(terms, seen.null_space)
+    lost = frozenset(f"backlash_{a}" for a in hidden_lost_motion(columns, known)) if known.lost_motion else frozenset()
+    knowing = _knowing(beliefs, p)
+    volume = whole_volume(machine, terms, knowing)
+    return Observability(
+        machine=machine,
+        terms=terms,
+        seen=seen,
+        reachable=found.reachable,
+        known=tuple(known.held),
+        hidden=found.groups,
+        advice=found.advice,
+        parameters=parameters(names, beliefs.theta, beliefs.covariance, beliefs.prior_sd, secret | lost),
+        correlations=correlations(names, beliefs.covariance),
+        motions=motions(machine, terms, knowing.posterior, knowing.prior, secret),
+        knowing=knowing,
+        volume=volume,
+        number=observability_number(volume),
+    )
+
+
+def _knowing(beliefs: _Beliefs, p: int) -> Knowing:
+    """Covariances of the terms; the noise part is that of the estimator in use, priors included."""
+    plain = posterior_covariance(beliefs.information, beliefs.prior_sd)
+    noise = (plain @ beliefs.information @ plain)[:p, :p] / beliefs.noise_mm**2
+    return Knowing(np.diag(beliefs.prior_sd[:p] ** 2), beliefs.covariance[:p, :p], noise)

@@ -1,0 +1,173 @@
+"""What the runs of a campaign show of the machine: rank, effective rank and hidden combinations of the error motions' coefficients.
+
+Convention of math.md 4.6: columns of unit length, everything unknown about the set-up projected out, singular values counted down to 1e-9
+(rank) and 1e-3 (effective rank) of the largest. Priors do not count: a typical size is no measurement. What counts beside the readings is
+what somebody measured or certified about the set-up (`Knowledge`): a calibrated bar, a laser whose drift the maker states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.geometry.bases import DIRECTIONS, Term
+from models.machine import Machine
+from models.solvers.designs import unit_columns
+from models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
+from models.solvers.observations import RunData
+from models.solvers.observe import Setup, run_design
+
+HAND_SET = ("cup", "tilt", "zero")
+"""Set-up unknowns that hands make and nobody states; with uncalibrated bar lengths they are free. All others have a stated limit: slow
+drifts, the laser's wavelength, its cosine error (`models.solvers.priors`). They are known for the rank, and in every uncertainty."""
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known about the set-up besides the readings, for the rank only.
+
+    Attributes
+    ----------
+    held : mapping of set-up unknown to array, shape (number of terms,)
+        Unknowns that are known: zero, or this combination of the machine's own errors (a mirror that was squared to the machine's Z line
+        leans as that line does).
+    shared : tuple of tuples of names
+        Unknowns that are one and the same, e.g. the lengths of one sensor with two calibrated extension bars.
+    lost_motion : bool
+        Whether the machine may have lost motion. The papers' models have none.
+    """
+
+    held: Mapping[str, F1] = field(default_factory=dict)
+    shared: tuple[tuple[str, ...], ...] = ()
+    lost_motion: bool = True
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Readings of a campaign per unit of everything: ``machine`` (n, p), ``lost`` (n, 3) lost motion, ``setup`` (n, k), with its names."""
+
+    machine: F2
+    lost: F2
+    setup: F2
+    setup_names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the readings show of the machine.
+
+    Attributes
+    ----------
+    rank, effective_rank : int
+        Singular values above 1e-9 and 1e-3 of the largest.
+    condition : float
+        Largest over smallest singular value counted in ``rank``.
+    factor : array, shape (p,)
+        Coefficient = factor times its value in unit columns.
+    singular : array, shape (p,)
+        Singular values of the design with unit columns, set-up projected out.
+    row_space, null_space : array, shape (p, rank) and (p, p - rank)
+        Orthonormal combinations (unit columns) that the readings show, and that leave no trace.
+    """
+
+    rank: int
+    effective_rank: int
+    condition: float
+    factor: F1
+    singular: F1
+    row_space: F2
+    null_space: F2
+
+
+def campaign_columns(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: Setup) -> Columns:
+    """Linearised readings of all runs, unweighted: what a reading shows does not depend on its noise."""
+    a = np.concatenate([run_design(machine, terms, run, setup) for run in runs])
+    p = len(terms)
+    return Columns(a[:, :p], a[:, p : p + len(DIRECTIONS)], a[:, p + len(DIRECTIONS) :], setup.names)
+
+
+def compressed(columns: Columns) -> Columns:
+    """The same information in as few rows as there are columns (QR): everything after it is cheap, whatever the number of readings."""
+    whole = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1)
+    unit, factor = unit_columns(whole)
+    if whole.shape[0] > whole.shape[1]:
+        unit = linalg.qr(unit, mode="r", check_finite=False)[0][: whole.shape[1]]
+    r = unit / factor
+    p = columns.machine.shape[1]
+    return Columns(r[:, :p], r[:, p : p + 3], r[:, p + 3 :], columns.setup_names)
+
+
+def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: Setup) -> Knowledge:
+    """What is stated about the set-up: lengths of calibrated bars, and whatever no hand sets (`HAND_SET`).
+
+    A bar counts as calibrated if every run with it says so or states its uncertainty, and none says the opposite
+    (`models.solvers.priors.bar_length_sd`); how well it was calibrated enters the uncertainties, not the rank. Cup offsets, mirror tilts,
+    laser zeros and uncalibrated lengths are free, however narrow their priors.
+    """
+    vague = {f"bar_length_{r.radius_mm:g}" for r in runs if r.kind == "bar" and not _calibrated(r)}
+    return Knowledge({n: np.zeros(len(terms)) for n in setup.names if n.partition("_")[0] not in HAND_SET and n not in vague})
+
+
+def _calibrated(run: RunData) -> bool:
+    return run.length_calibrated is True or (run.length_calibrated is None and run.u_length_mm is not None)
+
+
+def perfect_setup(known: Knowledge, terms: tuple[Term, ...], setup: Setup, kinds: tuple[str, ...] = HAND_SET) -> Knowledge:
+    """Known besides: all set-up unknowns of these kinds (``"cup"``, ``"tilt"``, ``"bar_length"``), as the papers assume."""
+    more = {n: np.zeros(len(terms)) for n in setup.names if n.startswith(tuple(f"{k}_" for k in kinds))}
+    return replace(known, held={**known.held, **more}, shared=tuple(g for g in known.shared if not set(g) & set(more)))
+
+
+def with_knowledge(columns: Columns, known: Knowledge) -> tuple[F2, F2, tuple[tuple[str, ...], ...]]:
+    """Machine columns, columns of what stays free (set-up unknowns and lost motion), and the names behind each of these."""
+    machine, at = columns.machine, {n: i for i, n in enumerate(columns.setup_names)}
+    for name, combination in known.held.items():
+        if combination.any():
+            machine = machine + np.outer(columns.setup[:, at[name]], combination)
+    tied = {n for group in known.shared for n in group}
+    groups: list[tuple[str, ...]] = [(n,) for n in columns.setup_names if n not in known.held and n not in tied]
+    groups += [tuple(n for n in group if n in at) for group in known.shared]
+    free = [columns.setup[:, [at[n] for n in group]].sum(axis=1, keepdims=True) for group in groups]
+    if known.lost_motion:
+        free.append(columns.lost)
+        groups += [(f"backlash_{a}",) for a in DIRECTIONS]
+    return machine, np.concatenate([columns.setup[:, :0], *free], axis=1), tuple(groups)
+
+
+def what_is_seen(columns: Columns, known: Knowledge) -> Seen:
+    """Rank and null space of the machine's coefficients, whatever the free set-up unknowns and the lost motion are.
+
+    Raises
+    ------
+    ValueError
+        ``known`` names a set-up unknown that the campaign has not.
+    """
+    strangers = set(known.held) | {n for group in known.shared for n in group}
+    if strangers - set(columns.setup_names):
+        raise ValueError(f"observability: {', '.join(sorted(strangers - set(columns.setup_names)))} is no set-up unknown of these runs")
+    machine, free, _ = with_knowledge(columns, known)
+    unit, factor = unit_columns(machine)
+    _, s, vt = linalg.svd(project_out(unit, free), full_matrices=True, check_finite=False)
+    s = np.concatenate([s, np.zeros(unit.shape[1] - s.size)])
+    top = float(s[0]) if s.size else 0.0
+    rank = int((s > RANK_TOLERANCE * top).sum())
+    condition = top / float(s[rank - 1]) if rank else float("inf")
+    effective = int((s > EFFECTIVE_TOLERANCE * top).sum())
+    return Seen(rank, effective, condition, factor, np.asarray(s), vt[:rank].T, vt[rank:].T)
+
+
+def hidden_lost_motion(columns: Columns, known: Knowledge) -> tuple[str, ...]:
+    """Axes whose lost motion other unknowns can imitate completely: mostly axes that never reverse, like the pole axis of one helix."""
+    machine, free, _ = with_knowledge(columns, replace(known, lost_motion=False))
+    out = []
+    for k, axis in enumerate(DIRECTIONS):
+        column = columns.lost[:, k : k + 1]
+        others = unit_columns(np.concatenate([machine, free, np.delete(columns.lost, k, axis=1)], axis=1))[0]
+        size = float(np.linalg.norm(column))
+        if size == 0.0 or float(np.linalg.norm(project_out(column, others))) < RANK_TOLERANCE * size:
+            out.append(axis)
+    return tuple(out)

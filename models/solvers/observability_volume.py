@@ -1,0 +1,168 @@
+"""How well the deviation is known at every point of the volume, and one number for it.
+
+All figures are of the deviation without the best-fit rigid motion over the inner 80 % of the strokes: where the workpiece lies is no
+property of the machine. Three standard deviations belong to a point: what a typical machine has (prior), what is left after the runs
+(posterior), and what one micrometre of reading noise makes of it (noise gain).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2, F3
+from models.geometry.bases import Term
+from models.geometry.chain import design
+from models.machine import Machine
+from models.volumetric import rigid_design, volume_grid
+
+INNER = 0.8
+NODES = 11
+"""Nodes per axis over the strokes; those at 0.1 .. 0.9 make the inner 80 %."""
+USABLE, GOOD = 3.0, 10.0
+"""Bounds of the observability number (`observability_number`)."""
+
+
+@dataclass(frozen=True)
+class Knowing:
+    """Covariances of the error motions' coefficients in their own units, shape (p, p).
+
+    ``prior``: of a typical machine; ``posterior``: after the runs; ``noise``: the part of the posterior that reading noise makes, per mm
+    squared of reading noise (root mean square over the readings).
+    """
+
+    prior: F2
+    posterior: F2
+    noise: F2
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Figures at points of the volume, rigid motion removed.
+
+    Attributes
+    ----------
+    axes_mm : array, shape (n, 3)
+    prior_mm, u_mm : array, shape (n,)
+        Root mean square length of the deviation of a typical machine; of the difference between truth and prediction (standard
+        uncertainty of the three components taken together, root of the sum of squares).
+    worst_mm : array, shape (n,)
+        Standard uncertainty in the direction in which it is largest.
+    gain : array, shape (n,)
+        Micrometres of predicted deviation (root of the sum of squares) per micrometre of reading noise.
+    inner : array of bool, shape (n,)
+        Inside the inner 80 % of every stroke.
+    """
+
+    axes_mm: F2
+    prior_mm: F1
+    u_mm: F1
+    worst_mm: F1
+    gain: F1
+    inner: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+    @property
+    def worst_point(self) -> int:
+        """Row with the largest uncertainty."""
+        return int(np.argmax(self.u_mm))
+
+
+@dataclass(frozen=True)
+class Number:
+    """The observability number: how many times smaller the volumetric error of a typical machine can become by these runs.
+
+    ``value``: at the worst place of the inner 80 %, before over after; ``median``: median place before over median place after;
+    ``before_mm``, ``after_mm``: the sizes behind ``value``; ``where_mm``: the worst place afterwards; ``verdict``: ``"good"``, ``"usable
+    with care"`` or ``"mostly assumption"``; ``text``: in words.
+    """
+
+    value: float
+    median: float
+    before_mm: float
+    after_mm: float
+    where_mm: F1
+    verdict: str
+    text: str
+
+
+def inner_box(machine: Machine) -> F2:
+    """The inner 80 % of every stroke, shape (3, 2)."""
+    edge = 0.5 * (1.0 - INNER) * machine.length_mm[:, None] * np.array([1.0, -1.0])
+    return np.asarray(machine.stroke_mm + edge)
+
+
+def frame_free_design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2, reference_mm: F2) -> F3:
+    """Deviation per unit of every coefficient with the best-fit rigid motion over ``reference_mm`` removed, shape (n, 3, p)."""
+    at_reference = design(machine, terms, reference_mm).reshape(-1, len(terms))
+    centre = reference_mm.mean(axis=0)
+    rigid = linalg.lstsq(rigid_design(reference_mm).reshape(-1, 6), at_reference, check_finite=False)[0]
+    motion = _rigid_about(axes_mm, centre)
+    return np.asarray(design(machine, terms, axes_mm) - motion @ rigid)
+
+
+def _rigid_about(points_mm: F2, centre_mm: F1) -> F3:
+    """As `models.volumetric.rigid_design`, about a given centre instead of the points' own."""
+    out = np.zeros((points_mm.shape[0], 3, 6))
+    out[:, :, :3] = np.eye(3)
+    for k in range(3):
+        out[:, :, 3 + k] = np.cross(np.eye(3)[k], points_mm - centre_mm)
+    return out
+
+
+def volume_at(machine: Machine, terms: tuple[Term, ...], knowing: Knowing, axes_mm: F2) -> Volume:
+    """Prior size, uncertainty and noise gain of the deviation at commanded positions (n, 3), with the machine's own tool.
+
+    Parameters
+    ----------
+    knowing : Knowing
+    axes_mm : array, shape (n, 3)
+        Commanded positions, mm.
+    """
+    box = inner_box(machine)
+    field = frame_free_design(machine, terms, axes_mm, volume_grid(box, 7))
+    prior, posterior, noise = (_point_covariance(field, c) for c in (knowing.prior, knowing.posterior, knowing.noise))
+    slack = 1e-9 * machine.length_mm
+    inner = np.all((axes_mm >= box[:, 0] - slack) & (axes_mm <= box[:, 1] + slack), axis=1)
+    largest = np.linalg.eigvalsh(posterior)[:, -1]
+    return Volume(axes_mm, _length(prior), _length(posterior), np.sqrt(np.maximum(largest, 0.0)), _length(noise), inner)
+
+
+def whole_volume(machine: Machine, terms: tuple[Term, ...], knowing: Knowing) -> Volume:
+    """`volume_at` on a grid of 11 nodes per axis over the strokes, x slowest."""
+    return volume_at(machine, terms, knowing, volume_grid(machine.stroke_mm, NODES))
+
+
+def _point_covariance(field: F3, covariance: F2) -> F3:
+    """Covariance of the deviation at every point, shape (n, 3, 3)."""
+    return np.asarray(np.einsum("nip,njp->nij", (field.reshape(-1, field.shape[2]) @ covariance).reshape(field.shape), field))
+
+
+def _length(covariance: F3) -> F1:
+    return np.asarray(np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0)))
+
+
+def observability_number(volume: Volume) -> Number:
+    """The factor by which a correction from these runs can at best reduce the error of a typical machine, at the worst inner place.
+
+    Largest prior size over largest remaining uncertainty, both without rigid motion, over the inner 80 %. (Point by point the ratio would
+    blame the middle of the volume, where a machine whose frame was fitted has little error to begin with.) Controls that calibrate
+    kinematics print a "valuation number" for the measuring positions, in parameters' units. This one has no units, is about the deviation
+    that is corrected, and can be read on the shop floor: at 10, a machine with 30 um of volumetric error can be brought to 3 um, no
+    better. Without runs it is 1. Thresholds: below 3, more than a tenth of the variance (1/3^2) that a typical machine has stays unknown:
+    what would be written there is mostly what was assumed about machines, and not worth the risk. From 10 on it is at most a hundredth,
+    and repeatability and temperature decide.
+    """
+    prior, u = volume.prior_mm[volume.inner], np.maximum(volume.u_mm[volume.inner], 1e-12)
+    k = int(np.argmax(u))
+    value, median, where = float(prior.max() / u[k]), float(np.median(prior) / np.median(u)), volume.axes_mm[volume.inner][k]
+    verdict = "good" if value >= GOOD else "usable with care" if value >= USABLE else "mostly assumption"
+    place = ", ".join(f"{v:.0f}" for v in where)
+    sizes = f"from {prior.max() * 1e3:.2g} µm to {u[k] * 1e3:.2g} µm at ({place}) mm"
+    text = (
+        f"Observability {value:.1f} ({verdict}): at the worst place of the inner 80 % of the volume, a correction from these runs makes "
+        f"the error of a typical machine at best {value:.1f} times smaller ({sizes}), {median:.1f} times at the median. Below {USABLE:g} "
+        f"the result is mostly assumption, from {GOOD:g} on it is good."
+    )
+    return Number(value, median, float(prior.max()), float(u[k]), where, verdict, text)
