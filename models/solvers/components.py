@@ -14,7 +14,7 @@ from scipy import linalg
 
 from models.arrays import F1, F2
 from models.solvers.information import Sums
-from models.solvers.priors import SizeModel
+from models.solvers.priors import LENGTHS, SizeModel, with_length
 
 NOISE_SD = 2.0
 """Hyperprior of an instrument's log noise variance about what its repeats say: a factor of e in the standard deviation, weak."""
@@ -90,8 +90,17 @@ def slope(sums: Sums, c: Components, model: SizeModel, p: Posterior) -> tuple[F1
     return np.concatenate([by_size, by_noise]), info
 
 
-def estimate(sums: Sums, model: SizeModel, start: Components) -> tuple[Components, F2]:
-    """Most probable components from a start, and their covariance (psi first, then eta)."""
+@dataclass(frozen=True)
+class Found:
+    """Most probable components, their covariance (psi first, then eta), and log evidence plus log hyperprior."""
+
+    components: Components
+    spread: F2
+    value: float
+
+
+def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
+    """Most probable components from a start; ``sums`` about the independent unknowns of the model (`Sums.turned`)."""
     weight = np.concatenate([model.sd, np.full(start.eta.size, NOISE_SD)]) ** -2.0
     h = model.sd.size
 
@@ -118,7 +127,29 @@ def estimate(sums: Sums, model: SizeModel, start: Components) -> tuple[Component
         c, value, p = trial, better, found
         if np.abs(step).max() < TOLERANCE:
             break
-    return c, np.asarray(linalg.inv(info))
+    return Found(c, np.asarray(linalg.inv(info)), value)
+
+
+def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeModel, Found]:
+    """The same with the correlation length of the error motions, by climbing over `LENGTHS` from the model's own.
+
+    ``sums`` about the unknowns in units of their typical size.
+    """
+    at = LENGTHS.index(model.length)
+    found = {at: estimate(sums.turned(model.root), model, start)}
+    models = {at: model}
+    if not model.blocks:
+        return model, found[at]
+    for way in (1, -1):
+        while 0 <= at + way < len(LENGTHS):
+            new = at + way
+            if new not in found:
+                models[new] = with_length(model, LENGTHS[new])
+                found[new] = estimate(sums.turned(models[new].root), models[new], found[at].components)
+            if found[new].value <= found[at].value:
+                break
+            at = new
+    return models[at], found[at]
 
 
 def widened(model: SizeModel, p: Posterior, spread: F2) -> F2:

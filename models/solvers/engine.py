@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
@@ -12,19 +12,20 @@ from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term
 from models.machine import Machine
 from models.solvers import robust
-from models.solvers.components import Components, Posterior, blend, estimate, posterior, widened
-from models.solvers.information import I1, KINDS, Readings, Sums, grams, sums, total
+from models.solvers.components import Components, Posterior, blend, estimate, fit_length, posterior, widened
+from models.solvers.information import I1, KINDS, Grams, Readings, Sums, grams, sums, total
 from models.solvers.noise import DEFAULT_SIGMA_MM, RESOLUTION_MM, repeat_noise_mm
 from models.solvers.observations import RunData
 from models.solvers.observe import Setup, predict, run_design, setup_unknowns
 from models.solvers.order import folds
-from models.solvers.priors import Priors, SizeModel, size_model, term_prior_sd
+from models.solvers.priors import Priors, SizeModel, size_model
 from models.solvers.residual_tests import inflation
 
 ROUNDS = 8
 SETTLED = 0.01
 """The iteration ends when no reading's prediction moves by more than this part of its noise and no weight changes."""
 HUBER = 1.5
+GENTLE = 3
 Progress = Callable[[str], None]
 
 
@@ -46,7 +47,6 @@ class Problem:
     terms: tuple[Term, ...]
     setup: Setup
     names: tuple[str, ...]
-    reference: F1
     sizes: SizeModel
     noise: Noise
     sigma: F1
@@ -73,6 +73,7 @@ class Fit:
     theta: F1
     covariance: F2
     prior_sd: F1
+    sizes: SizeModel
     components: Components
     posterior: Posterior
     weight: F1
@@ -93,46 +94,48 @@ def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], 
     """Linearise all runs about the perfect machine."""
     setup = setup_unknowns(runs, priors)
     rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
-    reference = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+    rest_sd = np.concatenate([np.full(len(DIRECTIONS), priors.backlash_mm), setup.prior_sd])
+    sizes = size_model(machine, terms, rest, rest_sd, priors)
     sigma = np.concatenate([np.hypot(noise.sigma_mm[r.kind] / np.sqrt(r.weight_n), noise.floor_mm[r.kind]) for r in runs])
     a = np.concatenate([run_design(machine, terms, r, setup) for r in runs])
-    a *= reference
+    a *= sizes.typical
     a /= sigma[:, None]
     n = [r.deviation_mm.size for r in runs]
     rows = [np.repeat(v, n).astype(np.int64) for v in (np.arange(len(runs)), folds(runs), [KINDS.index(r.kind) for r in runs])]
     names = tuple(t.name for t in terms) + rest
     readings = Readings(a, np.zeros(len(sigma)), rows[0], rows[1], rows[2])
-    return Problem(machine, runs, terms, setup, names, reference, size_model(terms, rest), noise, sigma, readings)
+    return Problem(machine, runs, terms, setup, names, sizes, noise, sigma, readings)
 
 
 def settle(problem: Problem, say: Progress) -> Fit:
     """Iterate weights, components and the exact model until nothing moves."""
-    r, kinds = problem.readings, len(KINDS)
-    gram = grams(r)
-    measured = problem.measured
-    theta, weight = np.zeros(len(problem.names)), np.ones(len(measured))
-    c = Components(np.zeros(len(problem.sizes.names)), np.zeros(kinds))
+    r = problem.readings
+    gram, measured, sizes = grams(r), problem.measured, problem.sizes
+    x, weight = np.zeros(len(problem.names)), np.ones(len(measured))
+    c = Components(np.zeros(len(sizes.names)), np.zeros(len(KINDS)))
     limit = robust.threshold(len(measured))
     dirty = False
     for step in range(ROUNDS):
-        z = (measured - problem.predicted(theta)) / problem.sigma + r.a @ (theta / problem.reference)
-        here = Readings(r.a, z, r.run, r.fold, r.kind)
-        whole = total(sums(here, gram, weight))
-        if step:
-            c, _ = estimate(whole, problem.sizes, c)
-        x = posterior(whole, c, problem.sizes).x * c.half(problem.sizes)
+        z = (measured - problem.predicted(sizes.typical * x)) / problem.sigma + r.a @ x
+        whole = total(sums(Readings(r.a, z, r.run, r.fold, r.kind), gram, weight))
+        if step == 1:
+            sizes, found = fit_length(whole, sizes, c)
+            c = found.components
+        elif step:
+            c = estimate(whole.turned(sizes.root), sizes, c).components
+        root = sizes.root * c.half(sizes)
+        before, x = x, root @ posterior(whole.turned(sizes.root), c, sizes).x
         size = (z - r.a @ x) / np.exp(0.5 * c.eta)[r.kind]
         if not step:
             size = size / _robust_scale(size, r.kind)[r.kind]
         dirty = dirty or bool(np.abs(size).max() > 0.7 * limit)
-        new = _weights(size / _spread(problem, whole, c, step) if dirty else size, limit, gentle=step < 3)
-        moved = float(np.abs(r.a @ (x - theta / problem.reference)).max())
-        changed = float(np.abs(new - weight).max())
-        theta, weight = x * problem.reference, new
+        new = _weights(size / _spread(problem, whole, c, sizes) if dirty and step >= GENTLE else size, limit, gentle=step < GENTLE)
+        moved, changed = float(np.abs(r.a @ (x - before)).max()), float(np.abs(new - weight).max())
+        weight = new
         say(f"round {step + 1}: readings move by {moved:.2g} sigma, {int((weight < 1).sum())} readings count less")
         if step >= 2 and moved < SETTLED and changed < SETTLED:
             break
-    return _finish(problem, theta, weight, c)
+    return _finish(replace(problem, sizes=sizes), x, weight, c, gram)
 
 
 def _robust_scale(size: F1, kind: I1) -> F1:
@@ -147,34 +150,33 @@ def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
     return hard
 
 
-def _spread(problem: Problem, whole: Sums, c: Components, step: int) -> F1:
+def _spread(problem: Problem, whole: Sums, c: Components, sizes: SizeModel) -> F1:
     """Standard deviation of each residual in units of its noise: what the fit took of it is missing."""
-    if step < 3:
-        return np.ones(len(problem.sigma))
-    half = c.half(problem.sizes)
-    information, _, _ = blend(whole, c, half)
+    information, _, _ = blend(whole.turned(sizes.root), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
     low = linalg.cholesky(information, lower=True)
-    scaled = problem.readings.a * half / np.exp(0.5 * c.eta)[problem.readings.kind][:, None]
-    return np.asarray(np.sqrt(np.maximum(1.0 - robust.leverage(scaled, low), 0.05)))
+    h = robust.leverage(problem.readings.a, linalg.solve_triangular(low, (sizes.root * c.half(sizes)).T, lower=True))
+    return np.asarray(np.sqrt(np.maximum(1.0 - h / np.exp(c.eta)[problem.readings.kind], 0.05)))
 
 
-def _finish(problem: Problem, theta: F1, weight: F1, c: Components) -> Fit:
+def _finish(problem: Problem, x: F1, weight: F1, c: Components, gram: Grams) -> Fit:
     """Last solution with the exact residuals; neighbours that are alike count as fewer readings."""
-    r = problem.readings
-    residual = problem.measured - problem.predicted(theta)
-    z = residual / problem.sigma + r.a @ (theta / problem.reference)
-    parts = sums(Readings(r.a, z, r.run, r.fold, r.kind), grams(r), weight)
-    size = residual / problem.sigma / np.exp(0.5 * c.eta)[r.kind] / _spread(problem, total(parts), c, ROUNDS)
+    r, typical = problem.readings, problem.sizes.typical
+    residual = problem.measured - problem.predicted(typical * x)
+    z = residual / problem.sigma + r.a @ x
+    parts = sums(Readings(r.a, z, r.run, r.fold, r.kind), gram, weight)
+    size = residual / problem.sigma / np.exp(0.5 * c.eta)[r.kind] / _spread(problem, total(parts), c, problem.sizes)
     thinning = _thinning(problem, size, weight)
     parts = tuple(s.thinned(thinning) for s in parts)
     whole = total(parts)
-    c, spread = estimate(whole, problem.sizes, c)
-    p = posterior(whole, c, problem.sizes)
-    prior = problem.reference * c.half(problem.sizes)
-    cov = widened(problem.sizes, p, spread) * prior[:, None] * prior
-    theta = p.x * prior
-    return Fit(theta, cov, prior, c, p, weight, size, problem.measured - problem.predicted(theta), thinning, parts)
+    sizes, found = fit_length(whole, problem.sizes, c)
+    c = found.components
+    p = posterior(whole.turned(sizes.root), c, sizes)
+    root = typical[:, None] * sizes.root * c.half(sizes)
+    cov = root @ widened(sizes, p, found.spread) @ root.T
+    theta = root @ p.x
+    left = problem.measured - problem.predicted(theta)
+    return Fit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, thinning, parts)
 
 
 def _thinning(problem: Problem, size: F1, weight: F1) -> F1:

@@ -168,7 +168,7 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     fit = settle(problem, say)
     if model == "rigid6":
         return _solution(problem, fit, "rigid6", 1, None)
-    choice = choose(fit.parts, fit.components, problem.sizes, term_levels(terms, len(problem.names) - len(terms)))
+    choice = choose(fit.parts, fit.components, fit.sizes, term_levels(terms, len(problem.names) - len(terms)))
     if model == "auto" and choice.chosen == RIGID6:
         say("held-out runs ask for no more than scales and squareness")
         six = build(machine, _six(), runs, priors or Priors(), noise)
@@ -188,7 +188,7 @@ def _six() -> tuple[Term, ...]:
 
 def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderChoice | None) -> JointSolution:
     whole, c = total(fit.parts), fit.components
-    information = np.einsum("k,kij->ij", np.exp(-c.eta), whole.gram) / np.outer(problem.reference, problem.reference)
+    information = np.einsum("k,kij->ij", np.exp(-c.eta), whole.gram) / np.outer(fit.sizes.typical, fit.sizes.typical)
     factor = np.exp(0.5 * c.eta)
     return JointSolution(
         machine=problem.machine,
@@ -209,7 +209,7 @@ def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderC
         residual_tests=residual_tests(problem.runs, problem.split(fit.size), problem.split(fit.weight)),
         model=model,
         order_choice=choice,
-        size_factors={n: float(np.exp(0.5 * v)) for n, v in zip(problem.sizes.names, c.psi, strict=True) if n not in ("fade", "cut")},
+        size_factors={n: float(np.exp(0.5 * v)) for n, v in zip(fit.sizes.names, c.psi, strict=True)} | {"length": fit.sizes.length},
     )
 
 

@@ -9,7 +9,7 @@ from scipy import linalg
 
 from models.arrays import F1, F2
 from models.geometry.bases import Term
-from models.solvers.components import Components, blend
+from models.solvers.components import Components
 from models.solvers.information import I1, Sums, total
 from models.solvers.observations import RunData
 from models.solvers.priors import SizeModel
@@ -53,20 +53,24 @@ def term_levels(terms: tuple[Term, ...], rest: int) -> I1:
 
 
 def truncated_evidence(sums: Sums, c: Components, model: SizeModel, level: I1) -> tuple[tuple[int, ...], F1]:
-    """Log evidence of every truncation of the model from one Cholesky factor: unknowns ordered by level are nested.
+    """Log evidence of every truncation of the model; constants that all levels share are left out.
 
-    Constants that all levels share are left out.
+    A truncated model has no Legendre coefficients above its level; the others keep their prior covariance.
     """
-    order = np.argsort(level, kind="stable")
-    gram, moment, _ = blend(sums, c, c.half(model))
-    gram = gram[np.ix_(order, order)]
-    np.fill_diagonal(gram, gram.diagonal() + 1.0)
-    low = linalg.cholesky(gram, lower=True)
-    z = linalg.solve_triangular(low, moment[order], lower=True)
-    running = np.cumsum(0.5 * z**2 - np.log(low.diagonal()))
     levels = tuple(int(v) for v in np.unique(level[level >= 0]))
-    ends = np.searchsorted(level[order], levels, side="right") - 1
-    return levels, np.asarray(running[ends])
+    w = np.exp(-c.eta)
+    gram, moment = np.einsum("k,kij->ij", w, sums.gram), w @ sums.moment
+    scaled = model.root * c.half(model)
+    out = []
+    for k in levels:
+        keep = np.flatnonzero(level <= k)
+        low = linalg.cholesky(scaled[keep] @ scaled[keep].T, lower=True)
+        inside = low.T @ gram[np.ix_(keep, keep)] @ low
+        np.fill_diagonal(inside, inside.diagonal() + 1.0)
+        factor = linalg.cholesky(inside, lower=True)
+        z = linalg.solve_triangular(factor, low.T @ moment[keep], lower=True)
+        out.append(0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum()))
+    return levels, np.array(out)
 
 
 def choose(parts: tuple[Sums, ...], c: Components, model: SizeModel, level: I1) -> OrderChoice:

@@ -6,9 +6,12 @@ Sources: effects.md 2 (typical magnitudes of geometry), published machine data (
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
 
 from models.arrays import F1, F2
 from models.geometry.bases import Term
@@ -92,10 +95,42 @@ def _sd(machine: Machine, term: Term, p: Priors) -> float:
 
 SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
+MOTION_FACTOR = 2.0
+"""Hyperprior of one error motion against the others of its class."""
 SPECTRUM_SD = 1.0
 """Hyperprior of the two numbers that bend how sizes fade with the order."""
 LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift")
 """Set-up unknowns that hands and temperatures make, so that their size may be learned. Stated calibrations never are."""
+LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(14) / 4.0), 4))
+"""Correlation lengths of the error motions that are tried, in strokes: 0.1 to 0.95."""
+FIRST_LENGTH = LENGTHS[5]
+SMALLEST_SHARE = 1e-7
+"""Variance that every shape keeps of the largest one's, so that none is ruled out."""
+
+
+@cache
+def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
+    """Shapes in which an error motion may bend, and how much: the covariance of its Legendre coefficients of order 2 to ``order``.
+
+    An error motion is equally large and equally smooth everywhere on its stroke, its line taken away. Independent Legendre coefficients
+    would not say so: all polynomials are largest at the ends of the stroke. So the coefficients are those of a stationary process with a
+    squared exponential correlation of ``length`` strokes, whose independent shapes are the eigenvectors of their covariance.
+
+    Returns
+    -------
+    shapes : array, shape (order - 1, order - 1)
+        Coefficients of every shape (columns), smoothest first, orthonormal.
+    variance : array, shape (order - 1,)
+        Of every shape, for a process of variance 1 (before its line is taken away).
+    """
+    u, weight = legendre.leggauss(96)
+    kernel = np.exp(-0.5 * ((u[:, None] - u) / 2.0 / length) ** 2)
+    k = np.arange(2, order + 1)
+    project = (k + 0.5)[:, None] * legendre.legvander(u, order)[:, 2:].T * weight
+    values, vectors = np.linalg.eigh(project @ kernel @ project.T)
+    values, vectors = values[::-1], vectors[:, ::-1]
+    vectors = vectors * np.sign(vectors[np.argmax(np.abs(vectors), axis=0), np.arange(k.size)])
+    return np.asarray(vectors), np.maximum(values, SMALLEST_SHARE * values[0])
 
 
 @dataclass(frozen=True)
@@ -104,45 +139,89 @@ class SizeModel:
 
     Attributes
     ----------
+    typical : array, shape (p,)
+        Documented size of every unknown, its unit in all arrays.
+    root : array, shape (p, p)
+        Unknowns (in units of ``typical``) = ``root`` @ independent ones of reference variance 1: one block per error motion
+        (`smooth_shapes`), else the unit matrix.
+    blocks : tuple of arrays of int
+        Unknowns of each error motion of order 2 and more.
+    length : float
+        Correlation length of the error motions, strokes.
     names : tuple of str
-        What each number is: a class of unknowns (its log variance over the documented one), or ``fade`` and ``cut`` of the orders.
+        What each number of psi is: a class of unknowns (its log variance over the documented one), one error motion against its class, or
+        ``fade`` and ``cut`` of the shapes.
     design : array, shape (p, h)
     sd : array, shape (h,)
         Standard deviation of the normal hyperprior of each number, around 0 (the documented size).
     """
 
+    typical: F1
+    root: F2
+    blocks: tuple[NDArray[np.intp], ...]
+    length: float
     names: tuple[str, ...]
     design: F2
     sd: F1
 
 
-def size_model(terms: tuple[Term, ...], rest: tuple[str, ...]) -> SizeModel:
+def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...], rest_sd: F1, priors: Priors) -> SizeModel:
     """Classes of the smooth ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
 
-    All squareness errors share one size, all scales, all positioning errors of order 2 and more, all straightness errors, all angles, all
-    slopes of angles, and so on: what the data show of some tells how large the others may be. Sizes fade with the order k as
-    exp(-fade ln(k/2) - cut (k^2 - 4)/72) on top of `Priors.decay_order`, the same for all motions.
+    Positioning errors of order 2 and more share one size, all straightness errors, all angles, all slopes of angles, all lost motions,
+    cups and so on: what the data show of some tells how large the others may be; each error motion may differ from its class. How sizes
+    fade with the number of a shape is the same for all motions. Scales and squareness errors keep their documented size: there are only
+    three of each, and what is common to them (temperature) cannot be learned from how they differ.
     """
     kinds = [_class(t) for t in terms] + [_setup_class(n) for n in rest]
-    names = tuple(dict.fromkeys(k for k in kinds if k))
-    columns = [np.array([float(k == name) for k in kinds]) for name in names]
-    sd = [2.0 * np.log(SIZE_FACTOR)] * len(names)
-    order = np.array([t.order if t.order >= 2 else 2 for t in terms] + [2] * len(rest), dtype=np.float64)
+    motions = [t.motion if t.order >= 2 else "" for t in terms] + [""] * len(rest)
+    parts = [(kinds, 2.0 * np.log(SIZE_FACTOR)), (motions, 2.0 * np.log(MOTION_FACTOR))]
+    names, columns, sd = [], [], []
+    for labels, width in parts:
+        for name in dict.fromkeys(v for v in labels if v):
+            names.append(name)
+            columns.append(np.array([float(v == name) for v in labels]))
+            sd.append(width)
+    order = np.array([max(t.order, 2) for t in terms] + [2] * len(rest), dtype=np.float64)
     if order.max(initial=2.0) > 3.0:
-        names += ("fade", "cut")
+        names += ["fade", "cut"]
         columns += [-2.0 * np.log(order / 2.0), -(order**2 - 4.0) / 36.0]
         sd += [SPECTRUM_SD, SPECTRUM_SD]
     design = np.stack(columns, axis=1) if columns else np.zeros((len(kinds), 0))
-    return SizeModel(names, design, np.array(sd))
+    typical = np.concatenate([_reference(machine, terms, priors), rest_sd])
+    motion = np.array(motions)
+    blocks = tuple(np.flatnonzero(motion == m) for m in dict.fromkeys(motions) if m)
+    return with_length(SizeModel(typical, np.eye(typical.size), blocks, FIRST_LENGTH, tuple(names), design, np.array(sd)), FIRST_LENGTH)
+
+
+def with_length(model: SizeModel, length: float) -> SizeModel:
+    """The same for error motions of another correlation length, strokes."""
+    root = np.eye(model.typical.size)
+    for at in model.blocks:
+        shapes, variance = smooth_shapes(at.size + 1, length)
+        root[np.ix_(at, at)] = shapes * np.sqrt(variance)
+    return replace(model, root=root, length=length)
+
+
+def _reference(machine: Machine, terms: tuple[Term, ...], p: Priors) -> F1:
+    """Scales, squareness and slopes of angles: their prior; of a motion that bends: the size of the process."""
+    return np.array([_sd(machine, t, p) if t.order < 2 else _bend_size(t, p) for t in terms])
+
+
+def _bend_size(term: Term, p: Priors) -> float:
+    """Standard deviation of an error motion on its stroke."""
+    if term.component >= 3:
+        return p.angle_rad
+    return p.positioning_mm if term.component == term.axis else p.straightness_mm
 
 
 def _class(term: Term) -> str:
     if term.order == 0:
-        return "squareness"
+        return ""
     if term.component >= 3:
         return "angle slope" if term.order == 1 else "angle"
     if term.component == term.axis:
-        return "scale" if term.order == 1 else "positioning"
+        return "" if term.order == 1 else "positioning"
     return "straightness"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, special
+from scipy import special
 
 from models.arrays import F1, F2
 
@@ -26,17 +26,17 @@ class Outlier:
 
 
 def leverage(a: F2, root: F2) -> F1:
-    """Share of each reading's variance that the fit takes, shape (n,): rows of ``a`` times ``root``, a lower Cholesky factor's inverse.
+    """Share of each reading's variance that the fit takes, shape (n,): squared length of the rows of ``a @ root.T``.
 
     Parameters
     ----------
     a : array, shape (n, p)
-        Whitened design in units of the prior.
+        Whitened design.
     root : array, shape (p, p)
-        Lower Cholesky factor of information plus prior.
+        ``root.T @ root`` is the covariance of the unknowns.
     """
-    z = linalg.solve_triangular(root, a.T, lower=True, check_finite=False)
-    return np.asarray(np.einsum("pn,pn->n", z, z))
+    z = a @ root.T
+    return np.asarray(np.einsum("np,np->n", z, z))
 
 
 def threshold(n: int) -> float:
