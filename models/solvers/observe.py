@@ -110,7 +110,7 @@ def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, t
 class _Bar:
     """|p - c + D(p) - D(c) - offset + drift t| - R + length error: nominal bar R, nominal cup c, D the machine's deviation.
 
-    The spindle puts the cup down, so the cup carries the machine's deviation D(c) there, with the tool of the run; from which side the
+    The spindle puts the cup down, so the cup carries the machine's deviation D(c) there, with the tool of the set-up; from which side the
     axes came then is not known and belongs to the mounting offset.
     """
 

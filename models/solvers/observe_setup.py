@@ -52,9 +52,9 @@ def setup_unknowns(runs: tuple[RunData, ...], priors: Priors) -> Setup:
     Raises
     ------
     ValueError
-        Two runs of one set-up with different cups, beams or instruments: something was re-mounted, which is another set-up.
+        Two runs of one set-up with different cups, beams, tools or instruments: something was re-mounted, which is another set-up.
     """
-    firsts = _checked_setups(runs)
+    _check_setups(runs)
     spans = _bar_spans(runs)
     sd: dict[str, float] = {"laser_scale": priors.laser_scale} if any(r.kind == "laser" for r in runs) else {}
     for run in runs:
@@ -62,8 +62,7 @@ def setup_unknowns(runs: tuple[RunData, ...], priors: Priors) -> Setup:
             sd |= _bar_unknowns(run, sd, priors, spans[run.setup])
         else:
             sd |= _laser_unknowns(run, priors)
-    starts = {name: start for name, (start, _) in spans.items() if firsts[name].kind == "bar"}
-    return Setup(tuple(sd), np.array(list(sd.values())), starts)
+    return Setup(tuple(sd), np.array(list(sd.values())), {name: start for name, (start, _) in spans.items()})
 
 
 def _bar_unknowns(run: RunData, known: Mapping[str, float], priors: Priors, span_s: tuple[float, float]) -> dict[str, float]:
@@ -93,8 +92,8 @@ def _bar_spans(runs: tuple[RunData, ...]) -> dict[str, tuple[float, float]]:
     return spans
 
 
-def _checked_setups(runs: tuple[RunData, ...]) -> dict[str, RunData]:
-    """First run of every set-up; refuses what cannot be one mounting."""
+def _check_setups(runs: tuple[RunData, ...]) -> None:
+    """Refuse what cannot be one mounting."""
     firsts: dict[str, RunData] = {}
     for run in runs:
         first = firsts.setdefault(run.setup, run)
@@ -104,10 +103,16 @@ def _checked_setups(runs: tuple[RunData, ...]) -> dict[str, RunData]:
             what = "cup"
         elif run.beam is not None and first.beam is not None and np.abs(run.beam - first.beam).max() > SAME_BEAM:
             what = "beam"
+        elif not _same_tool(run.tool_mm, first.tool_mm):
+            what = "tool"
         else:
             continue
         raise ValueError(f"run {run.label}: set-up {run.setup} has another {what} than in run {first.label}; re-mounted is a new set-up")
-    return firsts
+
+
+def _same_tool(a: F1 | None, b: F1 | None) -> bool:
+    """Whether two runs use one tool: with another, the same axis positions meet another cup, and the mirror was taken off in between."""
+    return a is b if a is None or b is None else float(np.abs(a - b).max()) <= SAME_PLACE_MM
 
 
 def _bent(run: RunData) -> bool:

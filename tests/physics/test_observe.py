@@ -245,11 +245,13 @@ def test_a_drift_that_cannot_matter_is_no_unknown():
     assert sum(n.startswith("bar_drift") for n in setup_unknowns((run, later), Priors()).names) == 3
 
 
-@pytest.mark.parametrize("what", ["cup", "beam", "instrument"])
+@pytest.mark.parametrize("what", ["cup", "beam", "tool", "instrument"])
 def test_what_was_re_mounted_is_not_one_set_up(what):
     first, second = bar("a", arc("XY", 0.0, 6.0), setup="S"), bar("b", arc("XY", 0.0, 6.0), setup="S")
     if what == "cup":
         second = replace(second, centre_mm=CENTRE + 1.0)
+    elif what == "tool":
+        second = replace(second, tool_mm=np.array([0.0, 0.0, -200.0]))
     else:
         line = replace(laser("b", straight_line(BOX[:, 0], BOX[:, 1], 5)), setup="S")
         if what == "beam":
