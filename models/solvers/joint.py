@@ -63,6 +63,8 @@ class JointSolution:
         What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
         Of the terms up to ``order`` only.
+    prior_root : array, shape (p, p)
+        Factor of the prior covariance of the unknowns, root root^T: orders of one motion are alike, so ``prior_sd`` alone is not all of it.
     weight_per_mm2 : array, shape (n,)
         Weight of every reading in ``information``, run by run: robust weight over noise variance, alike neighbours counting as fewer.
     order : int
@@ -88,6 +90,7 @@ class JointSolution:
     setup: Setup
     prior_sd: F1
     information: F2
+    prior_root: F2
     weight_per_mm2: F1
     order: int
     noise_mm: dict[str, float]
@@ -201,6 +204,7 @@ def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderC
         setup=problem.setup,
         prior_sd=fit.prior_sd,
         information=information,
+        prior_root=fit.sizes.typical[:, None] * fit.sizes.root * c.half(fit.sizes),
         weight_per_mm2=(np.exp(-c.eta) / fit.thinning)[problem.readings.kind] * fit.weight / problem.sigma**2,
         order=order,
         noise_mm={k: float(problem.noise.sigma_mm[k] * factor[i]) for i, k in enumerate(KINDS) if whole.count[i] > 0},

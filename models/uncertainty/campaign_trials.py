@@ -57,36 +57,41 @@ class CampaignTrials:
         """Trials through the solver's gain, results (trials, 3 m)."""
         n = len(self.sources.solution.terms)
         readings = ((self.predict_per_unit[:, :n] @ self.response.gain[:n]).T * self._reading_sd()[:, None]).astype(np.float32)
-        others = [(s.name, (self.predict_per_unit @ s.factor).T) for s in self._others()]
+        others = self._others()
 
         def draw(rng: np.random.Generator, trials: int) -> F2:
             out: F2 = (self._readings(rng, trials) @ readings).astype(np.float64)  # single precision: seven digits of what is random
-            for name, factor in others:
-                out += self._drawn(name, rng, (trials, factor.shape[0])) @ factor
-            return self._scattered(out, rng) + self.value()
+            return self._with_others(out, others, rng)
 
         return draw
 
     def exact(self) -> Draw:
-        """Trials through the exact readings, iterated; everything that is no reading and no set-up stays linear."""
-        solution, r = self.sources.solution, self.response
-        n, gain, sd = len(solution.terms), self.response.gain, self._reading_sd()
+        """Trials through the exact readings, iterated; everything that is no reading stays linear."""
+        solution, gain, sd = self.sources.solution, self.response.gain, self._reading_sd()
+        n = len(solution.terms)
         measured = np.concatenate([run.deviation_mm for run in solution.data])
-        others = self._others()
         resting = self._settled(measured, gain, solution.estimate.theta)
+        others = self._others()
 
         def draw(rng: np.random.Generator, trials: int) -> F2:
             noise = self._readings(rng, trials) * sd
-            shift = np.zeros((trials, len(self.sources.terms)))
-            for source in others:
-                shift += self._drawn(source.name, rng, (trials, source.factor.shape[1])) @ source.factor.T
+            out = np.empty((trials, len(self.predict_per_unit)))
             for t in range(trials):
-                start = resting + gain @ noise[t]
-                shift[t, :n] += self._settled(measured + noise[t], gain, start)[:n] - resting[:n]
-            return self._scattered(shift @ self.predict_per_unit.T, rng) + self.value()
+                moved = self._settled(measured + noise[t], gain, resting + gain @ noise[t]) - resting
+                out[t] = self.predict_per_unit[:, :n] @ moved[:n]
+            return self._with_others(out, others, rng)
 
-        assert r.weight.size == measured.size
         return draw
+
+    def _with_others(self, out: F2, others: list[tuple[str, F2]], rng: np.random.Generator) -> F2:
+        """What the other sources do to the results, drawn and added in place, about the prediction itself."""
+        for name, factor in others:
+            out += self._drawn(name, rng, (len(out), len(factor))) @ factor
+        scatter = self.sources.inputs.repeatability_mm if self.sources.inputs.single_approach else 0.0
+        if scatter:
+            out += scatter * self._drawn("repeatability", rng, (len(out), out.shape[1]))
+        out += self.value()
+        return out
 
     def _settled(self, measured: F1, gain: F2, theta: F1) -> F1:
         """The solver's iteration to the exact model, with its weights and sizes."""
@@ -94,8 +99,18 @@ class CampaignTrials:
             theta = gain @ (measured - _predicted(self.sources.solution, theta) + self.response.design @ theta)
         return np.asarray(theta)
 
-    def _others(self) -> list[_Factor]:
-        return [_Factor(s.name, s.factor) for s in self.sources.sources if s.name not in (*READINGS, "repeatability")]
+    def _others(self) -> list[tuple[str, F2]]:
+        """Sources that are no noise of readings, each as a factor (inputs, 3 m) of the results."""
+        b, out = self.predict_per_unit, []
+        for s in self.sources.sources:
+            if s.name in (*READINGS, "repeatability"):
+                continue
+            factor = (b @ s.factor).T
+            if s.less is not None:
+                value, vector = np.linalg.eigh(factor.T @ factor - (b @ s.less) @ (b @ s.less).T)
+                factor = (vector * np.sqrt(np.maximum(value, 0.0))).T
+            out.append((s.name, factor))
+        return out
 
     def _reading_sd(self) -> F1:
         w = self.response.weight
@@ -115,17 +130,6 @@ class CampaignTrials:
         out = np.empty(shape)
         self.distributions.get(name, NORMAL).fill(rng, out)
         return out
-
-    def _scattered(self, out: F2, rng: np.random.Generator) -> F2:
-        """Repeatability of one approach on top, where the prediction is of one."""
-        scatter = self.sources.inputs.repeatability_mm if self.sources.inputs.single_approach else 0.0
-        return out + scatter * self._drawn("repeatability", rng, (out.shape[0], out.shape[1])) if scatter else out
-
-
-@dataclass(frozen=True)
-class _Factor:
-    name: str
-    factor: F2
 
 
 def _predicted(solution: JointSolution, theta: F1) -> F1:

@@ -46,7 +46,7 @@ def order_source(solution: JointSolution, r: Response, orders_above: int) -> tup
 
 def chosen_order(solution: JointSolution) -> int:
     """Legendre order that the data support; terms of the solution above it are there only to be allowed for."""
-    return int(getattr(solution, "order", 0)) or max((t.order for t in solution.terms), default=0)
+    return solution.order
 
 
 def omitted_terms(order: int, orders_above: int) -> tuple[Term, ...]:

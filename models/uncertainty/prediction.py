@@ -122,6 +122,15 @@ def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFre
     for k, source in enumerate(sources.sources):
         influence = d @ source.factor
         share = influence @ np.swapaxes(influence, 1, 2) + source.scatter_mm**2 * np.eye(3)
+        if source.less is not None:
+            off = d @ source.less
+            share = _not_negative(share - off @ np.swapaxes(off, 1, 2))
         covariance += share
         variance[k] = np.einsum("mii->mi", share)
     return d @ sources.coefficients, covariance, variance
+
+
+def _not_negative(covariance: F3) -> F3:
+    """The nearest covariance without negative variances, (m, 3, 3): that sizes are uncertain must not make any prediction better."""
+    value, vector = np.linalg.eigh(covariance)
+    return np.asarray((vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2))

@@ -26,21 +26,22 @@ class Response:
         Instrument of each reading.
     covariance : array, shape (p, p)
         Posterior covariance for those sizes: (A^T W A + P^-1)^-1.
-    widening : array, shape (p, q)
-        Factor of what the solution's covariance holds on top: the sizes were estimated too, or the residuals are larger than stated.
+    pull : array, shape (p, p)
+        Change of every unknown per standard deviation of each independent part of the prior (`prior_factor`): pull pull^T is the prior's
+        share C P^-1 C.
+    widening : array, shape (p, p)
+        What the solution's covariance holds on top because the sizes were estimated too. Not positive in every direction.
     dof : float
-        Degrees of freedom of the residuals.
-    noise_estimated : bool
-        Whether the noise was estimated from these residuals (then it has ``dof`` degrees of freedom), or stated.
+        Degrees of freedom of the residuals, from which the noise was estimated.
     """
 
     design: F2
     weight: F1
     kind: np.ndarray[tuple[int, ...], np.dtype[np.str_]]
     covariance: F2
+    pull: F2
     widening: F2
     dof: float
-    noise_estimated: bool
 
     def of_readings(self, error_mm: F1) -> F1:
         """Change of every unknown when each reading is wrong by ``error_mm`` (n,): C A^T W e, shape (p,)."""
@@ -62,35 +63,20 @@ class Response:
 
 
 def response(solution: JointSolution) -> Response:
-    """Design, weights and covariance of a solution, from its own runs, set-up and weights."""
+    """Design, weights and covariance of a solution, from its own runs, set-up, weights and prior."""
     design = np.concatenate([run_design(solution.machine, solution.terms, run, solution.setup) for run in solution.data])
-    prior = solution.prior_sd
-    known = np.isfinite(prior)
-    diagonal = np.diag(solution.information)
-    scale = np.where(known, prior, 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
-    normal = solution.information * np.outer(scale, scale) + np.diag(known.astype(np.float64))
-    lower = linalg.cholesky(normal, lower=True)
-    root = scale[:, None] * linalg.solve_triangular(lower, np.eye(len(prior)), lower=True).T
-    covariance = root @ root.T
     kind = np.concatenate([np.full(run.deviation_mm.size, run.kind) for run in solution.data])
-    widening = _widening(solution.estimate.covariance, covariance, scale)
-    return Response(
-        design, reading_weights(solution), kind, covariance, widening, solution.estimate.dof, bool(getattr(solution, "noise_mm", None))
-    )
+    root = prior_factor(solution.prior_root)
+    normal = root.T @ solution.information @ root
+    np.fill_diagonal(normal, normal.diagonal() + 1.0)
+    inner = linalg.solve_triangular(linalg.cholesky(normal, lower=True), root.T, lower=True)
+    pull = linalg.cho_solve((linalg.cholesky(normal, lower=True), True), root.T).T  # C R^-T
+    covariance = inner.T @ inner
+    widening = solution.estimate.covariance - covariance
+    return Response(design, solution.weight_per_mm2, kind, covariance, pull, widening, solution.estimate.dof)
 
 
-def _widening(whole: F2, covariance: F2, scale: F1) -> F2:
-    """Factor of what is left of the solution's covariance; nothing below a part in 10^9 of the prior."""
-    value, vector = linalg.eigh((whole - covariance) / np.outer(scale, scale))
-    kept = value > 1e-9
-    return np.asarray(scale[:, None] * vector[:, kept] * np.sqrt(value[kept]))
-
-
-def reading_weights(solution: JointSolution) -> F1:
-    """Weight of each reading of the campaign in the solution, 1/mm^2, shape (n,)."""
-    stated = getattr(solution, "weight_per_mm2", None)
-    if stated is not None:
-        return np.asarray(stated)
-    return np.concatenate(
-        [np.full(run.deviation_mm.size, fit.expected_mm**-2) for fit, run in zip(solution.runs, solution.data, strict=True)]
-    )
+def prior_factor(root: F2) -> F2:
+    """Triangular factor of the prior covariance root root^T: what an unknown adds to those before it, orders of a motion from low to
+    high.""" scale = np.linalg.norm(root, axis=1)
+    return np.asarray(scale[:, None] * linalg.qr((root / scale[:, None]).T, mode="r")[0].T)

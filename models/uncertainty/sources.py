@@ -8,7 +8,7 @@ not know.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
@@ -57,12 +57,16 @@ class Source:
         Degrees of freedom of its size; inf where it is stated.
     scatter_mm : float
         Standard deviation that comes on top at each point, per component.
+    less : array, shape (P, r), optional
+        Factor of what is to be taken off: only for `estimated_sizes`, which may never make a prediction better
+        (`models.uncertainty.prediction`).
     """
 
     name: str
     factor: F2
     dof: float = float("inf")
     scatter_mm: float = 0.0
+    less: F2 | None = None
 
 
 @dataclass(frozen=True)
@@ -107,13 +111,20 @@ def error_sources(solution: JointSolution, inputs: Inputs | None = None) -> Erro
     found = [*_noise(r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
     if inputs.single_approach:
         found.append(Source("repeatability", np.zeros((n, 0)), inputs.repeatability_dof, inputs.repeatability_mm))
-    found = _merged([Source(s.name, s.factor[:n], s.dof, s.scatter_mm) for s in found])
     terms, extra = order_source(solution, r, inputs.orders_above)
     above = len(terms) - n
-    sources = [Source(s.name, np.pad(s.factor, ((0, above), (0, 0))), s.dof, s.scatter_mm) for s in found]
-    if above:
-        sources = _merged([*sources, Source("model_order", extra)])
-    return ErrorSources(solution, inputs, terms, np.concatenate([solution.coefficients, np.zeros(above)]), tuple(sources))
+    parts = [replace(s, factor=_padded(s.factor[:n], above)) for s in found]
+    parts.append(Source("model_order", extra))
+    wider = _widening(r, n)
+    assert wider.less is not None
+    wider = replace(wider, factor=_padded(wider.factor, above), less=_padded(wider.less, above))
+    coefficients = np.concatenate([solution.coefficients, np.zeros(above)])
+    return ErrorSources(solution, inputs, terms, coefficients, (*_merged(parts), wider))
+
+
+def _padded(factor: F2, above: int) -> F2:
+    """With rows of zeros for the terms above."""
+    return np.pad(factor, ((0, above), (0, 0)))
 
 
 def _merged(sources: list[Source]) -> list[Source]:
@@ -121,6 +132,8 @@ def _merged(sources: list[Source]) -> list[Source]:
     out: dict[str, Source] = {}
     for s in sources:
         have = out.get(s.name)
+        if s.factor.shape[1] == 0 and s.scatter_mm == 0.0:
+            continue
         if have is None:
             out[s.name] = s
         else:
@@ -139,7 +152,6 @@ def _compressed(factor: F2) -> F2:
 def _noise(r: Response, inputs: Inputs) -> list[Source]:
     """Scatter of the readings per instrument, the machine's repeatability told apart, and that sizes were estimated at all."""
     out = []
-    dof = r.dof if r.noise_estimated else float("inf")
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
     share = np.full(r.weight.size, inputs.repeatability_mm**2)
@@ -147,24 +159,29 @@ def _noise(r: Response, inputs: Inputs) -> list[Source]:
         seen = r.kind == kind
         if seen.any():
             left = None if inputs.repeatability_mm == 0 else np.maximum(variance - share, 0.0)
-            out.append(Source(f"{kind}_noise", r.noise_factor(left, seen), dof))
+            out.append(Source(f"{kind}_noise", r.noise_factor(left, seen), r.dof))
     if inputs.repeatability_mm > 0:
         out.append(Source("repeatability", r.noise_factor(share, everywhere), inputs.repeatability_dof))
-    if r.widening.shape[1]:
-        out.append(Source("estimated_sizes", r.widening, r.dof))
     return out
 
 
+def _widening(r: Response, n: int) -> Source:
+    """That sizes were estimated at all: the covariance on top of what holds for the estimated ones, as plus and minus."""
+    whole = r.widening[:n, :n]
+    scale = np.sqrt(np.diag(r.covariance)[:n])
+    value, vector = linalg.eigh(whole / np.outer(scale, scale))
+    roots = scale[:, None] * vector * np.sqrt(np.abs(value))
+    return Source("estimated_sizes", roots[:, value > 0], r.dof, less=roots[:, value < 0])
+
+
 def _priors(solution: JointSolution, r: Response) -> list[Source]:
-    """Influence of every unknown's prior mean on the estimate, C e_i / p_i per standard deviation p_i of the prior."""
+    """Influence of the prior of every unknown on the estimate; of correlated ones that of what each adds to those before it."""
     order = chosen_order(solution)
     above = {t.name for t in solution.terms if t.order > order}
     terms = {t.name for t in solution.terms}
     names = np.array(["model_order" if n in above else _prior_source(n, n in terms) for n in solution.estimate.names])
-    known = np.isfinite(solution.prior_sd)
-    per_sd = r.covariance[:, known] / solution.prior_sd[known]
-    which = names[known]
-    return [Source(s, per_sd[:, which == s]) for s in ("bar_length", "wavelength", "setup", "prior", "model_order") if (which == s).any()]
+    groups = ("bar_length", "wavelength", "setup", "prior", "model_order")
+    return [Source(s, r.pull[:, names == s]) for s in groups if (names == s).any()]
 
 
 def _prior_source(name: str, is_term: bool) -> str:
