@@ -77,6 +77,6 @@ def response(solution: JointSolution) -> Response:
 
 
 def prior_factor(root: F2) -> F2:
-    """Triangular factor of the prior covariance root root^T: what an unknown adds to those before it, orders of a motion from low to
-    high.""" scale = np.linalg.norm(root, axis=1)
+    """Triangular factor of the prior covariance root root^T: what each unknown adds to those before it, low orders of a motion first."""
+    scale = np.linalg.norm(root, axis=1)
     return np.asarray(scale[:, None] * linalg.qr((root / scale[:, None]).T, mode="r")[0].T)
