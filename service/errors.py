@@ -70,6 +70,12 @@ class InstrumentsDisagree(AbbeError):
     code = "SOL-002"
 
 
+class CampaignRefused(AbbeError):
+    """A run of the campaign cannot be what it says: another unit, exchanged axes, a copy, another machine. Nothing was solved."""
+
+    code = "SOL-003"
+
+
 class TableRefused(AbbeError):
     """A table breaks a limit (value, step, change). Nothing was written."""
 

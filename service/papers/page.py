@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import tempfile
 from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import version
@@ -13,13 +11,13 @@ from pathlib import Path
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.errors import FileFormatError
 from service.papers.check import Check
 from service.papers.pictures import figures
 from service.papers.row import Row
 from service.papers.run import PaperResult
 from service.papers.words import NONE, check_cells, computed_cells, note, short
 from service.report.numbers import printable
+from service.report.page_file import write_page as write_text
 from service.report.palette import style_rules
 from service.report.plots.signed import signed_rules
 
@@ -37,23 +35,7 @@ def write_page(found: Sequence[PaperResult], target: Path) -> None:
     FileFormatError
         The file cannot be written.
     """
-    text = render_page(found)
-    aside: Path | None = None
-    try:
-        if target.is_dir():
-            raise IsADirectoryError(21, "it is a folder")
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
-        aside = Path(name)
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.chmod(0o644)  # mkstemp makes private files, this one is for others
-        aside.replace(target)
-    except OSError as error:
-        if aside is not None:
-            aside.unlink(missing_ok=True)
-        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a folder that may be written") from None
+    write_text(render_page(found), target)
 
 
 def render_page(found: Sequence[PaperResult]) -> str:

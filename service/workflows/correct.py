@@ -22,7 +22,8 @@ from service.storage.store import Store
 from service.workflows.compensate import Base, Pushed, Pusher, read_base
 from service.workflows.measure import measure
 from service.workflows.recover import recover
-from service.workflows.solve import Solved, helix_misfit, solution_doc, solve_runs
+from service.workflows.solve import Solved, helix_misfit, solve_runs
+from service.workflows.solve_report import solution_doc
 from service.workflows.tables import added
 from service.workflows.verify import Decision, Figures, decide, figure_rows, figures
 

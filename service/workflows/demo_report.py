@@ -11,6 +11,7 @@ import numpy as np
 from models.compensation.summary import SCALE_NOTE, mean_linear
 from models.compensation.tables import NineTables
 from models.solvers.joint import JointSolution
+from models.solvers.observability import observability_of
 from service.report.model import (
     ArrowField,
     Contribution,
@@ -23,7 +24,6 @@ from service.report.model import (
 )
 from service.workflows.correct import Correction
 from service.workflows.demo import DemoResult
-from service.workflows.solve import not_observable
 from service.workflows.verify import Figures, figure_rows
 
 TRUTH = "sealed truth of the simulator"
@@ -163,7 +163,7 @@ def demo_report(result: DemoResult) -> DemoReport:
         accepted=c.decision.keep,
         summary=summary_rows(result),
         parameters=parameter_rows(joint),
-        not_observable=not_observable(joint),
+        not_observable=[g.text for g in observability_of(joint).hidden],
         runs=_runs(c),
         residuals=[ResidualSeries(r.label, "reading", list(range(r.residual_mm.size)), (r.residual_mm * 1e3).tolist()) for r in joint.runs],
         tables=_tables(c.tables),

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from importlib.metadata import version
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from models.compensation.summary import SCALE_NOTE, mean_linear
 from models.solvers.helix import HelixSolution, fit_run
-from models.solvers.joint import JointSolution, implausible, solve_joint
+from models.solvers.joint import JointSolution, Model, implausible, solve_joint
 from models.solvers.observations import RunData, nominal_reading
 from models.solvers.observe import bar_normals, setup_unknowns
 from models.solvers.priors import U_WAVELENGTH, Priors
 from models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
-from service.errors import InstrumentsDisagree, NotObservable
+from service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from service.runs.observations import bar_noise_mm, run_data
 from service.site import Site
+from service.workflows.campaign_checks import Finding, check_files, check_readings, copies, refuse
+from service.workflows.provenance import run_digest
 
-LEGENDRE_ORDER = 9
 LASER_SIGMA_MM = 3e-4
-FLOOR_MM = 3e-4
-"""What smooth functions of this order do not follow: neither instrument is trusted below it."""
 SEEN_SHARE = 0.2
 """A parameter whose data explain less than this share of its prior variance is listed as not seen."""
+ALL_READINGS = 10**9
+PER_UNKNOWN = 2
+"""Readings that a campaign needs for every unknown that only readings can tell."""
+SIX, TWENTY_ONE = 6 + 3, 21 + 3 + 18 + 3
+"""Unknowns of the smallest model of each kind: six, or 21 motions with slope and curvature; and the lost motion of three axes."""
 HELIX_NOTE = (
     "Ten-parameter figures describe the machine about that sphere only, from that run alone; over the volume the joint solution is the one "
     "to use."
@@ -33,42 +36,92 @@ STEP_NOTE = (
     "Step-diagonal figures are the paper's, for comparison: their uncertainty holds reading noise and the laser's wavelength only. Tilt of "
     "the mirrors and angular errors of the axes bias them and are not in it; the joint solution knows both and is the one to use."
 )
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Solved:
-    """Joint solution plus the papers' own solutions of the same runs, for comparison."""
+    """Joint solution plus the papers' own solutions of the same runs, for comparison.
+
+    ``flags``: what is odd about single runs without being wrong for certain. ``digests``: a hash of every run's data, by its name.
+    """
 
     joint: JointSolution
     helices: dict[str, HelixSolution]
     step_totals: dict[str, dict[str, float]]
     noise_bar_mm: float
+    flags: tuple[Finding, ...] = ()
+    digests: dict[str, str] = field(default_factory=dict)
 
 
-def solve_runs(site: Site, runs: list[dict[str, Any]]) -> Solved:
-    """Solve ``abbe-run/1`` objects together (role ``identify`` only).
+def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid21", say: Say | None = None) -> Solved:
+    """Solve ``abbe-run/1`` objects together (role ``identify`` only), after it was checked that each can be what it says.
 
     Raises
     ------
     NotObservable
-        There is no run to identify from, or only one kind of evidence for too many unknowns.
+        There is no run to identify from.
+    CampaignRefused
+        A run is in another unit, has exchanged axes, is a copy, or is of another machine; or there are too few readings for the model.
+    InstrumentsDisagree
+        A bar, cup or mirror would have to be impossibly wrong.
     """
+    say = say or _silent
     used = [r for r in runs if r["role"] == "identify"]
     if not used:
         raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
+    say(f"{len(used)} runs: units, axes, copies, machine")
+    flags = check_campaign(site, used, [r for r in runs if r["role"] == "holdout"], model)
     bars = [r for r in used if r["test"].startswith("ballbar")]
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
-    joint = solve_joint(
-        site.machine,
-        data,
-        order=LEGENDRE_ORDER,
-        sigma_mm={"bar": max(noise, 1e-4), "laser": LASER_SIGMA_MM},
-        floor_mm={"bar": FLOOR_MM, "laser": FLOOR_MM},
-    )
+    joint = solve_joint(site.machine, data, model=model, progress=say)
     check_instruments(joint, data)
-    helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.kind == "bar"}
-    return Solved(joint, helices, step_diagonals(used), noise)
+    spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not tell ten parameters
+    helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
+    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), {r["run_id"]: run_digest(r) for r in used})
+
+
+def _silent(_: str) -> None:
+    return None
+
+
+def check_campaign(site: Site, used: list[dict[str, Any]], others: list[dict[str, Any]], model: Model) -> list[Finding]:
+    """Flags of the runs that are to be solved; ``others`` are only looked at for copies.
+
+    Raises
+    ------
+    CampaignRefused
+        One line: which run, what is wrong, what to do.
+    """
+    flags = check_files(site.doc, used)
+    known = {f.run for f in flags}
+    flags += [f for f in copies([*used, *others]) if f.run not in known]
+    refuse(flags)
+    data = [run_data(r, blocks=ALL_READINGS) for r in used]
+    check_enough(data, model)
+    flags += check_readings(site.machine, data)
+    refuse(flags)
+    return flags
+
+
+def check_enough(data: list[RunData], model: Model) -> None:
+    """Refuse a campaign with fewer than two readings for every unknown that only readings can tell.
+
+    Raises
+    ------
+    CampaignRefused
+        How many there are, how many are needed, and which run has the fewest.
+    """
+    unknowns = (TWENTY_ONE if model == "rigid21" else SIX) + sum(4 if r.kind == "bar" else 2 for r in data)
+    count = sum(r.deviation_mm.size for r in data)
+    if count < PER_UNKNOWN * unknowns:
+        fewest = min(data, key=lambda r: r.deviation_mm.size)
+        raise CampaignRefused(
+            f"{count} readings are too few for the {unknowns} unknowns of {model} and the set-ups ({PER_UNKNOWN * unknowns} are needed); "
+            f"run {fewest.label} has the fewest, {fewest.deviation_mm.size}",
+            "measure more positions" + (", or use --model rigid6" if model != "rigid6" else "") + "; nothing was stored",
+        )
 
 
 def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> None:
@@ -144,33 +197,6 @@ def _apart(motions: tuple[str, ...], orders: list[int]) -> str:
         return f"{motions[0]} ({span}) leaves no trace in these runs"
     count = f"{len(orders)} combination{'s' if len(orders) > 1 else ''}"
     return f"{', '.join(motions[:-1])} and {motions[-1]} cannot be told apart ({span}, {count})"
-
-
-def solution_doc(solved: Solved) -> dict[str, Any]:
-    """The solution as it is stored: parameters with uncertainty in SI-like units, set-up, ranks, per-run residuals, versions."""
-    joint = solved.joint
-    e = joint.estimate
-    return {
-        "model": f"rigid21/legendre{LEGENDRE_ORDER}",
-        "abbe": version("abbe"),
-        "parameters": {n: {"value": e.value(n), "u": e.u(n), "data_share": float(s)} for n, s in zip(e.names, e.data_share, strict=True)},
-        "mean_over_volume": {p.name: {"value": p.value, "u": p.u} for p in mean_linear(joint)},
-        "mean_over_volume_note": f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
-        "rank": {"rank": joint.identifiability.rank, "of": joint.identifiability.n_parameters},
-        "not_observable": not_observable(joint),
-        "variance_factor": e.variance_factor,
-        "chi2": e.chi2,
-        "dof": e.dof,
-        "runs": {r.label: {"rms_um": r.rms_mm * 1e3} for r in joint.runs},
-        "noise_bar_mm": solved.noise_bar_mm,
-        "ten_parameter_helix": {
-            label: {n: {"value": h.estimate.value(n), "u": h.estimate.u(n)} for n in h.estimate.names}
-            for label, h in solved.helices.items()
-        },
-        "ten_parameter_helix_note": HELIX_NOTE,
-        "step_diagonals": solved.step_totals,
-        "step_diagonals_note": STEP_NOTE,
-    }
 
 
 def helix_misfit(solved: Solved, run: dict[str, Any]) -> float:

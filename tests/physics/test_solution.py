@@ -12,7 +12,8 @@ from service.devices.session import DeviceUrls
 from service.errors import InstrumentsDisagree
 from service.site import Site, machine_doc
 from service.workflows.demo_report import parameter_rows
-from service.workflows.solve import Solved, solution_doc, solve_runs
+from service.workflows.solve import Solved, solve_runs
+from service.workflows.solve_report import account, solution_doc
 from tests.physics.truth import MACHINE, Truth
 
 SITE = Site("sim", MACHINE, machine_doc("sim", MACHINE), DeviceUrls())
@@ -63,7 +64,8 @@ def test_every_step_diagonal_figure_has_its_uncertainty_and_says_what_is_not_in_
 
 
 def test_words_on_the_screen_say_the_same(solved, capsys):
-    _print(solved)
+    told = account(solved)
+    _print(told, {"campaign": "c1"} | solution_doc(told))
     text = " ".join(capsys.readouterr().out.split())
     for words in ("about this sphere only", "Tilt of the mirrors", "temperature", "step diagonals XYZ", "one tool length"):
         assert words in text

@@ -1,0 +1,35 @@
+"""A page on the disk: written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from service.errors import FileFormatError
+
+
+def write_page(text: str, target: Path) -> None:
+    """Write a page beside its place and move it there: a reader sees the old file or the whole new one.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+    """
+    aside: Path | None = None
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(21, "it is a folder")
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
+        aside = Path(name)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.chmod(0o644)  # mkstemp makes private files, this one is for others
+        aside.replace(target)
+    except OSError as error:
+        if aside is not None:
+            aside.unlink(missing_ok=True)
+        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a folder that may be written") from None

@@ -1,0 +1,211 @@
+"""Is every run of a campaign what it says? Before anything is solved, each mistake is one line: which run, what is wrong, what to do.
+
+First geometry (do the points lie where the set-up says?), then copies, then what the readings say of each other
+(`models.solvers.plausibility`). A finding either refuses the campaign or stands as a flag beside the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from models.machine import Machine
+from models.solvers.observations import RunData
+from models.solvers.plausibility import Suspect, suspects
+from service.errors import CampaignRefused
+from service.workflows.run_geometry import geometry
+
+Doc = dict[str, Any]
+LARGEST_MM = 2.0
+"""No ball-bar and no machine worth a laser deviates by more: such numbers are in another unit."""
+COPIED_SHARE = 0.98
+"""Runs share no more readings than this, positions included, unless one is a copy: noise differs every time."""
+FEWEST_BAR = 20
+PER_TURN = 8
+OTHER_RATIO = 8.0
+"""A run that misses the others' prediction by so many times what is expected is another machine's (`OTHER_MM` too); below it is a flag."""
+OTHER_MM = 4e-3
+CLEAN_RATIO = 3.0
+
+_READINGS = {
+    "um": "its deviations fit the other runs when divided by 1000: deviation_mm holds µm",
+    "inch": "its deviations fit the other runs when multiplied by 25.4: deviation_mm holds inches",
+    "sign": "its deviations fit the other runs with the other sign",
+    "mm_as_um": "its deviations fit the other runs when multiplied by 1000: deviation_mm holds m, or was divided once too often",
+    "mm_as_inch": "its deviations fit the other runs when divided by 25.4: deviation_mm was multiplied by 25.4 once too often",
+    "swap_xy": "its deviations fit the other runs with the columns x_mm and y_mm exchanged",
+    "swap_yz": "its deviations fit the other runs with the columns y_mm and z_mm exchanged",
+    "swap_xz": "its deviations fit the other runs with the columns x_mm and z_mm exchanged",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong with one run (or with two that contradict each other).
+
+    ``refuse``: nothing may be solved from such a campaign; otherwise it is a flag beside the result.
+    """
+
+    run: str
+    what: str
+    remedy: str
+    refuse: bool
+
+    @property
+    def line(self) -> str:
+        """One line for people."""
+        return f"run {self.run}: {self.what} - {self.remedy}"
+
+
+def refuse(findings: Sequence[Finding]) -> None:
+    """Stop at the first finding that refuses the campaign.
+
+    Raises
+    ------
+    CampaignRefused
+        Its line; how many more there are.
+    """
+    bad = [f for f in findings if f.refuse]
+    if bad:
+        more = f" (and {len(bad) - 1} more: {', '.join(sorted({f.run for f in bad[1:]}))})" if len(bad) > 1 else ""
+        raise CampaignRefused(f"run {bad[0].run}: {bad[0].what}{more}", f"{bad[0].remedy}; nothing was stored")
+
+
+def check_files(machine: Doc, runs: Sequence[Doc]) -> list[Finding]:
+    """What single runs and their comparison show without any model: machine, geometry, units, time, copies, too few readings.
+
+    Parameters
+    ----------
+    machine : dict
+        The campaign's machine object.
+    runs : sequence of dict
+        ``abbe-run/1`` objects with readings.
+    """
+    out = _twice([str(r["run_id"]) for r in runs])
+    for run in runs:
+        out += _other_machine(machine, run) or geometry_findings(machine, run)
+        out += _readings(run)
+    return out + copies(runs)
+
+
+def geometry_findings(machine: Doc, run: Doc) -> list[Finding]:
+    """Whether the points of a run lie where its set-up says, inside the strokes."""
+    what = geometry(machine, run)
+    return [Finding(run["run_id"], what.text, what.remedy, what.refuse)] if what else []
+
+
+def _twice(names: list[str]) -> list[Finding]:
+    twice = sorted({n for n in names if names.count(n) > 1})
+    return [Finding(n, "two runs have this run_id", "give each run its own", True) for n in twice]
+
+
+def _other_machine(machine: Doc, run: Doc) -> list[Finding]:
+    theirs = run.get("machine") or {}
+    for key, word in (("name", "name"), ("chain", "chain"), ("stroke_mm", "strokes"), ("pivots_mm", "pivots"), ("tool_mm", "tool")):
+        ours, other = machine.get(key), theirs.get(key)
+        if ours is not None and other is not None and not _same(ours, other):
+            what = f"measured on another machine: {word} {_short(other)}, the campaign's is {_short(ours)}"
+            return [Finding(run["run_id"], what, "leave it out (--without), or correct its machine object", True)]
+    return []
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, dict) and isinstance(b, dict):
+        return all(_same(a.get(k), b.get(k)) for k in a.keys() | b.keys() if a.get(k) is not None and b.get(k) is not None)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        return abs(a - b) <= 1e-6
+    return bool(a == b)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {_short(v)}" for k, v in value.items())
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_short(v) for v in value) + "]"
+    return f"{value:g}" if isinstance(value, int | float) else repr(value)
+
+
+def _readings(run: Doc) -> list[Finding]:
+    """Time, size and number of the readings of one run."""
+    label, columns = run["run_id"], run["columns"]
+    y, t = (np.asarray(columns[k], dtype=np.float64) for k in ("deviation_mm", "t_s"))
+    valid = np.asarray(columns.get("valid", np.ones(y.size))).astype(bool)
+    if not (np.isfinite(y[valid]).all() and np.isfinite(t).all()):
+        return [Finding(label, "a reading or a time is not a finite number", "mark it with valid 0 or leave the run out (--without)", True)]
+    if (np.diff(t) < 0).any():
+        row = int(np.argmax(np.diff(t) < 0)) + 2
+        return [Finding(label, f"t_s runs back at row {row}", "put the rows in the order in which they were measured", True)]
+    out = []
+    largest = float(np.abs(y[valid]).max(initial=0.0))
+    if largest > LARGEST_MM:
+        unit = " they look like µm" if largest < 1e3 else " no unit makes a machine of it"
+        out.append(Finding(label, f"deviations up to {largest:.3g} mm:{unit}", "write deviation_mm in mm", True))
+    return out + _too_few(run, int(valid.sum()))
+
+
+def _too_few(run: Doc, count: int) -> list[Finding]:
+    """Few readings are a flag: fewer than 10 are refused where runs become arrays (`service.runs.observations`)."""
+    turns = float(run["setup"].get("turns") or 1.0)
+    wanted = max(FEWEST_BAR, int(np.ceil(PER_TURN * turns)))
+    if not run["test"].startswith("ballbar") or not 10 <= count < wanted:
+        return []
+    what = (
+        f"only {count} valid readings on {turns:g} turns: cup, bar length and lost motion take most of what they tell ({wanted} are needed)"
+    )
+    return [Finding(run["run_id"], what, "measure it again with a higher rate", False)]
+
+
+def copies(runs: Sequence[Doc]) -> list[Finding]:
+    """Runs whose readings stand in another run already, whatever they are called and whenever they are said to be measured."""
+    keys = [_row_keys(r) for r in runs]
+    out = []
+    for k, run in enumerate(runs):
+        for j in range(k):
+            short, long = sorted((keys[j], keys[k]), key=lambda v: v.size)
+            if short.size and np.isin(short, long).mean() >= COPIED_SHARE:
+                what = f"its readings are those of run {runs[j]['run_id']}: one measurement would count twice"
+                out.append(Finding(run["run_id"], what, "leave it out (--without), or export it again", True))
+                break
+    return out
+
+
+def _row_keys(run: Doc) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    """One number per reading made of its position and deviation; none for a run whose deviations are all the same."""
+    columns = run["columns"]
+    y = np.asarray(columns["deviation_mm"], dtype=np.float64)
+    if y.size == 0 or not np.isfinite(y).all() or float(np.ptp(y)) == 0.0:
+        return np.zeros(0, dtype=np.int64)
+    key = np.rint(y * 1e8).astype(np.int64) * 1_000_003
+    for c, prime in (("x_mm", 7_368_787), ("y_mm", 15_485_863), ("z_mm", 32_452_843)):
+        key = key * 31 + np.rint(np.asarray(columns[c], dtype=np.float64) * 1e5).astype(np.int64) * prime
+    return key
+
+
+def check_readings(machine: Machine, data: Sequence[RunData]) -> list[Finding]:
+    """Runs whose readings contradict those of the others (`models.solvers.plausibility.suspects`)."""
+    found = suspects(machine, data)
+    return [_suspect(s, len(data), alone=len(found) == 1) for s in found]
+
+
+def _suspect(s: Suspect, count: int, *, alone: bool) -> Finding:
+    if s.tied or count < 3:
+        others = " and ".join((s.run, *s.tied)) if s.tied else s.run
+        what = f"contradicts the others ({_misfit(s)})" if not s.tied else f"one of {others} contradicts the other ({_misfit(s)})"
+        return Finding(s.run, what, "measure them again; with so few runs nobody can say which is wrong", True)
+    if s.cause != "other":
+        return Finding(s.run, f"{_READINGS[s.cause]} ({_misfit(s)})", "correct the file, or leave it out (--without)", True)
+    gross = alone and s.misfit_mm > OTHER_RATIO * s.expected_mm and s.misfit_mm > OTHER_MM
+    if gross:
+        what = f"fits none of the other runs ({_misfit(s)}), which fit each other: another machine, tool or table"
+        return Finding(s.run, what, "leave it out (--without), or measure it again", True)
+    what = f"does not fit the other runs ({_misfit(s)}): the machine changed, or its set-up or tool is not what it says"
+    return Finding(s.run, what, "look at its residuals; measure it again, or leave it out (--without)", False)
+
+
+def _misfit(s: Suspect) -> str:
+    return f"off by {s.misfit_mm * 1e3:.2g} µm rms where {s.expected_mm * 1e3:.2g} are expected"

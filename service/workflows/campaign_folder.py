@@ -1,0 +1,110 @@
+"""Where a campaign comes from: the store, or a folder with campaign.json that is read, checked and, if asked for, stored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.devices.session import DeviceUrls
+from service.errors import CampaignRefused
+from service.runs.columns import load_run
+from service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
+from service.site import Site, machine_from_doc
+from service.storage.store import Store
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign as a solver takes it. ``folder``: where it was read from; None for one of the store."""
+
+    name: str
+    site: Site
+    runs: list[dict[str, Any]]
+    folder: Path | None
+
+    def without(self, labels: list[str]) -> Campaign:
+        """The campaign without some of its runs.
+
+        Raises
+        ------
+        CampaignRefused
+            There is no such run.
+        """
+        names = [r["run_id"] for r in self.runs]
+        missing = [n for n in labels if n not in names]
+        if missing:
+            raise CampaignRefused(f"campaign {self.name} has no run {missing[0]}", f"it has {', '.join(names)}")
+        return Campaign(self.name, self.site, [r for r in self.runs if r["run_id"] not in labels], self.folder)
+
+
+def is_folder(campaign: str) -> bool:
+    """Whether an argument names a campaign folder and not a campaign of the store."""
+    return (Path(campaign) / CAMPAIGN_FILE).exists() or Path(campaign).is_dir()
+
+
+def from_folder(folder: Path) -> Campaign:
+    """Read and check a campaign folder.
+
+    Raises
+    ------
+    FileFormatError
+        For the first mistake in any file.
+    """
+    content = read_folder(folder)
+    return _campaign(content.campaign["campaign"], content.campaign["machine"], content.runs, folder)
+
+
+def from_store(store: Store, name: str) -> Campaign:
+    """Complete runs of a campaign in the store.
+
+    Raises
+    ------
+    StoreError
+        There is no such campaign.
+    """
+    record = store.campaign(name)
+    runs = [load_run(store, r.id) for r in store.runs(record.id) if r.visible_status == "complete"]
+    return _campaign(record.name, store.machine(record.machine_id).doc, runs, None)
+
+
+def _campaign(name: str, machine: dict[str, Any], runs: list[dict[str, Any]], folder: Path | None) -> Campaign:
+    site = Site(str(machine.get("name") or name), machine_from_doc(machine), machine, DeviceUrls())
+    return Campaign(name, site, runs, folder)
+
+
+def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any]:
+    """Store a solution with its runs; a folder is imported first, unless its campaign is there already.
+
+    Returns
+    -------
+    dict
+        What the document learns by it: ``run_ids``, ``solution_id``, and ``same_as``: earlier solutions of the same readings and model.
+
+    Raises
+    ------
+    StoreError
+        It cannot be written.
+    CampaignRefused
+        Another campaign of this name is in the store.
+    """
+    if campaign.folder is not None and all(c.name != campaign.name for c in store.campaigns()):
+        import_folder(store, campaign.folder)
+    record = store.campaign(campaign.name)
+    ids = {r.label: r.id for r in store.runs(record.id) if r.visible_status == "complete"}
+    if campaign.folder is not None:
+        _check_same(store, campaign, ids)
+    used = [ids[label] for label in doc["inputs"]["runs"]]
+    same = [s.id for s in store.solutions(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
+    told = {"run_ids": used, "same_as": same}
+    return told | {"solution_id": store.add_solution(record.id, "joint", used, doc | told)}
+
+
+def _check_same(store: Store, campaign: Campaign, ids: dict[str, int]) -> None:
+    for run in campaign.runs:
+        found = ids.get(run["run_id"])
+        if run["role"] == "identify" and (found is None or load_run(store, found)["columns"] != run["columns"]):
+            raise CampaignRefused(
+                f"the store has another campaign {campaign.name!r}: run {run['run_id']} differs",
+                "rename the folder's campaign, or use another --db",
+            )

@@ -1,0 +1,59 @@
+"""What a solution came from: hashes of the runs' data, and which program solved them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from importlib.metadata import PackageNotFoundError, distribution, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
+
+
+def run_digest(run: dict[str, Any]) -> str:
+    """SHA-256 of what was measured: test, set-up and the columns that are solved from; the run's name and campaign do not count."""
+    out = hashlib.sha256(json.dumps([run["test"], run["setup"]], sort_keys=True).encode())
+    for name in SETUP_OF_DATA:
+        values = run["columns"].get(name)
+        out.update(name.encode())
+        out.update(b"-" if values is None else np.asarray(values, dtype="<f8").tobytes())
+    return out.hexdigest()
+
+
+def campaign_digest(digests: dict[str, str], model: str) -> str:
+    """SHA-256 of all runs, in any order, and the model: the same campaign solved twice has the same."""
+    return hashlib.sha256("\n".join([model, *sorted(digests.values())]).encode()).hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Abbe's version, its revision where there is one, and the libraries that do the arithmetic."""
+    out = {"abbe": version("abbe"), "numpy": version("numpy"), "scipy": version("scipy")}
+    found = revision()
+    return out if found is None else out | {"revision": found}
+
+
+def revision() -> str | None:
+    """Commit of the sources: as installed from a repository, or of the work tree that they stand in; None for a plain package."""
+    try:
+        text = distribution("abbe").read_text("direct_url.json")
+    except PackageNotFoundError:
+        text = None
+    commit = json.loads(text).get("vcs_info", {}).get("commit_id") if text else None
+    return str(commit) if commit else _of_tree(Path(__file__).resolve().parents[2] / ".git")
+
+
+def _of_tree(git: Path) -> str | None:
+    try:
+        head = (git / "HEAD").read_text(encoding="ascii").strip()
+        if not head.startswith("ref: "):
+            return head
+        name = head.removeprefix("ref: ")
+        if (git / name).exists():
+            return (git / name).read_text(encoding="ascii").strip()
+        packed = (git / "packed-refs").read_text(encoding="ascii").splitlines()
+        return next((line.split()[0] for line in packed if line.endswith(f" {name}")), None)
+    except (OSError, UnicodeDecodeError, IndexError):
+        return None

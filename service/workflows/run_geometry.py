@@ -1,0 +1,172 @@
+"""Do the commanded positions of a run lie where its set-up says: on the sphere, in the plane, on the line, inside the strokes?
+
+Where they do not, the usual mistakes are tried (inches, micrometres, metres, exchanged columns), and the one that puts them there is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+
+from models.arrays import F1, F2
+
+Doc = dict[str, Any]
+Distance = Callable[[F2], float]
+
+TOLERANCE_MM = 1.5
+"""Farther from its nominal path no run is: chords of a polyline stay below 0.1 mm, a ball-bar has a range of about 1 mm."""
+SMALLEST_RADIUS_MM = 15.0
+UNITS = {"inches": 25.4, "µm": 1e-3, "m": 1e3}
+AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True)
+class Misplaced:
+    """What is wrong with the geometry of a run, and what to do."""
+
+    text: str
+    remedy: str
+    refuse: bool = True
+
+
+def geometry(machine: Doc, run: Doc) -> Misplaced | None:
+    """The first thing that is wrong with where a run lies; None when it lies where it says.
+
+    Keys that a run does not have are not looked at.
+    """
+    setup, columns = run["setup"], run["columns"]
+    points = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in AXES])
+    if not np.isfinite(points).all():
+        return Misplaced("a position is not a finite number", "correct x_mm, y_mm, z_mm")
+    look = _bar if run["test"].startswith("ballbar") else _laser
+    found = look(run["test"], setup, points)
+    return found or _inside(machine, points)
+
+
+def _bar(test: str, setup: Doc, points: F2) -> Misplaced | None:
+    centre, radius = np.asarray(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"])
+    plane = str(setup.get("plane") or "").lower() if test == "ballbar_circle" else ""
+
+    def off(p: F2, c: F1 = centre, r: float = radius) -> float:
+        return float(np.abs(np.linalg.norm(p - c, axis=1) - r).max())
+
+    largest = off(points)
+    if largest > TOLERANCE_MM:
+        place = f"points lie up to {largest:.0f} mm beside the sphere of radius {radius:g} mm about centre_mm"
+        return (
+            _explained(points, place, off) or _setup_unit(points, centre, radius, place) or _unexplained(place, "centre_mm and radius_mm")
+        )
+    if plane:
+        normal = next(k for k, a in enumerate(AXES) if a not in plane)
+        out = float(np.abs(points[:, normal] - centre[normal]).max())
+        if out > TOLERANCE_MM:
+            place = f"points leave the plane {plane.upper()} by up to {out:.0f} mm"
+            return _explained(points, place, lambda p: float(np.abs(p[:, normal] - centre[normal]).max())) or _unexplained(place, "plane")
+    if radius < SMALLEST_RADIUS_MM:
+        return Misplaced(f"radius_mm is {radius:g}: no ball-bar is that short, {radius * 25.4:.0f} mm would be", "write mm, not inches")
+    return None
+
+
+def _setup_unit(points: F2, centre: F1, radius: float, place: str) -> Misplaced | None:
+    for unit, factor in UNITS.items():
+        for key, c, r in (
+            ("radius_mm", centre, factor * radius),
+            ("centre_mm", factor * centre, radius),
+            ("both", factor * centre, factor * radius),
+        ):
+            if float(np.abs(np.linalg.norm(points - c, axis=1) - r).max()) < TOLERANCE_MM:
+                name = "centre_mm and radius_mm hold" if key == "both" else f"{key} holds"
+                return Misplaced(f"{place}: {name} {unit}", "convert to mm")
+    return None
+
+
+def _laser(test: str, setup: Doc, points: F2) -> Misplaced | None:
+    if setup.get("start_mm") is None or setup.get("end_mm") is None:
+        return None
+    start, end = (np.asarray(setup[k], dtype=np.float64) for k in ("start_mm", "end_mm"))
+    said = _direction(test, setup, end - start)
+    if said is not None:
+        return said
+
+    def off(p: F2) -> float:
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        outside = np.maximum(np.maximum(low - p, p - high), 0.0).max()
+        ends = max(np.linalg.norm(p - e, axis=1).min() for e in (start, end))
+        return float(max(outside, ends))
+
+    largest = off(points)
+    if largest > TOLERANCE_MM:
+        place = f"positions miss the line from start_mm to end_mm by {largest:.0f} mm"
+        return _explained(points, place, off) or _unexplained(place, "start_mm and end_mm")
+    return _sequence(setup, points) if test == "laser_diagonal" else None
+
+
+def _direction(test: str, setup: Doc, span: F1) -> Misplaced | None:
+    """Beam, axis, letters of the diagonal and increments against the line they belong to."""
+    unit = span / max(float(np.linalg.norm(span)), 1e-9)
+    beam = setup.get("nominal_beam")
+    if beam is not None and float(np.dot(beam, unit)) < 0.999 * float(np.linalg.norm(beam)):
+        return Misplaced("nominal_beam does not point from start_mm to end_mm", "correct the set-up: exchanged or reversed axes")
+    if test == "laser_linear" and abs(unit["XYZ".index(setup["axis"])]) < 0.999:
+        moved = "XYZ"[int(np.argmax(np.abs(unit)))]
+        return Misplaced(f"axis is {setup['axis']}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")
+    letters = setup.get("diagonal") if test == "laser_diagonal" else None
+    if letters and any((s > 0) != (c == "p") for s, c in zip(span, letters, strict=True)):
+        return Misplaced(f"diagonal is {letters}, but start_mm and end_mm run otherwise", "correct diagonal, start_mm or end_mm")
+    step, count = setup.get("increment_mm"), setup.get("steps")
+    if isinstance(step, list | tuple) and count and float(np.abs(np.asarray(step) * count - span).max()) > TOLERANCE_MM:
+        return Misplaced(f"{count} steps of increment_mm do not lead from start_mm to end_mm", "correct increment_mm, steps or the ends")
+    return None
+
+
+def _sequence(setup: Doc, points: F2) -> Misplaced | None:
+    """The way out of a step diagonal: one axis after the other, in the order that the run names (X, Y, Z where it names none)."""
+    count = int(setup.get("steps") or 0)
+    if count == 0 or len(points) < 3 * count + 1 or (setup.get("order") == "" and len(points) <= 2 * count + 2):
+        return None
+    order = str(setup.get("order") or "XYZ")
+    moved = np.abs(np.diff(points[: 3 * count + 1], axis=0)) > 1e-3
+    wanted = np.tile(np.array([[a == o for a in "XYZ"] for o in order]), (count, 1))
+    if (moved.sum(axis=1) == 1).all() and not (moved == wanted).all():
+        first = "".join("XYZ"[int(np.argmax(row))] for row in moved[:3])
+        return Misplaced(
+            f"steps go in the order {first}, the run says {order}: columns are exchanged or order is wrong", "correct the file"
+        )
+    return None
+
+
+def _inside(machine: Doc, points: F2) -> Misplaced | None:
+    stroke = machine.get("stroke_mm")
+    if stroke is None:
+        return None
+    box = np.array([stroke[a] for a in "XYZ"], dtype=np.float64)
+
+    def off(p: F2) -> float:
+        return float(np.maximum(box[:, 0] - p.min(axis=0), p.max(axis=0) - box[:, 1]).max())
+
+    largest = off(points)
+    if largest <= TOLERANCE_MM:
+        return None
+    axis = int(np.argmax(np.maximum(box[:, 0] - points.min(axis=0), points.max(axis=0) - box[:, 1])))
+    low, high = (f"{v:g}" for v in box[axis])
+    place = f"{'XYZ'[axis]} goes {largest:.0f} mm beyond the stroke {low} to {high} mm"
+    return Misplaced(place, "correct the positions or the machine's stroke, or leave the run out (--without)")
+
+
+def _explained(points: F2, place: str, off: Distance) -> Misplaced | None:
+    for unit, factor in UNITS.items():
+        if off(factor * points) < TOLERANCE_MM:
+            return Misplaced(f"{place}: x_mm, y_mm, z_mm hold {unit}", "convert the columns to mm")
+    for order in permutations(range(3)):
+        if order != (0, 1, 2) and off(points[:, order]) < TOLERANCE_MM:
+            moved = [f"{AXES[k]}_mm" for k in range(3) if order[k] != k]
+            return Misplaced(f"{place}: columns {' and '.join(moved)} are exchanged", "put the columns right")
+    return None
+
+
+def _unexplained(place: str, keys: str) -> Misplaced:
+    return Misplaced(f"{place}: {keys} or the positions are not of this run", "correct the set-up, or leave the run out (--without)")

@@ -1,0 +1,129 @@
+"""A solution as the values of its page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from models.geometry.bases import term_values
+from models.machine import AXES
+from models.solvers.joint import JointSolution
+from models.solvers.observability_volume import Number
+from service.report.model import SETUP_NOTE, ResidualSeries, RunRow
+from service.report.solution_model import BudgetRow, Correlations, MotionCurve, Slice, SolutionPage
+from service.site import Site
+from service.workflows.demo_report import contributions, parameter_rows
+from service.workflows.solve_report import Account, noise_lines, outlier_lines, residual_lines, worst_line
+
+CURVE_NODES = 61
+SLICE_NODES = 15
+MOST_CORRELATED = 14
+PLANES = ((0, 1, 2), (0, 2, 1))
+"""Axes across and up of each slice, and the axis that stands in the middle of its stroke."""
+
+
+def solution_page(told: Account, doc: dict[str, Any], site: Site, made: str) -> SolutionPage:
+    """Everything the page shows.
+
+    Parameters
+    ----------
+    told : Account
+    doc : dict
+        `service.workflows.solve_report.solution_doc` of it, with the campaign's name.
+    site : Site
+    made : str
+        When, as text.
+    """
+    joint = told.joint
+    rows = parameter_rows(joint)
+    return SolutionPage(
+        title=f"Campaign {doc['campaign']} - what it says about {site.name}",
+        facts={"chain": joint.machine.chain, "model": doc["model"], "runs": str(len(joint.runs)), "made": made},
+        verdict=_verdict(told.observability.number),
+        flags=doc["flags"],
+        parameters=[r for r in rows if r.note != SETUP_NOTE],
+        setup=[r for r in rows if r.note == SETUP_NOTE],
+        motions=motion_curves(told),
+        contributions=contributions(joint),
+        slices=[_slice(told, plane) for plane in PLANES],
+        worst=worst_line(told),
+        budget=[BudgetRow(line.words, line.u_mm * 1e3, line.share) for line in told.budget.lines],
+        correlations=_correlations(told),
+        residuals=[ResidualSeries(r.label, "reading", np.arange(float(r.residual_mm.size)), r.residual_mm * 1e3) for r in joint.runs],
+        runs=_runs(joint),
+        noise=noise_lines(joint),
+        outliers=outlier_lines(joint),
+        tests=residual_lines(joint),
+        not_observable=doc["not_observable"],
+        advice=doc["advice"],
+        provenance=_provenance(doc, made),
+    )
+
+
+def _verdict(number: Number) -> tuple[str, str, str]:
+    sign = {"good": "ok", "usable with care": "open"}.get(number.verdict, "bad")
+    return sign, number.verdict[:1].upper() + number.verdict[1:], number.text
+
+
+def motion_curves(told: Account) -> list[MotionCurve]:
+    """Every error motion as a function over its stroke, with its standard uncertainty, µm or µrad."""
+    joint = told.joint
+    stroke = joint.machine.stroke_mm
+    nodes = np.stack([np.linspace(lo, hi, CURVE_NODES) for lo, hi in stroke], axis=1)
+    values = term_values(joint.terms, nodes, stroke)
+    status = {m.name: m.status for m in told.observability.motions}
+    out = []
+    for name in dict.fromkeys(t.motion for t in joint.terms if t.order):
+        at = [i for i, t in enumerate(joint.terms) if t.motion == name]
+        axis, turns = joint.terms[at[0]].axis, joint.terms[at[0]].component >= 3
+        scale, unit = (1e6, "µrad") if turns else (1e3, "µm")
+        basis = values[:, at]
+        variance = np.einsum("ni,ij,nj->n", basis, joint.term_covariance[np.ix_(at, at)], basis)
+        u = np.sqrt(np.maximum(variance, 0.0))
+        out.append(MotionCurve(name, AXES[axis], nodes[:, axis], basis @ joint.coefficients[at] * scale, u * scale, unit, status[name]))
+    return out
+
+
+def _slice(told: Account, plane: tuple[int, int, int]) -> Slice:
+    across, up, fixed = plane
+    stroke = told.joint.machine.stroke_mm
+    x, y = (np.linspace(stroke[a, 0], stroke[a, 1], SLICE_NODES) for a in (across, up))
+    points = np.empty((SLICE_NODES**2, 3))
+    points[:, across], points[:, up] = np.tile(x, SLICE_NODES), np.repeat(y, SLICE_NODES)
+    points[:, fixed] = stroke[fixed].mean()
+    values = told.predict(points).expanded_vector_mm.reshape(SLICE_NODES, SLICE_NODES) * 1e3
+    return Slice(AXES[across], AXES[up], f"{AXES[fixed]} = {stroke[fixed].mean():.0f} mm", x, y, values)
+
+
+def _correlations(told: Account) -> Correlations:
+    """The parameters of the strongest pairs, in the order of the model."""
+    e = told.joint.estimate
+    chosen: list[str] = []
+    for pair in told.observability.correlations:
+        new = [n for n in (pair.first, pair.second) if n not in chosen]
+        if len(chosen) + len(new) > MOST_CORRELATED:
+            break
+        chosen += new
+    names = sorted(chosen, key=e.names.index)
+    at = [e.names.index(n) for n in names]
+    covariance = e.covariance[np.ix_(at, at)]
+    u = np.sqrt(np.diag(covariance))
+    return Correlations(names, np.asarray(covariance / np.outer(u, u)).reshape(len(names), len(names)))
+
+
+def _runs(joint: JointSolution) -> list[RunRow]:
+    counts = {r.label: sum(o.run == r.label for o in joint.outliers) for r in joint.runs}
+    return [
+        RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, r.expected_mm * 1e3, counts[r.label]) for r in joint.runs
+    ]
+
+
+def _provenance(doc: dict[str, Any], made: str) -> dict[str, str]:
+    out = {"made": made, "model": doc["model"], "readings (SHA-256)": doc["inputs"]["digest"]}
+    out |= {("revision" if k == "revision" else f"{k} version"): v for k, v in doc["versions"].items()}
+    if "solution_id" in doc:
+        out["stored as"] = f"solution {doc['solution_id']}"
+        if doc["same_as"]:
+            out["same readings and model as"] = "solution " + ", ".join(map(str, doc["same_as"]))
+    return out

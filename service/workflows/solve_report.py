@@ -1,0 +1,214 @@
+"""What is said about a solution: the stored document (`abbe-solution/1`), and lines for people. Every figure has its uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from models.arrays import F2
+from models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
+from models.solvers.joint import JointSolution
+from models.solvers.observability import Observability, observability_of
+from models.uncertainty.budget import Budget, budget_over, worst_point
+from models.uncertainty.frame import volume_frame
+from models.uncertainty.mask import CompensableMask, compensable_mask
+from models.uncertainty.prediction import Prediction, predict_deviation
+from models.uncertainty.sources import ErrorSources, error_sources
+from models.volumetric import volume_grid
+from service.workflows.provenance import campaign_digest, versions
+from service.workflows.solve import HELIX_NOTE, STEP_NOTE, Solved
+
+FORMAT = "abbe-solution/1"
+NODES = 6
+"""Nodes per axis of the grid over the strokes on which the uncertainty is stated."""
+LISTED = 20
+"""So many outliers and correlations are listed for people; the document holds all outliers."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """A solution and everything that is said about it. ``prediction`` is over the whole volume, best-fit rigid motion removed."""
+
+    solved: Solved
+    observability: Observability
+    sources: ErrorSources
+    prediction: Prediction
+    budget: Budget
+    mask: CompensableMask
+    mean: tuple[MeanParameter, ...]
+
+    @property
+    def joint(self) -> JointSolution:
+        """The joint solution."""
+        return self.solved.joint
+
+    def predict(self, points_mm: F2) -> Prediction:
+        """Deviation and uncertainty elsewhere, in the same frame."""
+        return predict_deviation(self.sources, points_mm, frame=volume_frame(self.joint.machine))
+
+
+def account(solved: Solved) -> Account:
+    """Ask a solution what it knows: observability, uncertainty over the volume, budget."""
+    joint = solved.joint
+    sources = error_sources(joint)
+    prediction = predict_deviation(sources, volume_grid(joint.machine.stroke_mm, NODES), frame=volume_frame(joint.machine))
+    return Account(
+        solved,
+        observability_of(joint),
+        sources,
+        prediction,
+        budget_over(prediction),
+        compensable_mask(prediction),
+        mean_linear(joint),
+    )
+
+
+def model_key(joint: JointSolution) -> str:
+    """Which model was fitted and who chose its order, e.g. ``rigid21/legendre7+order-by-heldout``."""
+    if joint.model == "rigid6":
+        return "rigid6" + ("+by-heldout" if joint.order_choice else "")
+    return f"{joint.model}/legendre{joint.order}" + ("+order-by-heldout" if joint.order_choice else "+order-given")
+
+
+def not_observable(found: Account) -> list[str]:
+    """In words: what the runs cannot tell apart, why, and what would show it."""
+    return [g.text for g in found.observability.hidden]
+
+
+def solution_doc(solved: Solved | Account) -> dict[str, Any]:
+    """The solution as it is stored: parameters with uncertainty in SI-like units, what is not observable, tests, versions, digests."""
+    found = solved if isinstance(solved, Account) else account(solved)
+    joint = found.joint
+    key = model_key(joint)
+    return {
+        "format": FORMAT,
+        "model": key,
+        "order": joint.order,
+        "versions": versions(),
+        "inputs": {"digest": campaign_digest(found.solved.digests, key.partition("/")[0]), "runs": found.solved.digests},
+        **_parameters(found),
+        **_observability(found),
+        **_residuals(joint),
+        "flags": [f.line for f in found.solved.flags],
+        "uncertainty": _uncertainty(found),
+        "ten_parameter_helix": {
+            label: {n: {"value": h.estimate.value(n), "u": h.estimate.u(n)} for n in h.estimate.names}
+            for label, h in found.solved.helices.items()
+        },
+        "ten_parameter_helix_note": HELIX_NOTE,
+        "step_diagonals": found.solved.step_totals,
+        "step_diagonals_note": STEP_NOTE,
+    }
+
+
+def _parameters(found: Account) -> dict[str, Any]:
+    return {
+        "parameters": {
+            p.name: {"value": p.value, "u": p.u, "data_share": p.share, "status": p.status} for p in found.observability.parameters
+        },
+        "mean_over_volume": {p.name: {"value": p.value, "u": p.u} for p in found.mean},
+        "mean_over_volume_note": f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
+        "motions": {m.name: {"status": m.status, "u": m.u, "data_share": m.share, "reason": m.reason} for m in found.observability.motions},
+    }
+
+
+def _observability(found: Account) -> dict[str, Any]:
+    o = found.observability
+    return {
+        "rank": {"rank": o.rank, "of": len(o.terms), "effective_rank": o.seen.effective_rank},
+        "not_observable": not_observable(found),
+        "advice": [a.text for a in o.advice],
+        "observability": {"number": o.number.value, "median": o.number.median, "verdict": o.number.verdict, "text": o.number.text},
+        "correlations": [{"first": c.first, "second": c.second, "r": c.r} for c in o.correlations[:LISTED]],
+    }
+
+
+def _residuals(joint: JointSolution) -> dict[str, Any]:
+    e = joint.estimate
+    counts = {r.label: sum(o.run == r.label for o in joint.outliers) for r in joint.runs}
+    return {
+        "chi2": e.chi2,
+        "dof": e.dof,
+        "variance_factor": e.variance_factor,
+        "runs": {
+            r.label: {
+                "readings": r.residual_mm.size,
+                "rms_um": r.rms_mm * 1e3,
+                "expected_um": r.expected_mm * 1e3,
+                "outliers": counts[r.label],
+            }
+            for r in joint.runs
+        },
+        "noise": {
+            kind: {"sigma_um": sigma * 1e3, "repeats_um": None if repeats is None else repeats * 1e3}
+            for kind, sigma in joint.noise_mm.items()
+            for repeats in [joint.noise_repeats_mm.get(kind)]
+        },
+        "outliers": [{"run": o.run, "index": o.index, "size_sigma": o.size, "weight": o.weight} for o in joint.outliers],
+        "residual_tests": [
+            {
+                "run": t.run,
+                "test": t.name,
+                "statistic": t.statistic,
+                "p": t.p,
+                "p_adjusted": t.p_adjusted,
+                "flagged": t.flagged,
+                "text": t.text,
+            }
+            for t in joint.residual_tests
+        ],
+    }
+
+
+def _uncertainty(found: Account) -> dict[str, Any]:
+    p, at = found.prediction, worst_point(found.prediction)
+    return {
+        "frame": "best-fit rigid motion over the strokes removed",
+        "worst_point": {
+            "at_mm": [float(v) for v in p.points_mm[at]],
+            "deviation_um": [float(v) for v in p.deviation_mm[at] * 1e3],
+            "u_um": [float(v) for v in p.u_mm[at] * 1e3],
+            "expanded_um": [float(v) for v in p.expanded_mm[at] * 1e3],
+            "expanded_vector_um": float(p.expanded_vector_mm[at]) * 1e3,
+        },
+        "rms_um": float(np.sqrt(np.mean(p.u_vector_mm**2))) * 1e3,
+        "budget": [{"source": line.name, "words": line.words, "u_um": line.u_mm * 1e3, "share": line.share} for line in found.budget.lines],
+        "compensable_share": found.mask.share,
+    }
+
+
+def worst_line(found: Account) -> str:
+    """Where the deviation is known worst, in one line."""
+    p, at = found.prediction, worst_point(found.prediction)
+    place = ", ".join(f"{v:.0f}" for v in p.points_mm[at])
+    return (
+        f"Worst known point ({place}) mm: deviation {np.linalg.norm(p.deviation_mm[at]) * 1e3:.1f} µm, "
+        f"95 % region of the vector ± {p.expanded_vector_mm[at] * 1e3:.1f} µm (rigid motion removed). {found.mask.text()}"
+    )
+
+
+def noise_lines(joint: JointSolution) -> list[str]:
+    """Noise found per instrument, and what repeats alone say of it."""
+    names = {"bar": "ball-bar", "laser": "laser"}
+    out = []
+    for kind, sigma in joint.noise_mm.items():
+        repeats = joint.noise_repeats_mm.get(kind)
+        more = f", {repeats * 1e3:.2f} µm from repeats alone" if repeats is not None else ", nothing was repeated"
+        out.append(f"{names.get(kind, kind)}: {sigma * 1e3:.2f} µm for one reading{more}")
+    return out
+
+
+def outlier_lines(joint: JointSolution) -> list[str]:
+    """Readings that count less, largest first."""
+    lines = [
+        f"run {o.run}, reading {o.index + 1}: {abs(o.size):.1f} standard deviations, counts {o.weight:.0%}" for o in joint.outliers[:LISTED]
+    ]
+    more = len(joint.outliers) - len(lines)
+    return [*lines, f"and {more} more"] if more > 0 else lines
+
+
+def residual_lines(joint: JointSolution) -> list[str]:
+    """What the tests of the residuals found, most significant first."""
+    return [t.text for t in sorted((t for t in joint.residual_tests if t.flagged), key=lambda t: t.p_adjusted)]
