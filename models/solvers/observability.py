@@ -7,7 +7,7 @@ the readings and stated calibrations alone; uncertainties include the documented
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
@@ -32,7 +32,7 @@ from models.solvers.observability_rank import (
 from models.solvers.observability_volume import Knowing, Number, Volume, observability_number, volume_at, whole_volume
 from models.solvers.observations import RunData
 from models.solvers.observe import setup_unknowns
-from models.solvers.priors import Priors, term_prior_sd
+from models.solvers.priors import Priors, size_model
 
 __all__ = ["Observability", "observability", "observability_of"]
 
@@ -47,8 +47,9 @@ class Observability:
 
     Attributes
     ----------
-    machine, terms
-        Nominal machine and coefficients of its error motions.
+    machine, terms, model
+        Nominal machine; coefficients of its error motions that count for the rank; all coefficients of the model (a solution carries higher
+        orders along, for honest uncertainties).
     seen : Seen
         Rank, effective rank, condition, null space (unit columns).
     reachable : int
@@ -68,6 +69,7 @@ class Observability:
 
     machine: Machine
     terms: tuple[Term, ...]
+    model: tuple[Term, ...]
     seen: Seen
     reachable: int
     known: tuple[str, ...]
@@ -87,7 +89,7 @@ class Observability:
 
     def at(self, axes_mm: F2) -> Volume:
         """Prior size, uncertainty and noise gain at commanded positions (n, 3), mm."""
-        return volume_at(self.machine, self.terms, self.knowing, axes_mm)
+        return volume_at(self.machine, self.model, self.knowing, axes_mm)
 
     def lines(self) -> tuple[str, ...]:
         """The report in short sentences, most important first."""
@@ -136,65 +138,81 @@ def observability(
     priors = priors or Priors()
     setup = setup_unknowns(runs, priors)
     sigma, floor = sigma_mm or SIGMA_MM, floor_mm or FLOOR_MM
-    prior = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+    rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
+    sizes = size_model(machine, terms, rest, np.concatenate([np.full(3, priors.backlash_mm), setup.prior_sd]), priors)
     u = np.concatenate([np.hypot(sigma[r.kind] / np.sqrt(r.weight_n), floor[r.kind]) for r in runs])
     columns = campaign_columns(machine, terms, runs, setup)
     whitened = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1) / u[:, None]
-    information = whitened.T @ whitened
-    covariance = posterior_covariance(information, prior)
-    beliefs = _Beliefs(None, covariance, prior, information, float(np.sqrt(np.mean(u**2))))
-    return _report(machine, terms, runs, columns, beliefs, known or stated_knowledge(terms, runs, setup))
+    information, root = whitened.T @ whitened, sizes.typical[:, None] * sizes.root
+    beliefs = _Beliefs(None, posterior_covariance(information, root), root, information, float(np.sqrt(np.mean(u**2))))
+    return _report(_Model(machine, terms, len(terms)), runs, columns, beliefs, known)
 
 
 def observability_of(solution: JointSolution, known: Knowledge | None = None) -> Observability:
-    """What the runs of a solution told: as `observability`, with the solution's own estimates, covariance, priors and noise."""
+    """What the runs of a solution told: as `observability`, with the solution's own estimates, covariance, priors and noise.
+
+    Rank and null space count the terms up to the order that the solution chose; the orders above it, which the solver carries along so
+    that no interval is too narrow, count in every uncertainty and share.
+    """
     e, s = solution.estimate, solution
     noise = np.concatenate([np.full(r.residual_mm.size, r.expected_mm) for r in s.runs])
-    beliefs = _Beliefs(e.theta, e.covariance, s.prior_sd, s.information, float(np.sqrt(np.mean(noise**2))))
+    beliefs = _Beliefs(e.theta, e.covariance, s.prior_root, s.information, float(np.sqrt(np.mean(noise**2))))
     columns = campaign_columns(s.machine, s.terms, s.data, s.setup)
-    return _report(s.machine, s.terms, s.data, columns, beliefs, known or stated_knowledge(s.terms, s.data, s.setup))
+    return _report(_Model(s.machine, s.terms, s.order), s.data, columns, beliefs, known)
 
 
-def posterior_covariance(information: F2, prior_sd: F1) -> F2:
-    """Covariance of all unknowns from the information of the readings, shape (p, p), and independent priors."""
-    scaled = information * np.outer(prior_sd, prior_sd) + np.eye(prior_sd.size)
-    inverse = linalg.cho_solve(linalg.cho_factor(scaled, check_finite=False), np.eye(prior_sd.size), check_finite=False)
-    return np.asarray(inverse * np.outer(prior_sd, prior_sd))
+def posterior_covariance(information: F2, prior_root: F2) -> F2:
+    """Covariance of all unknowns, shape (p, p), from the information of the readings and the prior covariance root root^T."""
+    scaled = prior_root.T @ information @ prior_root + np.eye(information.shape[0])
+    half = linalg.solve_triangular(linalg.cholesky(scaled, lower=True, check_finite=False), prior_root.T, lower=True, check_finite=False)
+    return np.asarray(half.T @ half)
 
 
 @dataclass(frozen=True)
 class _Beliefs:
-    """Estimates (None before solving), their covariance, priors, information of the readings, rms noise of a reading in mm."""
+    """Estimates (None before solving), covariance, root of the prior covariance, information of the readings, rms noise of one, mm."""
 
     theta: F1 | None
     covariance: F2
-    prior_sd: F1
+    prior_root: F2
     information: F2
     noise_mm: float
 
 
-def _report(
-    machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], columns: Columns, beliefs: _Beliefs, known: Knowledge
-) -> Observability:
-    p, columns = len(terms), compressed(columns)
-    seen = what_is_seen(columns, known)
-    found = picture(Campaign(machine, terms, runs, columns, known), seen, beliefs.prior_sd[:p])
-    names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
+@dataclass(frozen=True)
+class _Model:
+    """Nominal machine, its terms, and the highest order that counts for the rank."""
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    order: int
+
+
+def _report(model: _Model, runs: tuple[RunData, ...], columns: Columns, beliefs: _Beliefs, known: Knowledge | None) -> Observability:
+    machine, p = model.machine, len(model.terms)
+    counted = [i for i, t in enumerate(model.terms) if t.order <= model.order]
+    terms = tuple(model.terms[i] for i in counted)
+    few = compressed(replace(columns, machine=columns.machine[:, counted]))
+    known = stated_knowledge(terms, runs, columns.setup_names) if known is None else known
+    seen, prior_sd = what_is_seen(few, known), np.linalg.norm(beliefs.prior_root, axis=1)
+    found = picture(Campaign(machine, terms, runs, few, known), seen, prior_sd[counted])
+    names = (*(t.name for t in model.terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
     secret = hidden_terms(terms, seen.null_space)
-    lost = frozenset(f"backlash_{a}" for a in hidden_lost_motion(columns, known)) if known.lost_motion else frozenset()
+    lost = frozenset(f"backlash_{a}" for a in hidden_lost_motion(few, known)) if known.lost_motion else frozenset()
     knowing = _knowing(beliefs, p)
-    volume = whole_volume(machine, terms, knowing)
+    volume = whole_volume(machine, model.terms, knowing)
     return Observability(
         machine=machine,
         terms=terms,
+        model=model.terms,
         seen=seen,
         reachable=found.reachable,
         known=tuple(known.held),
         hidden=found.groups,
         advice=found.advice,
-        parameters=parameters(names, beliefs.theta, beliefs.covariance, beliefs.prior_sd, secret | lost),
+        parameters=parameters(names, beliefs.theta, beliefs.covariance, prior_sd, secret | lost),
         correlations=correlations(names, beliefs.covariance),
-        motions=motions(machine, terms, knowing.posterior, knowing.prior, secret),
+        motions=motions(machine, model.terms, knowing.posterior, knowing.prior, secret),
         knowing=knowing,
         volume=volume,
         number=observability_number(volume),
@@ -203,6 +221,6 @@ def _report(
 
 def _knowing(beliefs: _Beliefs, p: int) -> Knowing:
     """Covariances of the terms; the noise part is that of the estimator in use, priors included."""
-    plain = posterior_covariance(beliefs.information, beliefs.prior_sd)
-    noise = (plain @ beliefs.information @ plain)[:p, :p] / beliefs.noise_mm**2
-    return Knowing(np.diag(beliefs.prior_sd[:p] ** 2), beliefs.covariance[:p, :p], noise)
+    plain = posterior_covariance(beliefs.information, beliefs.prior_root)[:p]
+    root = beliefs.prior_root[:p]
+    return Knowing(root @ root.T, beliefs.covariance[:p, :p], plain @ beliefs.information @ plain.T / beliefs.noise_mm**2)

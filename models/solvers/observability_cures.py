@@ -133,7 +133,7 @@ def _shown(campaign: Campaign, addition: Addition, play: _Play) -> F2:
 def _known_with(campaign: Campaign, runs: tuple[RunData, ...], setup: Setup, new: Columns) -> Knowledge:
     """Unknowns that the addition brings are known or free by the same rules as the old ones, which stay what they were."""
     known, before = campaign.known, set(campaign.columns.setup_names)
-    stated = stated_knowledge(campaign.terms, runs, setup).held
+    stated = stated_knowledge(campaign.terms, runs, setup.names).held
     held = {n: v for n, v in stated.items() if n not in before} | {n: v for n, v in known.held.items() if n in new.setup_names}
     return replace(known, held=held)
 

@@ -17,10 +17,7 @@ from models.solvers.observability_rank import Seen
 from models.solvers.observability_volume import frame_free_design, inner_box
 from models.solvers.observability_words import Family, families, sentence
 from models.solvers.observe import with_tool
-from models.volumetric import volume_grid
 
-NODES = 7
-"""Nodes per axis of the grid on which a hidden combination is asked what it does; enough for order 6 (rank of math.md 4.6)."""
 HARMLESS = 1e-7
 """Deviation (unit columns, relative to the largest) below which a combination moves the tool nowhere."""
 CURES = 3
@@ -97,11 +94,25 @@ def picture(campaign: Campaign, seen: Seen, prior_sd: F1) -> Picture:
 
 def _fields(campaign: Campaign, factor: F1) -> F2:
     """Deviation over the inner volume with every tool in use, rigid motion removed, unit columns, shape (rows, p)."""
-    grid = volume_grid(inner_box(campaign.machine), NODES)
+    points = _lines(campaign.machine, max(t.order for t in campaign.terms) + 3)
     tools = {tuple(with_tool(campaign.machine, r.tool_mm).tool_mm): r.tool_mm for r in campaign.runs}
-    machines: list[Machine] = [with_tool(campaign.machine, tool) for tool in tools.values()]
-    parts = [frame_free_design(m, campaign.terms, grid, grid).reshape(-1, len(campaign.terms)) for m in machines]
-    return np.concatenate(parts) * factor
+    machines = [with_tool(campaign.machine, tool) for tool in tools.values()]
+    parts = [frame_free_design(m, campaign.terms, points, points).reshape(-1, len(campaign.terms)) for m in machines]
+    return np.asarray(np.concatenate(parts) * factor)
+
+
+def _lines(machine: Machine, nodes: int) -> F2:
+    """Points on nine lines along each axis of the inner volume.
+
+    They tell as much as a whole grid: an error motion depends on one axis, and its lever on the others linearly (rule G).
+    """
+    box = inner_box(machine)
+    three = np.stack([box[:, 0], box.mean(axis=1), box[:, 1]], axis=1)
+    out = []
+    for a in range(3):
+        along = [three[k] if k != a else np.linspace(box[a, 0], box[a, 1], nodes) for k in range(3)]
+        out.append(np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, 3))
+    return np.concatenate(out)
 
 
 def _silent(null_space: F2, field: F2) -> F2:

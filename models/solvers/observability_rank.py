@@ -26,6 +26,10 @@ HAND_SET = ("cup", "tilt", "zero")
 drifts, the laser's wavelength, its cosine error (`models.solvers.priors`). They are known for the rank, and in every uncertainty."""
 
 
+ROUNDING = 1e-12
+"""Columns shorter than this share of the longest one are zero: a lever that cancels leaves 1e-16 of its parts."""
+
+
 @dataclass(frozen=True)
 class Knowledge:
     """What is known about the set-up besides the readings, for the rank only.
@@ -101,7 +105,7 @@ def compressed(columns: Columns) -> Columns:
     return Columns(r[:, :p], r[:, p : p + 3], r[:, p + 3 :], columns.setup_names)
 
 
-def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: Setup) -> Knowledge:
+def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup_names: tuple[str, ...]) -> Knowledge:
     """What is stated about the set-up: lengths of calibrated bars, and whatever no hand sets (`HAND_SET`).
 
     A bar counts as calibrated if every run with it says so or states its uncertainty, and none says the opposite
@@ -109,7 +113,7 @@ def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: 
     laser zeros and uncalibrated lengths are free, however narrow their priors.
     """
     vague = {f"bar_length_{r.radius_mm:g}" for r in runs if r.kind == "bar" and not _calibrated(r)}
-    return Knowledge({n: np.zeros(len(terms)) for n in setup.names if n.partition("_")[0] not in HAND_SET and n not in vague})
+    return Knowledge({n: np.zeros(len(terms)) for n in setup_names if n.partition("_")[0] not in HAND_SET and n not in vague})
 
 
 def _calibrated(run: RunData) -> bool:
@@ -150,7 +154,7 @@ def what_is_seen(columns: Columns, known: Knowledge) -> Seen:
     if strangers - set(columns.setup_names):
         raise ValueError(f"observability: {', '.join(sorted(strangers - set(columns.setup_names)))} is no set-up unknown of these runs")
     machine, free, _ = with_knowledge(columns, known)
-    unit, factor = unit_columns(machine)
+    unit, factor = unit_columns(_without_rounding(machine))
     _, s, vt = linalg.svd(project_out(unit, free), full_matrices=True, check_finite=False)
     s = np.concatenate([s, np.zeros(unit.shape[1] - s.size)])
     top = float(s[0]) if s.size else 0.0
@@ -158,6 +162,12 @@ def what_is_seen(columns: Columns, known: Knowledge) -> Seen:
     condition = top / float(s[rank - 1]) if rank else float("inf")
     effective = int((s > EFFECTIVE_TOLERANCE * top).sum())
     return Seen(rank, effective, condition, factor, np.asarray(s), vt[:rank].T, vt[rank:].T)
+
+
+def _without_rounding(a: F2) -> F2:
+    """The design with columns that are nothing but rounding set to zero: brought to unit length they would count as seen."""
+    norm = np.linalg.norm(a, axis=0)
+    return np.where(norm > ROUNDING * norm.max(initial=0.0), a, 0.0)
 
 
 def hidden_lost_motion(columns: Columns, known: Knowledge) -> tuple[str, ...]:
