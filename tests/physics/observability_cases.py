@@ -56,7 +56,7 @@ class Experiment:
 
 def laser(label: str, path: np.ndarray, beam: np.ndarray | None = None) -> RunData:
     n = len(path)
-    way = path[-1] - path[0]
+    way = path[int(np.argmax(np.linalg.norm(path - path[0], axis=1)))] - path[0]
     beam = way / np.linalg.norm(way) if beam is None else beam
     return RunData(label, label, "laser", path, np.zeros(n), travel_sign(path), np.arange(n) * 1.0, np.ones(n), beam=beam)
 
