@@ -66,9 +66,14 @@ def limit(search: Search, rows: F2) -> tuple[float, str]:
 
 def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, passes: int) -> tuple[Chosen, bool]:
     """The shortest plan found that reaches the goal within the budget, or the best plan for the budget and False."""
-    chosen = search.exchange(search.fill({}, budget_min), budget_min, passes)
-    if not _enough(search, rows, chosen, wanted_mm):
-        return chosen, False
+    first = minutes_needed(search, rows, wanted_mm, {}, budget_min)
+    if first is None:
+        chosen = search.exchange(search.fill({}, budget_min), budget_min, passes)
+        return chosen, bool(chosen) and _enough(search, rows, chosen, wanted_mm)
+    chosen = search.exchange(search.fill({}, first), first, passes)
+    if not _enough(search, rows, chosen, wanted_mm):  # the criterion leans on the worst node, it is not the worst node
+        chosen = search.exchange(search.fill({}, budget_min), budget_min, passes)
+        return chosen, _enough(search, rows, chosen, wanted_mm)
     while True:
         tighter = 0.93 * search.total_min(chosen)
         trial = search.exchange(search.fill({}, tighter), tighter, passes)
@@ -77,11 +82,11 @@ def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, pass
         chosen = trial
 
 
-def minutes_needed(search: Search, rows: F2, wanted_mm: float, start: Chosen) -> float | None:
-    """Minutes at which going on from a plan reaches the goal; None: not within `LONGEST_MIN`."""
+def minutes_needed(search: Search, rows: F2, wanted_mm: float, start: Chosen, longest_min: float = LONGEST_MIN) -> float | None:
+    """Minutes at which going on from a plan reaches the goal; None: not within the longest time."""
     chosen = dict(start)
     while True:
-        left = LONGEST_MIN - search.total_min(chosen)
+        left = longest_min - search.total_min(chosen)
         test = search.best_addition(chosen, left)
         if test is None:
             return None

@@ -10,6 +10,7 @@ from service.cli.errors import errors
 from service.cli.exchange import export_campaign, import_campaign
 from service.cli.measure import correct, measure
 from service.cli.papers import papers
+from service.cli.plan import plan
 from service.cli.serve import serve
 from service.cli.show import runs, show
 from service.cli.solve import solve
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 
 app.command("demo")(demo)
+app.command("plan")(plan)
 app.command("measure")(measure)
 app.command("solve")(solve)
 app.command("errors")(errors)

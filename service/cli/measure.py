@@ -24,7 +24,7 @@ RECIPES = "identification, verification, quick-check"
 
 def measure(
     machine: MachineArgument,
-    recipe: Annotated[str, typer.Option(help=f"One of: {RECIPES}.")] = "quick-check",
+    recipe: Annotated[str, typer.Option(help=f"One of: {RECIPES}; or a recipe FILE.toml (`abbe plan` writes one).")] = "quick-check",
     helix: Annotated[str, typer.Option(help="Instead of a recipe: one ball-bar helix, X,Y,Z,RADIUS in mm.")] = "",
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: recipe and time.")] = "",
     rate_hz: Annotated[int, typer.Option(help="Ball-bar samples per second; must divide 1000.")] = 100,
@@ -42,7 +42,8 @@ def measure(
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
-    plan = _plan(site.machine, recipe, helix, rate_hz, name or f"{'helix' if helix else recipe} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
+    what = "helix" if helix else Path(recipe).stem
+    plan = _plan(site.machine, recipe, helix, rate_hz, name or f"{what} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     if dry_run:
         print_path(plan) if path else print_dry_run(plan.name, runs)
@@ -127,8 +128,12 @@ def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int, name: str) ->
             raise ConfigError(f"--helix {helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
         return CampaignPlan(name, (Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz).plan(machine),))
     plans = {"identification": identification, "verification": verification, "quick-check": quick_check}
+    if recipe.endswith(".toml"):
+        from service.sequences.recipe_file import read_recipe
+
+        return CampaignPlan(name, tuple(r.plan(machine) for r in read_recipe(Path(recipe))[1]))
     if recipe not in plans:
-        raise ConfigError(f"there is no recipe {recipe!r}", f"use one of: {RECIPES}")
+        raise ConfigError(f"there is no recipe {recipe!r}", f"use one of: {RECIPES}, or a FILE.toml")
     return plans[recipe](machine, rate_hz=rate_hz, name=name)
 
 

@@ -1,0 +1,70 @@
+"""`abbe plan`: which measurements are worth the minutes there are, as a recipe that `abbe measure` runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.common import JsonOption, print_json, print_table
+
+if TYPE_CHECKING:
+    from service.workflows.plan import Planned
+
+HEADINGS = ("no", "label", "measurement", "min", "until min", "worst U µm", "mean U µm")
+
+
+def plan(
+    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
+    minutes: Annotated[float, typer.Option(min=1.0, max=1440.0, help="Minutes there are, set-ups included.")] = 60.0,
+    goal_um: Annotated[
+        float | None, typer.Option(min=0.001, help="Wanted worst U = 2u of the deviation, µm; the plan ends when it is reached.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE.toml", help="Write the campaign recipe.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE.html", help="Write a page with a picture of the set-ups.")
+    ] = None,
+    instruments: Annotated[
+        Path | None, typer.Option("--instruments", metavar="FILE.toml", help="Bars, noise and set-up times; default: usual ones.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
+    # Before numpy is loaded: for matrices this small a second thread costs more than it does, on a busy computer twenty times more.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from service.cli.progress import display
+    from service.config import load_machine
+    from service.site import site_of
+    from service.workflows.plan import plan_doc, plan_for, plan_page, write_text
+    from service.workflows.plan_instruments import read_instruments
+
+    site = site_of(load_machine(machine).machine)
+    tools = read_instruments(instruments)
+    with display() as sink:
+        planned = plan_for(site, minutes=minutes, goal_um=goal_um, tools=tools, progress=sink)
+    if out is not None:
+        write_text(out, planned.text)
+    if picture is not None:
+        write_text(picture, plan_page(site, planned))
+    if as_json:
+        print_json(plan_doc(planned))
+        return
+    _print(planned, out, picture)
+
+
+def _print(planned: Planned, out: Path | None, picture: Path | None) -> None:
+    from service.workflows.plan import BOUND_NOTE, goal_words, step_rows
+
+    print_table(HEADINGS, step_rows(planned.plan), f"{planned.plan.minutes:.0f} minutes, set-ups included")
+    typer.echo(BOUND_NOTE)
+    for line in goal_words(planned.plan):
+        typer.echo(line)
+    typer.echo("this campaign cannot tell:")
+    for text in planned.plan.open_questions:
+        typer.echo(f"- {text}")
+    if picture is not None:
+        typer.echo(f"picture: {picture}")
+    if out is not None:
+        typer.echo(f"recipe: {out}; run it with `abbe measure MACHINE.toml --recipe {out}`")

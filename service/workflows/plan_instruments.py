@@ -1,0 +1,78 @@
+"""The instruments file of `abbe plan --instruments FILE.toml`: which bars there are, how well they read, how long set-ups take."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from models.planning.instruments import BAR_LENGTHS_MM, Instruments, SetupMinutes
+from service.config import read_toml
+from service.errors import ConfigError
+from service.explain import expected, nearest, where
+
+USUAL = SetupMinutes()
+Micrometres = Annotated[float, Field(gt=0.0, le=1000.0)]
+Minutes = Annotated[float, Field(ge=0.0, le=1440.0)]
+Length = Annotated[float, Field(ge=10.0, le=2000.0)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class SetupTable(_Table):
+    """``[setup]``: minutes a person needs."""
+
+    cup_min: Minutes = USUAL.cup
+    bar_min: Minutes = USUAL.bar
+    line_min: Minutes = USUAL.line
+    diagonal_min: Minutes = USUAL.diagonal
+
+
+class InstrumentsFile(_Table):
+    """What there is to measure with; a key left out keeps its default."""
+
+    bar_lengths_mm: tuple[Length, ...] = BAR_LENGTHS_MM
+    laser: bool = True
+    bar_noise_um: Micrometres = 0.5
+    laser_noise_um: Micrometres = 0.3
+    bar_length_u_um: Micrometres = 2.0
+    setup: SetupTable = SetupTable()
+
+
+def read_instruments(path: Path | None) -> Instruments:
+    """Instruments from a file; without one, the planner's defaults.
+
+    Raises
+    ------
+    ConfigError
+        File, key and what is expected there.
+    """
+    if path is None:
+        return Instruments()
+    if not path.exists():
+        raise ConfigError(f"instruments file {path} does not exist", "docs/how-to/plan.md shows one")
+    content = read_toml(path)
+    try:
+        found = InstrumentsFile.model_validate_json(json.dumps(content, default=str), strict=True)
+        times = SetupMinutes(found.setup.cup_min, found.setup.bar_min, found.setup.line_min, found.setup.diagonal_min)
+        return Instruments(
+            tuple(sorted(set(found.bar_lengths_mm))),
+            found.laser,
+            found.bar_noise_um * 1e-3,
+            found.laser_noise_um * 1e-3,
+            u_bar_length_mm=found.bar_length_u_um * 1e-3,
+            setup=times,
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = first["loc"]
+        if first["type"] == "extra_forbidden":
+            table = SetupTable if place[0] == "setup" and len(place) > 1 else InstrumentsFile
+            raise ConfigError(f"{path}: unknown key {where(place)!r}", nearest(str(place[-1]), table.model_fields)) from None
+        raise ConfigError(f"{path}: {where(place)}: {expected(first)}", "correct it; docs/how-to/plan.md shows a file") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}", "give bar_lengths_mm or laser = true") from None
