@@ -17,7 +17,12 @@ from models.compensation.masking import blend
 from models.compensation.tables import grid_positions
 from models.geometry.chain import design
 from models.solvers.joint import JointSolution
-from models.volumetric import remove_rigid, rigid_design
+from models.uncertainty.frame import RigidFree
+from models.uncertainty.inputs import Inputs
+from models.uncertainty.mask import compensable_mask
+from models.uncertainty.prediction import predict_deviation
+from models.uncertainty.sources import error_sources
+from models.volumetric import rigid_design
 
 Mask = NDArray[np.bool_]
 
@@ -99,7 +104,7 @@ def grid_table(
     counts : (int, int, int)
         Nodes of X, Y, Z.
     compensable : array of bool, shape ``counts``, optional
-        Nodes at which to compensate, e.g. `models.compensation.masking.known_better_than_error`; none: all.
+        Nodes at which to compensate, e.g. `compensable_nodes`; none given: all.
     reference : (int, int, int)
         Node that the corrections do not move.
     fitted : bool
@@ -116,10 +121,10 @@ def grid_table(
         raise ValueError(f"grid table: mask of shape {keep.shape} for {counts} nodes")
     if not all(0 <= r < n for r, n in zip(reference, counts, strict=True)):
         raise ValueError(f"grid table: reference node {reference} is outside the grid of {counts} nodes")
-    full = node_design(solution, position, fitted=fitted)
-    error = (full @ solution.coefficients).reshape(*counts, 3)
+    error = (node_design(solution, position, fitted=fitted) @ solution.coefficients).reshape(*counts, 3)
     correction, done = blend(position, error, keep)
-    u = node_uncertainty_mm(full, nodes_mm(position), solution.term_covariance).reshape(*counts, 3)
+    points = nodes_mm(position)
+    u = node_uncertainty_mm(design(solution.machine, solution.terms, points), points, solution.term_covariance).reshape(*counts, 3)
     return GridTable(position, correction - correction[reference], u, done, reference)
 
 
@@ -132,14 +137,16 @@ def node_uncertainty_mm(full: F3, points_mm: F2, covariance: F2) -> F2:
     return np.asarray(np.sqrt(np.sum(free**2, axis=1)).reshape(-1, 3))
 
 
-def known_better_than_error(solution: JointSolution, counts: tuple[int, int, int], coverage: float = 1.0) -> Mask:
-    """Nodes at which the deviation's length exceeds its uncertainty (times ``coverage``), rigid motion removed, shape ``counts``."""
-    position = grid_positions(solution.machine, counts)
-    points = nodes_mm(position)
-    full = node_design(solution, position)
-    size = np.linalg.norm(remove_rigid(points, full @ solution.coefficients), axis=1)
-    u = np.linalg.norm(node_uncertainty_mm(full, points, solution.term_covariance), axis=1)
-    return np.asarray((size > coverage * u).reshape(counts))
+def compensable_nodes(
+    solution: JointSolution, counts: tuple[int, int, int], *, inputs: Inputs | None = None, k: float | None = None
+) -> Mask:
+    """Nodes at which the deviation is larger than its expanded uncertainty (`models.uncertainty.mask`), shape ``counts``.
+
+    All sources of uncertainty count; the deviation is that without rigid motion over the grid. ``k``: coverage factor, default 95 %.
+    """
+    points = nodes_mm(grid_positions(solution.machine, counts))
+    prediction = predict_deviation(error_sources(solution, inputs), points, frame=RigidFree(points))
+    return compensable_mask(prediction, k=k).points.reshape(counts)
 
 
 def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:

@@ -7,7 +7,7 @@ A motion that the data do not tell apart is not written under its name. Two ways
   known together with a hidden motion stays uncorrected;
 - `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Right at this tool length only, and so labelled.
 
-Either way the values of the motions that are written are those that reproduce the identified deviation best.
+In the first case every motion has its own estimate; in the second those that are written take over what the others did at this tool.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class MotionTables:
 def motion_tables(
     solution: JointSolution, counts: tuple[int, int, int], motions: frozenset[str] | set[str], *, any_tool: bool = True
 ) -> MotionTables:
-    """Tables of the named motions only, at their best values for the identified deviation with the machine's own tool.
+    """Tables of the named motions only.
 
     Parameters
     ----------
@@ -84,7 +84,8 @@ def motion_tables(
     motions : set of str
         What may be written: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``.
     any_tool : bool
-        Whether these motions are observable by themselves; False for `enough_for_the_field`.
+        Whether these motions are observable by themselves: then each has its own estimate. False, for `enough_for_the_field`: values that
+        reproduce the identified deviation with the machine's own tool best, all others being zero.
 
     Raises
     ------
@@ -96,30 +97,34 @@ def motion_tables(
         raise ValueError(f"motion tables: {', '.join(sorted(set(motions) - known)) or 'no motion'} cannot be written")
     machine, keep = solution.machine, [i for i, t in enumerate(solution.terms) if t.motion in motions]
     grids = grid_positions(machine, counts)
-    operator = _refit(solution, keep) if motions < known else np.eye(len(solution.terms))
-    chosen = tuple(solution.terms[i] for i in keep)
-    values: dict[str, F1] = {}
-    u: dict[str, F1] = {}
-    for name in sorted(motions):
-        mine = [k for k, t in enumerate(chosen) if t.motion == name]
-        axis = chosen[mine[0]].axis
-        points = np.tile(machine.centre_mm, (grids[axis].size, 1))
-        points[:, axis] = grids[axis]
-        rows = np.ones((1, 1)) if name in SQUARENESS else term_values(tuple(chosen[k] for k in mine), points, machine.stroke_mm)
-        gradient = rows @ operator[mine]
-        values[name] = gradient @ solution.coefficients
-        u[name] = np.sqrt(np.maximum(np.einsum("nk,kl,nl->n", gradient, solution.term_covariance, gradient), 0.0))
-    square = [n for n in SQUARENESS if n in motions]
+    operator = np.eye(len(solution.terms))[keep] if any_tool else _refit(solution, keep)
+    entries = {name: _entries(solution, name, grids, keep, operator) for name in sorted(motions)}
+    functions = {n: e for n, e in entries.items() if n not in SQUARENESS}
+    square = {n: e for n, e in entries.items() if n in SQUARENESS}
     return MotionTables(
         machine,
         grids,
-        {n: v for n, v in values.items() if n not in square},
-        {n: v for n, v in u.items() if n not in square},
-        {n: float(values[n][0]) for n in square},
-        {n: float(u[n][0]) for n in square},
+        {n: e[0] for n, e in functions.items()},
+        {n: e[1] for n, e in functions.items()},
+        {n: float(e[0][0]) for n, e in square.items()},
+        {n: float(e[1][0]) for n, e in square.items()},
         tuple(sorted(known - motions)),
         any_tool,
     )
+
+
+def _entries(solution: JointSolution, name: str, grids: tuple[F1, F1, F1], keep: list[int], operator: F2) -> tuple[F1, F1]:
+    """Values and standard uncertainties of one motion on the grid of its axis; of a squareness one value (rad)."""
+    machine = solution.machine
+    mine = [k for k, i in enumerate(keep) if solution.terms[i].motion == name]
+    terms = tuple(solution.terms[keep[k]] for k in mine)
+    axis = terms[0].axis
+    points = np.tile(machine.centre_mm, (grids[axis].size, 1))
+    points[:, axis] = grids[axis]
+    rows = np.ones((1, 1)) if name in SQUARENESS else term_values(terms, points, machine.stroke_mm)
+    gradient = rows @ operator[mine]
+    variance = np.einsum("nk,kl,nl->n", gradient, solution.term_covariance, gradient)
+    return gradient @ solution.coefficients, np.sqrt(np.maximum(variance, 0.0))
 
 
 def seen_by_rank(solution: JointSolution) -> frozenset[str]:
@@ -136,13 +141,14 @@ def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
 
     def rank(motions: set[str]) -> int:
         at = [i for i, n in enumerate(names) if n == "rigid" or n in motions]
-        return int(np.linalg.matrix_rank(triangle[:, at], tol=RANK_TOLERANCE * np.sqrt(len(names))))
+        return int(np.linalg.matrix_rank(triangle[:, at], tol=RANK_TOLERANCE))
 
     kept = {t.motion for t in solution.terms}
     whole = rank(kept)
-    for t in sorted(solution.terms, key=lambda t: (-t.component, -t.axis)):
-        if t.motion in kept and t.order > 0 and rank(kept - {t.motion}) == whole:
-            kept = kept - {t.motion}
+    motions = {(t.component, t.axis): t.motion for t in solution.terms if t.order > 0}
+    for _, name in sorted(motions.items(), reverse=True):
+        if rank(kept - {name}) == whole:
+            kept = kept - {name}
     return frozenset(kept)
 
 
