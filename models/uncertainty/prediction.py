@@ -115,16 +115,28 @@ def predict_deviation(
     return Prediction(points, deviation, covariance, tuple(s.name for s in sources.sources), variance, effective, probability)
 
 
+def propagated_covariance(per_unit: F3, factor: F2) -> F3:
+    """Covariance of vectors that depend linearly on coefficients of covariance factor factor^T (GUM eq 13), shape (m, 3, 3).
+
+    Parameters
+    ----------
+    per_unit : array, shape (m, 3, p)
+        Vector per unit of each coefficient.
+    factor : array, shape (p, q)
+    """
+    m, k, p = per_unit.shape
+    influence = (per_unit.reshape(m * k, p) @ factor).reshape(m, k, -1)
+    return np.asarray(influence @ np.swapaxes(influence, 1, 2))
+
+
 def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFree | None) -> tuple[F2, F3, F3]:
     d = field(sources.solution.machine, sources.terms, points, tool_mm, frame)
     covariance = np.zeros((len(points), 3, 3))
     variance = np.zeros((len(sources.sources), len(points), 3))
     for k, source in enumerate(sources.sources):
-        influence = d @ source.factor
-        share = influence @ np.swapaxes(influence, 1, 2) + source.scatter_mm**2 * np.eye(3)
+        share = propagated_covariance(d, source.factor) + source.scatter_mm**2 * np.eye(3)
         if source.less is not None:
-            off = d @ source.less
-            share = _not_negative(share - off @ np.swapaxes(off, 1, 2))
+            share = _not_negative(share - propagated_covariance(d, source.less))
         covariance += share
         variance[k] = np.einsum("mii->mi", share)
     return d @ sources.coefficients, covariance, variance

@@ -20,6 +20,8 @@ from tests.bench import report
 from tests.bench.case import CASES, make
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS, contestants
 from tests.bench.facts import facts
+from tests.bench.trials_contestants import TRIAL_CASES
+from tests.bench.trials_judge import judged
 
 ROUNDING_MM = 1e-12
 SECOND_ORDER_MM = 1e-5
@@ -32,10 +34,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make bench ARGS=...", description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3, help="how often each contestant's process is run (default 3)")
     parser.add_argument("--json", type=Path, help="write all figures to this file as well")
+    parser.add_argument("--only", choices=("map", "trials"), help="the error map alone, or trials, propagation and joint solution alone")
     given = parser.parse_args()
-    found = {"facts": facts(), "cases": {}}
+    found = {"facts": facts(), "cases": {}, "trials": {}}
     with tempfile.TemporaryDirectory() as folder:
-        for name in CASES:
+        for name in CASES if given.only != "trials" else ():
             names = list(contestants(name))
             runs = {k: [] for k in names}
             for n in range(given.rounds):
@@ -44,10 +47,38 @@ def main() -> int:
                     runs[k].append(_run(name, k, Path(folder) / f"{name}-{k}.npy"))
             _progress("")
             found["cases"][name] = {"contestants": {k: _summary(v) for k, v in runs.items()}, "agreement": _agreement(name, Path(folder))}
+        for name, names in TRIAL_CASES.items() if given.only != "map" else ():
+            found["trials"][name] = _trials(name, list(names), given.rounds, Path(folder))
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(report.text(found))  # noqa: T201
-    return 0 if all(a["ok"] for case in found["cases"].values() for a in case["agreement"].values()) else 1
+    whole = [*found["cases"].values(), *found["trials"].values()]
+    return 0 if all(a["ok"] for case in whole for a in case["agreement"].values()) else 1
+
+
+def _trials(name: str, names: list[str], rounds: int, folder: Path) -> dict:
+    runs = {k: [] for k in names}
+    for n in range(rounds):
+        for k in names:
+            _progress(f"{name}, round {n + 1} of {rounds}: {k}")
+            runs[k].append(_run(name, k, folder / f"{name}-{k}.npz"))
+    _progress("")
+    results = {k: dict(np.load(folder / f"{name}-{k}.npz")) for k in names}
+    return {"contestants": {k: _trial_summary(v) for k, v in runs.items()}, "agreement": judged(name, results)}
+
+
+def _trial_summary(runs: list[dict]) -> dict:
+    """Best and middle time of one call and per item (trial, point, solution)."""
+    times = np.array([t for r in runs for t in r["times_s"]])
+    beyond = [r["beyond_mb"] for r in runs]
+    return {
+        "min_s": float(times.min()),
+        "median_s": float(np.median(times)),
+        "calls": len(times),
+        "items": runs[0]["items"],
+        "per_item_s": float(times.min()) / runs[0]["items"],
+        "beyond_mb": None if None in beyond else max(beyond),
+    }
 
 
 def _progress(words: str) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from tests.bench import trials_report
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS
+from tests.bench.facts import LIBRARIES
 
 GOALS = {"numpy": {"htm": 25, "sympy": 12, "pytransform3d": 12}, "compiled": {"htm": 200, "sympy": 100, "pytransform3d": 100}}
 GOALS["compiled-1"] = GOALS["compiled"]
@@ -33,21 +35,26 @@ def text(found: dict) -> str:
     words = {**WORDS, "compiled": f"ours, compiled, {f['threads']} threads"}
     busy = "" if f["load"] is None else f", load {f['load']:.1f} at the start"
     lines = [
-        "Deviation of a machine with 21 errors, tables of 51 nodes, float64",
+        "Deviation of a machine with 21 errors, tables of 51 nodes, float64; trials and propagation of uncertainties",
         f"{f['processor']}, {f['cores']} cores{busy}; {f['system']}, Python {f['python']}",
-        ", ".join(f"{k} {f[k]}" for k in ("numpy", "scipy", "numba", "sympy", "pytransform3d")),
+        ", ".join(f"{k} {f[k]}" for k in LIBRARIES),
     ]
     for name, case in found["cases"].items():
         lines += ["", *_times(name, case, words), *_plainly(name, case), "", *_goals(name, case, words), "", *_results(case, words)]
-    lines += [
-        "",
-        "Ratios are of best times. Beyond MB: largest rise of resident memory during one call, result excluded, libraries loaded before.",
-        "Process MB: everything, with interpreter, libraries, points and result. Look-up: share of the best time that table values take.",
-        "Peers (a) to (c) search the tables by numpy.interp, on the grid at its 3 x 100 positions only; ours know that the nodes are even",
-        "and prepare the straight pieces before the clock starts. The rows below (c) get more help, and have no goal.",
-        "Times never fail this run, differing results do.",
-    ]
-    return "\n".join(lines)
+    if found["cases"]:
+        lines += MAP_NOTES
+    if found["trials"]:
+        lines += trials_report.lines(found["trials"])
+    return "\n".join([*lines, "", "Times never fail this run, differing results do."])
+
+
+MAP_NOTES = [
+    "",
+    "Ratios are of best times. Beyond MB: largest rise of resident memory during one call, result excluded, libraries loaded before.",
+    "Process MB: everything, with interpreter, libraries, points and result. Look-up: share of the best time that table values take.",
+    "Peers (a) to (c) search the tables by numpy.interp, on the grid at its 3 x 100 positions only; ours know that the nodes are even",
+    "and prepare the straight pieces before the clock starts. The rows below (c) get more help, and have no goal.",
+]
 
 
 def _times(name: str, case: dict, words: dict) -> list[str]:
