@@ -29,7 +29,7 @@ from models.solvers.observability_rank import (
     stated_knowledge,
     what_is_seen,
 )
-from models.solvers.observability_volume import Knowing, Number, Volume, observability_number, volume_at, whole_volume
+from models.solvers.observability_volume import Knowing, Number, Plane, Volume, observability_number, plane_at, volume_at, whole_volume
 from models.solvers.observations import RunData
 from models.solvers.observe import setup_unknowns
 from models.solvers.priors import Priors, size_model
@@ -90,6 +90,10 @@ class Observability:
     def at(self, axes_mm: F2) -> Volume:
         """Prior size, uncertainty and noise gain at commanded positions (n, 3), mm."""
         return volume_at(self.machine, self.model, self.knowing, axes_mm)
+
+    def plane(self, fixed: int = 2, nodes: int = 15) -> Plane:
+        """The same over the plane in the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture: nodes x nodes points."""
+        return plane_at(self.machine, self.model, self.knowing, fixed, nodes)
 
     def lines(self) -> tuple[str, ...]:
         """The report in short sentences, most important first."""

@@ -3,6 +3,10 @@
 Convention of math.md 4.6: columns of unit length, everything unknown about the set-up projected out, singular values counted down to 1e-9
 (rank) and 1e-3 (effective rank) of the largest. Priors do not count: a typical size is no measurement. What counts beside the readings is
 what somebody measured or certified about the set-up (`Knowledge`): a calibrated bar, a laser whose drift the maker states.
+
+The rank does not depend on the functions in which error motions are written, the effective rank does: Legendre polynomials are nearly
+independent of each other on the readings and keep more of it than powers of the position, of which math.md states its figures
+(`models.solvers.designs.ranks` of the papers' problems has those).
 """
 
 from __future__ import annotations

@@ -70,6 +70,22 @@ class Volume:
 
 
 @dataclass(frozen=True)
+class Plane:
+    """Figures over one plane of the volume: values of ``volume`` in rows of ``second_mm``, i.e. ``u_mm.reshape(len(second), len(first))``.
+
+    ``first``, ``second``, ``fixed``: axis indices across, up and through the plane, which lies at ``fixed_mm``.
+    """
+
+    first: int
+    second: int
+    fixed: int
+    fixed_mm: float
+    first_mm: F1
+    second_mm: F1
+    volume: Volume
+
+
+@dataclass(frozen=True)
 class Number:
     """The observability number: how many times smaller the volumetric error of a typical machine can become by these runs.
 
@@ -129,6 +145,15 @@ def volume_at(machine: Machine, terms: tuple[Term, ...], knowing: Knowing, axes_
     return Volume(axes_mm, _length(prior), _length(posterior), np.sqrt(np.maximum(largest, 0.0)), _length(noise), inner)
 
 
+def plane_at(machine: Machine, terms: tuple[Term, ...], knowing: Knowing, fixed: int, nodes: int) -> Plane:
+    """`volume_at` over the plane through the middle of the stroke of axis ``fixed``, over the whole strokes of the other two."""
+    first, second = (a for a in range(3) if a != fixed)
+    x, y = (np.linspace(machine.stroke_mm[a, 0], machine.stroke_mm[a, 1], nodes) for a in (first, second))
+    points = np.empty((nodes * nodes, 3))
+    points[:, first], points[:, second], points[:, fixed] = np.tile(x, nodes), np.repeat(y, nodes), machine.centre_mm[fixed]
+    return Plane(first, second, fixed, float(machine.centre_mm[fixed]), x, y, volume_at(machine, terms, knowing, points))
+
+
 def whole_volume(machine: Machine, terms: tuple[Term, ...], knowing: Knowing) -> Volume:
     """`volume_at` on a grid of 11 nodes per axis over the strokes, x slowest."""
     return volume_at(machine, terms, knowing, volume_grid(machine.stroke_mm, NODES))
@@ -152,7 +177,7 @@ def observability_number(volume: Volume) -> Number:
     that is corrected, and can be read on the shop floor: at 10, a machine with 30 um of volumetric error can be brought to 3 um, no
     better. Without runs it is 1. Thresholds: below 3, more than a tenth of the variance (1/3^2) that a typical machine has stays unknown:
     what would be written there is mostly what was assumed about machines, and not worth the risk. From 10 on it is at most a hundredth,
-    and repeatability and temperature decide.
+    and repeatability and temperature decide. Not in it: what functions of the model's order cannot follow, and what changes with time.
     """
     prior, u = volume.prior_mm[volume.inner], np.maximum(volume.u_mm[volume.inner], 1e-12)
     k = int(np.argmax(u))
