@@ -40,11 +40,11 @@ class CompensableMask:
 
     def text(self) -> str:
         """One line for people."""
-        left = 1.0 - self.share
-        if left == 0.0:
+        left = int((~self.points).sum())
+        if left == 0:
             return "The deviation is larger than its uncertainty everywhere."
         k = np.median(self.coverage_factor)
-        return f"At {left:.0%} of the points the uncertainty (k = {k:.2f}) is larger than the error: not compensated."
+        return f"At {left} of {self.points.size} points the uncertainty (k = {k:.2f}) is larger than the error: not compensated."
 
 
 def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest_mm: float = 0.0) -> CompensableMask:

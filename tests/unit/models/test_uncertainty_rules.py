@@ -29,7 +29,7 @@ def test_a_component_may_be_compensated_where_it_exceeds_its_expanded_uncertaint
     assert mask.components.tolist() == [[False, False, False], [True, True, False]]
     assert mask.points.tolist() == [False, True]
     assert mask.share == 0.5
-    assert "50%" in mask.text()
+    assert "1 of 2 points" in mask.text()
     assert "k = 1.96" in mask.text()
     assert not compensable_mask(p, k=3.0).points.any()
     assert not compensable_mask(p, smallest_mm=5e-3).points.any()
