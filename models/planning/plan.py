@@ -130,10 +130,8 @@ def plan_campaign(
     """
     if not 0 < minutes < np.inf or (goal_mm is not None and not 0 < goal_mm < np.inf):
         raise ValueError("planner: minutes and goal must be positive numbers")
-    tools = tools or Instruments()
-    what = problem(machine, tools, PLAN_ORDER, priors)
-    search = Search(what, candidates(machine, tools, vertical), INNER_SHARE, progress)
-    rows = field_rows(what, INNER_SHARE, REPORT_NODES)
+    search = searcher(machine, tools or Instruments(), priors, vertical, progress)
+    rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     if goal_mm is None:
         chosen, reached = search.exchange(search.fill({}, minutes), minutes, PASSES), False
     else:
@@ -149,6 +147,17 @@ def plan_campaign(
     else:
         needed = minutes_needed(search, rows, goal_mm, chosen) if floor_mm < goal_mm else None
     return replace(plan, goal=Goal(goal_mm, reached, needed, floor_mm, limit_by))
+
+
+def searcher(
+    machine: Machine,
+    tools: Instruments,
+    priors: Priors | None = None,
+    vertical: int = 2,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Search:
+    """The search that `plan_campaign` uses: all candidates, judged with the planner's order over the inner volume."""
+    return Search(problem(machine, tools, PLAN_ORDER, priors), candidates(machine, tools, vertical), INNER_SHARE, progress)
 
 
 def laid_out(search: Search, chosen: Chosen) -> Plan:

@@ -1,0 +1,205 @@
+"""Recipe files: what is written is read back the same; what cannot run is refused in one line; the plan is what the sequencer moves."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from models.machine import Machine
+from models.paths.lines import DIAGONALS
+from models.planning.instruments import Instruments
+from models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
+from models.planning.plan import Step
+from service.cli.app import app
+from service.errors import AbbeError, ConfigError
+from service.sequences.check import dry_run, dry_run_campaign
+from service.sequences.recipe_file import parse_recipe, read_recipe, recipe_text
+from service.sequences.recipes import Diagonal, Helix, Linear
+from service.sequences.setups import shared_setups
+from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, Unmount
+from service.site import Site, machine_doc
+from service.workflows.plan import plan_for, recipe_of, words
+from service.workflows.plan_instruments import read_instruments
+
+MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
+names = st.text("abcXYZ019-_ äµ", min_size=1, max_size=12).filter(lambda s: s == s.strip())
+millimetres = st.floats(-2000.0, 2000.0, allow_nan=False)
+roles = st.sampled_from(["identify", "holdout"])
+helices = st.builds(
+    Helix,
+    names,
+    names,
+    roles,
+    st.tuples(millimetres, millimetres, millimetres),
+    st.floats(1.0, 2000.0),
+    turns=st.floats(3.0, 50.0),
+    law=st.sampled_from(["area", "angle"]),
+    axis=st.integers(0, 2),
+    direction=st.sampled_from([1, -1]),
+    rate_hz=st.sampled_from([50, 100, 1000]),
+)
+diagonals = st.builds(
+    Diagonal, names, names, roles, st.sampled_from(list(DIAGONALS)), st.integers(1, 500), st.sampled_from(["XYZ", "ZYX", ""])
+)
+share = st.floats(0.0, 1.0)
+lines = st.builds(Linear, names, names, roles, st.integers(0, 2), n=st.integers(5, 1000), at=st.tuples(share, share))
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(helices | diagonals | lines, min_size=1, max_size=5, unique_by=(lambda r: r.label, lambda r: r.setup_id)), names)
+def test_any_campaign_comes_back_from_its_file_as_it_went_in(recipes, name):
+    told = shared_setups(tuple(recipes), "f")
+    assert parse_recipe(recipe_text(name, told, "a note"), "f") == (name, told)
+
+
+def site() -> Site:
+    return Site("m", MACHINE, machine_doc("m", MACHINE), None)
+
+
+@pytest.fixture(scope="module")
+def planned():
+    return plan_for(site(), minutes=25.0)
+
+
+def test_a_plan_written_and_read_is_the_same_campaign(planned, tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text(planned.text)
+    name, recipes = read_recipe(path)
+    assert CampaignPlan(name, tuple(r.plan(MACHINE) for r in recipes)) == planned.campaign
+
+
+def test_the_sequencer_moves_where_the_planner_thinks_and_takes_as_long(planned):
+    for step, run, test, dry in zip(planned.plan.steps, planned.plan.runs, planned.campaign.tests, planned.dry, strict=True):
+        path = np.array([p for s in test.steps if isinstance(s, RecordPath) for p in s.points_mm])
+        near = np.linalg.norm(path[None] - run.axes_mm[::40, None], axis=2).min(axis=1) if len(path) else np.zeros(1)
+        assert near.max() < 1.0  # chords of the path are a millimetre long
+        assert dry.duration_s == pytest.approx(machine_seconds(MACHINE, step.test), rel=0.02, abs=1.5)
+
+
+@pytest.mark.parametrize("test", [DiagonalTest("pnp", "YZX"), DiagonalTest("ppp", ""), LineTest(1, (0.1, 0.9)), LineTest(2, (0.5, 0.5))])
+def test_laser_positions_are_those_of_the_sequencer(test):
+    plan = recipe_of(Step("a", "S1", test, 0.0, 0.0, 0.0, 0.0)).plan(MACHINE)
+    moves = [s.target_mm for s in plan.steps if isinstance(s, MoveTo)][1:]
+    path, beam = laser_path(MACHINE, test)
+    kept = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > 0]]
+    assert moves == pytest.approx(kept, abs=1e-5)
+    assert next(s for s in plan.steps if isinstance(s, MountLaser)).beam == pytest.approx(beam)
+    assert dry_run(MACHINE, plan).duration_s == pytest.approx(machine_seconds(MACHINE, test), abs=1.0)
+
+
+def test_one_set_up_is_mounted_once_and_its_bar_changed_at_the_standing_cup():
+    cup = (300.0, 250.0, 50.0)
+    recipes = (
+        Helix("a", "S1", "identify", cup, 150.0),
+        Helix("b", "S1", "identify", cup, 100.0),
+        Helix("c", "S1", "identify", cup, 100.0, direction=-1),
+        Diagonal("d", "S2", "identify", "ppp", 6, "XYZ"),
+        Diagonal("e", "S2", "identify", "ppp", 6, ""),
+    )
+    by_hand = MountBar | ChangeBar | MountLaser | Unmount
+    plans = [r.plan(MACHINE) for r in shared_setups(recipes, "f")]
+    done = [type(s).__name__ for p in plans for s in p.steps if isinstance(s, by_hand)]
+    assert done == ["MountBar", "ChangeBar", "Unmount", "MountLaser", "Unmount"]
+    dry_run_campaign(MACHINE, CampaignPlan("n", tuple(plans)))
+
+
+GOOD = recipe_text("n", (Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0), Linear("l", "S2", "identify", 1, at=(0.1, 0.9))))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("radius_mm = 150.0", 'radius_mm = "150"', "test[1].radius_mm: expected a number"),
+        ("radius_mm = 150.0", "radius_mm = nan", "test[1].radius_mm"),
+        ("radius_mm", "radius", "did you mean 'radius_mm'"),
+        ("turns = 5.0", "turns = 2.0", "test[1].turns"),
+        ("rate_hz = 100", "rate_hz = 333", "divides 1000"),
+        ('axis = "Y"', 'axis = "W"', "test[2].axis"),
+        ("at_share = [0.1, 0.9]", "at_share = [0.1, 1.9]", "test[2].at_share[2]"),
+        ('kind = "line"', 'kind = "lime"', "'line'"),
+        ('label = "l"', 'label = "a"', "labelled 'a'"),
+        ('label = "l"', 'label = "a/b"', "test[2].label"),
+        ('setup = "S2"', 'setup = "S1"', "cannot share set-up 'S1'"),
+        ("abbe-recipe/1", "abbe-recipe/9", "format"),
+        ('name = "n"', "name = ", "not valid TOML"),
+        ("[[test]]", "[test]", "f.toml"),
+        (GOOD, "", "missing"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line_that_says_where(old, new, says):
+    with pytest.raises(ConfigError) as caught:
+        parse_recipe(GOOD.replace(old, new), "f.toml")
+    text = str(caught.value)
+    assert text.startswith("f.toml")
+    assert says in text
+    assert "\n" not in text
+
+
+def test_set_ups_that_cannot_be_shared_are_named():
+    cup = (300.0, 250.0, 50.0)
+    first = Helix("a", "S1", "identify", cup, 150.0)
+    for second, says in (
+        (Helix("b", "S1", "identify", (301.0, 250.0, 50.0), 150.0), "another cup"),
+        (Helix("b", "S1", "identify", cup, 150.0), "must run back"),
+        (Linear("b", "S1", "identify", 0), "share a set-up"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            shared_setups((first, second), "f")
+    with pytest.raises(ConfigError, match="another alignment"):
+        shared_setups((Diagonal("a", "D", "identify", "ppp"), Diagonal("b", "D", "identify", "npp")), "f")
+    with pytest.raises(ConfigError, match="taken down before"):
+        shared_setups((first, Linear("b", "S2", "identify", 0), Helix("c", "S1", "identify", cup, 100.0)), "f")
+
+
+MACHINE_TOML = 'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0.0, 600.0]\nY = [0.0, 500.0]\nZ = [0.0, 450.0]\n'
+
+
+def test_the_commands_plan_write_and_dry_run(tmp_path):
+    machine, out, page = tmp_path / "m.toml", tmp_path / "p.toml", tmp_path / "p.html"
+    machine.write_text(MACHINE_TOML)
+    (tmp_path / "i.toml").write_text("bar_lengths_mm = [100.0, 150.0]\nlaser = false\n[setup]\ncup_min = 2.0\n")
+    words = ["plan", str(machine), "--minutes", "9", "--out", str(out), "--picture", str(page), "--instruments", str(tmp_path / "i.toml")]
+    found = CliRunner().invoke(app, [*words, "--goal-um", "1"])
+    assert found.exit_code == 0, found.output
+    assert "goal 1 µm is not reached" in found.output
+    assert "this campaign cannot tell" in found.output
+    assert {r.radius_mm for r in read_recipe(out)[1]} <= {100.0, 150.0}
+    html = page.read_text()
+    assert "<polyline" in html
+    assert "http" not in html
+    dry = CliRunner().invoke(app, ["measure", str(machine), "--recipe", str(out), "--dry-run"])
+    assert dry.exit_code == 0, dry.output
+    assert "of machine time" in dry.output
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("bar_length_mm = [100.0]", "did you mean 'bar_lengths_mm'"),
+        ("laser_noise_um = -1.0", "laser_noise_um"),
+        ("bar_lengths_mm = []\nlaser = false", "neither a ball-bar nor a laser"),
+        ("[setup]\ncup_min = 'three'", "setup.cup_min"),
+        ("[setup]\ncups_min = 3.0", "did you mean 'cup_min'"),
+    ],
+)
+def test_an_instruments_file_says_what_is_wrong_in_it(tmp_path, text, says):
+    path = tmp_path / "i.toml"
+    path.write_text(text + "\n")
+    with pytest.raises(AbbeError, match=says):
+        read_instruments(path)
+
+
+def test_instruments_default_to_the_planners_own():
+    assert read_instruments(None) == Instruments()
+
+
+def test_too_few_minutes_are_one_clear_line():
+    with pytest.raises(ConfigError, match="no measurement fits into 1 minutes"):
+        plan_for(site(), minutes=1.0)
+
+
+def test_words_for_the_operator_name_every_kind():
+    assert words(HelixTest((1.0, 2.0, 3.0), 150.0)) == "ball-bar 150 mm about (1, 2, 3)"
+    assert words(LineTest(1, (0.1, 0.9))) == "laser along Y, X at 10 %, Z at 90 % of the stroke"
+    assert words(DiagonalTest("ppp", "")) == "laser, body diagonal ppp, straight"
