@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from service.config_schema import MachineFile
 from service.runs.formats import CampaignFile, ErrorsFile, RunFile
 from service.runs.machine_object import MachineObject
+from service.runs.solution_file import SolutionFile
 
 MODELS: dict[str, type[BaseModel]] = {
     "machine-file": MachineFile,
@@ -17,6 +18,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "run": RunFile,
     "campaign": CampaignFile,
     "errors": ErrorsFile,
+    "solution": SolutionFile,
 }
 
 

@@ -38,8 +38,8 @@ WIDE = Priors(
 """Wider than those of the solution: a bad machine or a clumsy set-up is no reason to suspect a file."""
 ORDER = 10
 BLOCKS = 120
-STRONG = 25.0
-"""Difference of log evidence (natural) above which a cause is named."""
+STRONG, NAMED = 25.0, 5.0
+"""Least gain of log evidence (natural) for which a run is suspected at all; by which a named cause has to be better than none."""
 FACTORS = {"um": 1e-3, "inch": 25.4, "sign": -1.0, "mm_as_um": 1e3, "mm_as_inch": 1.0 / 25.4}
 """What the deviations of a run would have to be multiplied by, if they were written in another unit or with the other sign."""
 SWAPS = {"swap_xy": (0, 1), "swap_yz": (1, 2), "swap_xz": (0, 2)}
@@ -49,6 +49,8 @@ GROSS, GROSS_MM = 4.0, 2e-3
 SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
 OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
 """A reading that the rest of its run misses by so many standard deviations does not count here; at most this share of a run."""
+SURE_SIGMA = 5.0
+"""A reading that all other readings of the campaign miss by so many standard deviations is an outlier, not a sign of a bad run."""
 OUTLIER_MM = 0.1
 """Width of the range in which an outlier may lie."""
 LARGE_MM = 0.3
@@ -95,13 +97,17 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A run as it is and with each possible mistake undone; ``first_setup``: where the unknowns of the set-ups begin."""
+    """A run as it is and with each possible mistake undone.
+
+    ``first_setup``: where the unknowns of the set-ups begin; ``cleaned``: outliers were taken out of it against the other runs.
+    """
 
     label: str
     as_is: _Part
     undone: dict[str, _Part]
     sigma_mm: float
     first_setup: int
+    cleaned: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,9 +140,38 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
         worst = _worst(left, limit)
         if worst is None:
             break
-        found.append(worst)
-        left = [r for r in left if r.label != worst.run]
+        run = next(r for r in left if r.label == worst.run)
+        left.remove(run)
+        cleaned = None if run.cleaned else _cleaned(run, _together([r.as_is for r in left]))
+        if cleaned is None:
+            found.append(worst)
+        else:
+            left.append(cleaned)
     return tuple(found)
+
+
+def _cleaned(run: _Run, others: _Posterior) -> _Run | None:
+    """The run without readings that the other runs show to be outliers, which few readings alone may not; None: there are no such."""
+    part = run.as_is
+    spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
+    off, drop = part.y - part.a @ others.theta, np.zeros(part.y.size, dtype=bool)
+    while True:
+        precision = linalg.inv(spread[~drop] @ spread[~drop].T + np.eye(int((~drop).sum())))
+        z = precision @ off[~drop] / np.sqrt(np.diag(precision))
+        if np.abs(z).max() <= SURE_SIGMA:
+            break
+        drop[np.flatnonzero(~drop)[int(np.argmax(np.abs(z)))]] = True
+        if drop.sum() > OUTLIER_SHARE * drop.size:
+            return None
+    if not drop.any():
+        return None
+    lost = float(drop.sum() * (np.log(OUTLIER_MM) - np.log(run.sigma_mm)))
+    return replace(run, as_is=_Part(part.a[~drop], part.y[~drop], part.log_sigma + lost), undone=_without(run.undone, drop), cleaned=True)
+
+
+def _without(undone: dict[str, _Part], drop: NDArray[np.bool_]) -> dict[str, _Part]:
+    """The same readings left out of every variant that has them all."""
+    return {n: _Part(p.a[~drop], p.y[~drop], p.log_sigma) if p.y.size == drop.size else p for n, p in undone.items()}
 
 
 def _prepared(machine: Machine, runs: Sequence[RunData]) -> list[_Run]:
@@ -252,7 +287,7 @@ def _judged(run: _Run, rest: list[_Part], as_is: float) -> Suspect:
     others = _together(rest)
     best, cause = others.log_evidence + _together([run.as_is]).log_evidence, "other"
     for name, log_p in _conditional(others, run.undone).items():
-        if others.log_evidence + log_p > best + STRONG * (cause == "other"):
+        if others.log_evidence + log_p > best + NAMED * (cause == "other"):
             best, cause = others.log_evidence + log_p, name
     misfit, expected = _misfit(others, run)
     return Suspect(run.label, cause, best - as_is, misfit, expected)

@@ -28,7 +28,6 @@ PER_TURN = 8
 OTHER_RATIO = 8.0
 """A run that misses the others' prediction by so many times what is expected is another machine's (`OTHER_MM` too); below it is a flag."""
 OTHER_MM = 4e-3
-CLEAN_RATIO = 3.0
 
 _READINGS = {
     "um": "its deviations fit the other runs when divided by 1000: deviation_mm holds µm",
@@ -189,18 +188,18 @@ def _row_keys(run: Doc) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
 def check_readings(machine: Machine, data: Sequence[RunData]) -> list[Finding]:
     """Runs whose readings contradict those of the others (`models.solvers.plausibility.suspects`)."""
     found = suspects(machine, data)
-    return [_suspect(s, len(data), alone=len(found) == 1) for s in found]
+    return [_suspect(s, alone=len(found) == 1) for s in found]
 
 
-def _suspect(s: Suspect, count: int, *, alone: bool) -> Finding:
-    if s.tied or count < 3:
-        others = " and ".join((s.run, *s.tied)) if s.tied else s.run
-        what = f"contradicts the others ({_misfit(s)})" if not s.tied else f"one of {others} contradicts the other ({_misfit(s)})"
-        return Finding(s.run, what, "measure them again; with so few runs nobody can say which is wrong", True)
+def _suspect(s: Suspect, *, alone: bool) -> Finding:
+    gross = s.misfit_mm > OTHER_RATIO * s.expected_mm and s.misfit_mm > OTHER_MM
+    if s.tied:
+        who = " or ".join(("it", *(f"run {name}" for name in s.tied)))
+        what = f"contradicts the others ({_misfit(s)}); whether {who} is wrong, these runs cannot tell"
+        return Finding(s.run, what, "measure them again", gross or s.cause != "other")
     if s.cause != "other":
         return Finding(s.run, f"{_READINGS[s.cause]} ({_misfit(s)})", "correct the file, or leave it out (--without)", True)
-    gross = alone and s.misfit_mm > OTHER_RATIO * s.expected_mm and s.misfit_mm > OTHER_MM
-    if gross:
+    if alone and gross:
         what = f"fits none of the other runs ({_misfit(s)}), which fit each other: another machine, tool or table"
         return Finding(s.run, what, "leave it out (--without), or measure it again", True)
     what = f"does not fit the other runs ({_misfit(s)}): the machine changed, or its set-up or tool is not what it says"

@@ -21,8 +21,14 @@ from service.workflows.campaign_checks import Finding, check_files, check_readin
 from service.workflows.provenance import run_digest
 
 LASER_SIGMA_MM = 3e-4
-SEEN_SHARE = 0.2
-"""A parameter whose data explain less than this share of its prior variance is listed as not seen."""
+CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
+"""Set-up unknowns that cannot be off by five times their uncertainty: somebody calibrated them, or would have seen it."""
+UNUSUAL = {
+    "cosine": "the relative length error of its set-up (beam and mirror askew, or its own wavelength)",
+    "bar_drift": "the drift of its ball-bar set-up",
+    "drift": "the drift of its laser",
+    "zero": "the error of its first record",
+}
 ALL_READINGS = 10**9
 PER_UNKNOWN = 2
 """Readings that a campaign needs for every unknown that only readings can tell."""
@@ -76,7 +82,7 @@ def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid2
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
     joint = solve_joint(site.machine, data, model=model, progress=say)
-    check_instruments(joint, data)
+    flags += check_instruments(joint, data)
     spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not tell ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
     return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), {r["run_id"]: run_digest(r) for r in used})
@@ -124,8 +130,8 @@ def check_enough(data: list[RunData], model: Model) -> None:
         )
 
 
-def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> None:
-    """Refuse a solution in which a bar, cup or mirror would have to be impossibly wrong.
+def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[Finding]:
+    """Refuse a solution in which a bar, cup, mirror or the laser's scale would have to be impossibly wrong; other set-up errors are flags.
 
     Raises
     ------
@@ -134,12 +140,24 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> None:
     """
     setup = setup_unknowns(data, Priors())
     found = implausible(joint, dict(zip(setup.names, (float(v) for v in setup.prior_sd), strict=True)))
-    if found:
-        name, times = found[0]
+    hard = [(name, times) for name, times in found if name.startswith(CALIBRATED)]
+    if hard:
+        name, times = hard[0]
         raise InstrumentsDisagree(
             f"{name.replace('_', ' ')} would have to be {times:.0f} times its calibration uncertainty",
             "check the laser's air compensation, the bar's length and the mirror before measuring again; nothing was written",
         )
+    return [_unusual(name, times, data) for name, times in found]
+
+
+def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> Finding:
+    """A set-up error that is larger than a careful hand leaves, without being impossible."""
+    words = next((text for prefix, text in UNUSUAL.items() if name.startswith(prefix)), name.replace("_", " "))
+    run = next((r.label for r in data if name.endswith(f"_{r.label}")), None)
+    run = run or next((r.label for r in data if f"_{r.setup}" in name), name)
+    return Finding(
+        run, f"{words} of its set-up is {times:.0f} times what is usual", "look at beam, mirror and temperature of that set-up", False
+    )
 
 
 def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -173,30 +191,6 @@ def _step_figures(found: dict[str, dict[str, Any]], order: str) -> dict[str, flo
         figures[f"theta_{name}_urad"] = getattr(contrast, f"theta_{name}") * 1e6
         figures[f"u_theta_{name}_urad"] = getattr(contrast, f"u_{name}") * 1e6
     return figures
-
-
-def not_observable(joint: JointSolution) -> list[str]:
-    """In words: motions that the runs cannot tell apart (grouped over their orders), then parameters that rest on their prior."""
-    groups: dict[tuple[str, ...], list[int]] = {}
-    for combination in joint.identifiability.hidden:
-        parts = [name.partition(".") for name, _ in combination.weights]
-        motions = tuple(sorted({motion for motion, _, _ in parts}))
-        groups.setdefault(motions, []).append(max(int(order or 0) for _, _, order in parts))
-    texts = [_apart(motions, sorted(orders)) for motions, orders in groups.items()]
-    names = [t.name for t, s in zip(joint.terms, joint.estimate.data_share, strict=False) if s < SEEN_SHARE]
-    if names:
-        texts.append(f"{len(names)} coefficients rest on their prior, the data hardly speak of them: {', '.join(names)}")
-    if groups and joint.tool_count == 1:
-        texts.append("all runs used one tool length: what is named above may act differently with another tool")
-    return texts
-
-
-def _apart(motions: tuple[str, ...], orders: list[int]) -> str:
-    span = f"order {orders[0]}" if orders[0] == orders[-1] else f"orders {orders[0]} to {orders[-1]}"
-    if len(motions) == 1:
-        return f"{motions[0]} ({span}) leaves no trace in these runs"
-    count = f"{len(orders)} combination{'s' if len(orders) > 1 else ''}"
-    return f"{', '.join(motions[:-1])} and {motions[-1]} cannot be told apart ({span}, {count})"
 
 
 def helix_misfit(solved: Solved, run: dict[str, Any]) -> float:

@@ -1,0 +1,184 @@
+"""The document of a solution (``abbe-solution/1``) as pydantic models: what `abbe solve --json` prints and the store keeps."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from service.runs.machine_object import FileObject, MachineObject, Point
+
+Status = Literal["observed", "weak", "not observable"]
+Digest = str
+
+
+class Versions(FileObject):
+    """Which program solved it."""
+
+    abbe: str
+    numpy: str
+    scipy: str
+    revision: str | None = None
+
+
+class Inputs(FileObject):
+    """SHA-256 of every run's data by its name, and of all of them with the model: the same campaign solved twice has the same."""
+
+    digest: Digest
+    runs: dict[str, Digest]
+
+
+class ParameterValue(FileObject):
+    """One unknown: value and standard uncertainty in mm, rad or mm/s; how much of what is known comes from the readings."""
+
+    value: float
+    u: float
+    data_share: float
+    status: Status
+
+
+class MeanValue(FileObject):
+    """Mean over the volume: mm/mm for scales, rad for squareness."""
+
+    value: float
+    u: float
+
+
+class MotionValue(FileObject):
+    """One error motion over its stroke: rms standard uncertainty, mm or rad; why it has no table of its own, empty if it may."""
+
+    status: Status
+    u: float
+    data_share: float
+    reason: str
+
+
+class Rank(FileObject):
+    """Singular values above 1e-9 and 1e-3 of the largest, of so many coefficients."""
+
+    rank: int
+    of: int
+    effective_rank: int
+
+
+class ObservabilityNumber(FileObject):
+    """How many times smaller these runs can make the error of a typical machine: at the worst place, at the median."""
+
+    number: float
+    median: float
+    verdict: Literal["good", "usable with care", "mostly assumption"]
+    text: str
+
+
+class CorrelationValue(FileObject):
+    """Two parameters whose errors go together."""
+
+    first: str
+    second: str
+    r: float
+
+
+class RunResult(FileObject):
+    """How one run was fitted, µm."""
+
+    readings: int
+    rms_um: float
+    expected_um: float
+    outliers: int
+
+
+class NoiseFound(FileObject):
+    """Standard deviation of one reading, µm, as estimated with the solution and from repeats alone (null: nothing was repeated)."""
+
+    sigma_um: float
+    repeats_um: float | None
+
+
+class OutlierFound(FileObject):
+    """A reading that counts less: index in the run's values, size in standard deviations, weight 0 to 1."""
+
+    run: str
+    index: int
+    size_sigma: float
+    weight: float
+
+
+class ResidualTestResult(FileObject):
+    """One test of one run's residuals; ``text`` says what was found, empty where nothing was."""
+
+    run: str
+    test: str
+    statistic: float
+    p: float
+    p_adjusted: float
+    flagged: bool
+    text: str
+
+
+class WorstPoint(FileObject):
+    """Where the deviation is known worst: components and their uncertainties, µm; half-axis of the 95 % region of the vector."""
+
+    at_mm: Point
+    deviation_um: Point
+    u_um: Point
+    expanded_um: Point
+    expanded_vector_um: float
+
+
+class BudgetLineValue(FileObject):
+    """One source of uncertainty, rms over the volume, and its share of the variance."""
+
+    source: str
+    words: str
+    u_um: float
+    share: float
+
+
+class Uncertainty(FileObject):
+    """Of the predicted deviation over the volume; ``compensable_share``: part of the volume where the error exceeds its uncertainty."""
+
+    frame: str
+    worst_point: WorstPoint
+    rms_um: float
+    budget: list[BudgetLineValue]
+    compensable_share: float
+
+
+class SolutionFile(FileObject):
+    """A solved campaign (``abbe-solution/1``). Every ``u`` is a standard uncertainty (k = 1); ``expanded_um`` has 95 % coverage.
+
+    ``solution_id``, ``run_ids`` and ``same_as`` (earlier solutions of the same readings and model) are there when it was stored.
+    """
+
+    format: Literal["abbe-solution/1"]
+    model: str = Field(description="model key: model/basis and order, and who chose the order")
+    order: int
+    versions: Versions
+    inputs: Inputs
+    parameters: dict[str, ParameterValue]
+    mean_over_volume: dict[str, MeanValue]
+    mean_over_volume_note: str
+    motions: dict[str, MotionValue]
+    rank: Rank
+    not_observable: list[str]
+    advice: list[str]
+    observability: ObservabilityNumber
+    correlations: list[CorrelationValue]
+    chi2: float
+    dof: float
+    variance_factor: float
+    runs: dict[str, RunResult]
+    noise: dict[str, NoiseFound]
+    outliers: list[OutlierFound]
+    residual_tests: list[ResidualTestResult]
+    flags: list[str]
+    uncertainty: Uncertainty
+    ten_parameter_helix: dict[str, dict[str, MeanValue]]
+    ten_parameter_helix_note: str
+    step_diagonals: dict[str, dict[str, float]]
+    step_diagonals_note: str
+    campaign: str | None = None
+    machine: MachineObject | None = None
+    solution_id: int | None = None
+    run_ids: list[int] | None = None
+    same_as: list[int] | None = None
