@@ -21,6 +21,7 @@ from models.solvers.observe import with_tool
 HARMLESS = 1e-7
 """Deviation (unit columns, relative to the largest) below which a combination moves the tool nowhere."""
 CURES = 3
+TOOLS = ("tool", "aside")
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ def picture(campaign: Campaign, seen: Seen, prior_sd: F1) -> Picture:
     tried = trials(campaign, seen)
     harmful = families(terms, seen.null_space, seen.factor, found=silent)
     groups = [_group(terms, f, seen, tried, _effect(f, field, seen.factor, prior_sd), prior_sd) for f in harmful]
-    groups += [_group(terms, f, seen, tried, 0.0, prior_sd) for f in families(terms, silent, seen.factor)]
+    other_tools = [t for t in tried if t.addition.key in TOOLS]  # what moves no tool in use is a matter of the tool alone
+    groups += [_group(terms, f, seen, other_tools, 0.0, prior_sd) for f in families(terms, silent, seen.factor)]
     steps = best_sequence(tried, seen.null_space.shape[1])
     advice = tuple(Advice(a.cure, seen.rank + shown, len(terms)) for a, shown in steps)
     return Picture(tuple(groups), advice, _reachable(field))

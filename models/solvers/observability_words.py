@@ -17,8 +17,9 @@ from models.geometry.bases import Term
 from models.machine import AXES
 from models.solvers.identifiability import sparse_rows
 
-LARGEST_SET = 3
-"""Combinations of up to so many motions are looked for by trying all sets; what is left over are mixtures."""
+LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
+"""Combinations of up to so many motions are looked for by trying all sets, first among orders up to LOW (a slope of an angle times the
+travel of its own axis is of order 2), then among all; what is left over are mixtures."""
 INSIDE = 1e-9
 """A set of motions holds a hidden combination if its share of the null space misses 1 by less than this (squared leak)."""
 ENTRY = 1e-6
@@ -121,22 +122,41 @@ def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None 
     list of Family, exact ones first; all vectors together with ``found`` span ``null``.
     """
     told = np.zeros((len(terms), 0)) if found is None else found
-    rows: dict[str, list[int]] = {}
-    for i, t in enumerate(terms):
-        rows.setdefault(t.motion, []).append(i)
     shadow = null @ null.T
+    out: list[tuple[tuple[str, ...], F2]] = []
+    for highest, largest in ((LOW, LARGEST_SET_OF_LOW), (max(t.order for t in terms), LARGEST_SET)):
+        rows: dict[str, list[int]] = {}
+        for i, t in enumerate(terms):
+            if t.order <= highest:
+                rows.setdefault(t.motion, []).append(i)
+        new, told = _of_few(shadow, rows, largest, told, null.shape[1])
+        out += new
+    left, _ = _independent(_unit_length(sparse_rows(null.T).T), told)
+    return _merged(terms, out, factor) + ([_family(terms, left, factor, exact=False)] if left.shape[1] else [])
+
+
+def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, told: F2, count: int) -> tuple[list[tuple[tuple[str, ...], F2]], F2]:
+    """Hidden combinations of sets of up to ``largest`` motions, smallest sets first, that were not told yet, and all that is told then."""
     active = {m: at for m, at in rows.items() if np.trace(shadow[np.ix_(at, at)]) > INSIDE}
-    out: list[Family] = []
-    for size in range(1, LARGEST_SET + 1):
-        for chosen, count in _holding(shadow, active, size):
-            known = sum(f.vectors.shape[1] for f in out if set(f.motions) <= set(chosen))
-            if told.shape[1] == null.shape[1] or count <= known:
+    out: list[tuple[tuple[str, ...], F2]] = []
+    for size in range(1, largest + 1):
+        for chosen, held in _holding(shadow, active, size):
+            known = sum(v.shape[1] for motions, v in out if set(motions) <= set(chosen))
+            if told.shape[1] == count or held <= known:
                 continue
             new, told = _independent(_inside(shadow, [i for m in chosen for i in active[m]]), told)
             if new.shape[1]:
-                out.append(_family(terms, new, factor, exact=True))
-    left, _ = _independent(_unit_length(sparse_rows(null.T).T), told)
-    return out + ([_family(terms, left, factor, exact=False)] if left.shape[1] else [])
+                out.append((chosen, new))
+    return out, told
+
+
+def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], factor: F1) -> list[Family]:
+    """One family per set of motions: what is hidden of their slopes and what is hidden of their shapes belongs together."""
+    by_motions: dict[tuple[str, ...], list[F2]] = {}
+    for motions, vectors in found:
+        by_motions.setdefault(motions, []).append(vectors)
+    ranked = sorted(by_motions.items(), key=lambda item: len(item[0]))
+    return [_family(terms, np.concatenate(v, axis=1), factor, exact=True) for _, v in ranked]
 
 
 def _holding(shadow: F2, rows: dict[str, list[int]], size: int) -> list[tuple[tuple[str, ...], int]]:

@@ -19,10 +19,13 @@ def test_hidden_combinations_leave_no_trace_and_observed_parameters_leave_one(ki
     names = tuple(t.name for t in report.terms) + tuple(f"backlash_{a}" for a in "XYZ")
     seen = traces(case, names)
     assert report.hidden  # one tool, or two of one line: something always is
+    n = len(report.terms)
     for group in report.hidden:
-        assert seen.of_combination(dict(group.weights)) < SECOND_ORDER, group.text
-        for v in group.vectors.T:
-            assert seen.of_combination({t.name: c for t, c in zip(report.terms, v, strict=True) if c}) < SECOND_ORDER
+        told = np.array([dict(group.weights).get(name, 0.0) for name in names[:n]])
+        for v in (told, *group.vectors.T):
+            in_sizes = v / seen.typical[:n]
+            shown = np.linalg.norm(np.linalg.norm(seen.raw[:, :n], axis=0) * in_sizes)
+            assert np.linalg.norm(seen.seen[:, :n] @ in_sizes) < SECOND_ORDER * shown, group.text
     share = dict(zip(seen.names, seen.share(), strict=True))
     status = {p.name: p.status for p in report.parameters}
     observed = [n for n in names if status[n] == "observed"]
