@@ -19,7 +19,8 @@ from models.solvers.priors import LENGTHS, SizeModel, with_length
 NOISE_SD = 2.0
 """Hyperprior of an instrument's log noise variance about what its repeats say: a factor of e in the standard deviation, weak."""
 STEPS = 25
-TOLERANCE = 1e-3
+TOLERANCE = 0.02
+"""Gain in log evidence below which the estimation of the components stops."""
 LARGEST_STEP = 1.5
 HALVINGS = 6
 
@@ -51,7 +52,7 @@ class Posterior:
 def blend(sums: Sums, c: Components, half: F1) -> tuple[F2, F1, float]:
     """Information, moment and sum of squares over all instruments in units of the prior: (p, p), (p,), scalar."""
     w = np.exp(-c.eta)
-    gram = np.einsum("k,kij->ij", w, sums.gram) * half[:, None] * half
+    gram = np.tensordot(w, sums.gram, 1) * (half[:, None] * half)
     return gram, (w @ sums.moment) * half, float(w @ sums.square)
 
 
@@ -59,11 +60,12 @@ def posterior(sums: Sums, c: Components, model: SizeModel) -> Posterior:
     """Most probable unknowns, their covariance and the evidence."""
     gram, moment, square = blend(sums, c, c.half(model))
     np.fill_diagonal(gram, gram.diagonal() + 1.0)
-    low = linalg.cholesky(gram, lower=True)
-    z = linalg.solve_triangular(low, moment, lower=True)
-    x = linalg.solve_triangular(low, z, lower=True, trans=1)
-    inverse, _ = linalg.lapack.dpotri(low, lower=1)
-    cov = np.tril(inverse) + np.tril(inverse, -1).T
+    low = linalg.cholesky(gram, lower=True, overwrite_a=True, check_finite=False)
+    z = linalg.solve_triangular(low, moment, lower=True, check_finite=False)
+    x = linalg.solve_triangular(low, z, lower=True, trans=1, check_finite=False)
+    inverse, _ = linalg.lapack.dpotri(low, lower=1)  # its lower half only; the rest is the zeros of the factor
+    cov = inverse + inverse.T
+    np.fill_diagonal(cov, inverse.diagonal())
     log_det = 2.0 * float(np.log(low.diagonal()).sum())
     return Posterior(x, cov, -0.5 * (float(sums.count @ c.eta) + log_det + square - float(z @ z)))
 
@@ -71,23 +73,37 @@ def posterior(sums: Sums, c: Components, model: SizeModel) -> Posterior:
 def slope(sums: Sums, c: Components, model: SizeModel, p: Posterior) -> tuple[F1, F2]:
     """Gradient of the log evidence and its expected information with respect to (psi, eta)."""
     half = c.half(model)
+    h, kinds = model.design.shape[1], range(c.eta.size)
     w: F1 = np.exp(-c.eta)
-    kinds = range(w.size)
-    hat = np.eye(p.x.size) - p.cov
-    by_size = 0.5 * (p.x**2 + p.cov.diagonal() - 1.0) @ model.design
-    grams = [w[k] * sums.gram[k] * half[:, None] * half for k in kinds]
-    seen = [g @ p.cov for g in grams]
-    left = [w[k] * sums.square[k] - 2.0 * w[k] * float((sums.moment[k] * half) @ p.x) + float(p.x @ grams[k] @ p.x) for k in kinds]
-    by_noise = [0.5 * (left[k] + float(seen[k].trace()) - float(sums.count[k])) for k in kinds]
-    h = model.design.shape[1]
-    info = np.zeros((h + w.size, h + w.size))
-    info[:h, :h] = 0.5 * model.design.T @ hat**2 @ model.design
+    hat = -p.cov
+    np.fill_diagonal(hat, hat.diagonal() + 1.0)
+    gradient = np.zeros(h + c.eta.size)
+    gradient[:h] = 0.5 * (p.x**2 + p.cov.diagonal() - 1.0) @ model.design
+    info = np.zeros((gradient.size, gradient.size))
+    info[:h, :h] = 0.5 * model.design.T @ (hat * hat) @ model.design
+    seen = _seen(sums, w, half, p.cov, hat)
     for k in kinds:
+        own = p.x * half
+        left = w[k] * (sums.square[k] - 2.0 * float(sums.moment[k] @ own) + float(own @ sums.gram[k] @ own))
+        trace = float(seen[k].trace())
+        gradient[h + k] = 0.5 * (left + trace - float(sums.count[k]))
         info[h + k, :h] = info[:h, h + k] = 0.5 * np.einsum("ij,ji->i", p.cov, seen[k]) @ model.design
         for m in kinds:
             info[h + k, h + m] = 0.5 * float(np.einsum("ij,ji->", seen[k], seen[m]))
-        info[h + k, h + k] += 0.5 * (float(sums.count[k]) - 2.0 * float(seen[k].trace()))
-    return np.concatenate([by_size, by_noise]), info
+        info[h + k, h + k] += 0.5 * (float(sums.count[k]) - 2.0 * trace)
+    return gradient, info
+
+
+def _seen(sums: Sums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
+    """Information of each instrument times the covariance; all together they are I - S, so the last one costs nothing."""
+    used = np.flatnonzero(sums.count > 0)
+    out = [np.zeros_like(cov) for _ in w]
+    rest = hat
+    for k in used[:-1]:
+        out[k] = (sums.gram[k] * (w[k] * half[:, None] * half)) @ cov
+        rest = rest - out[k]
+    out[used[-1]] = rest
+    return out
 
 
 @dataclass(frozen=True)
@@ -124,8 +140,8 @@ def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
             step *= 0.5
             trial = Components(c.psi + step[:h], c.eta + step[h:])
             better, found = objective(trial)
-        c, value, p = trial, better, found
-        if np.abs(step).max() < TOLERANCE:
+        gain, c, value, p = better - value, trial, better, found
+        if gain < TOLERANCE:
             break
     return Found(c, np.asarray(linalg.inv(info)), value)
 
@@ -136,7 +152,7 @@ def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeMod
     ``sums`` about the unknowns in units of their typical size.
     """
     at = LENGTHS.index(model.length)
-    found = {at: estimate(sums.turned(model.root), model, start)}
+    found = {at: estimate(sums.turned(model.root, model.blocks), model, start)}
     models = {at: model}
     if not model.blocks:
         return model, found[at]
@@ -145,7 +161,7 @@ def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeMod
             new = at + way
             if new not in found:
                 models[new] = with_length(model, LENGTHS[new])
-                found[new] = estimate(sums.turned(models[new].root), models[new], found[at].components)
+                found[new] = estimate(sums.turned(models[new].root, model.blocks), models[new], found[at].components)
             if found[new].value <= found[at].value:
                 break
             at = new

@@ -118,17 +118,17 @@ def settle(problem: Problem, say: Progress) -> Fit:
     for step in range(ROUNDS):
         z = (measured - problem.predicted(sizes.typical * x)) / problem.sigma + r.a @ x
         whole = total(sums(Readings(r.a, z, r.run, r.fold, r.kind), gram, weight))
-        if step == 1:
+        if step == 1 or (dirty and step == GENTLE):
             sizes, found = fit_length(whole, sizes, c)
             c = found.components
         elif step:
-            c = estimate(whole.turned(sizes.root), sizes, c).components
+            c = estimate(whole.turned(sizes.root, sizes.blocks), sizes, c).components
         root = sizes.root * c.half(sizes)
-        before, x = x, root @ posterior(whole.turned(sizes.root), c, sizes).x
+        before, x = x, root @ posterior(whole.turned(sizes.root, sizes.blocks), c, sizes).x
         size = (z - r.a @ x) / np.exp(0.5 * c.eta)[r.kind]
         if not step:
             size = size / _robust_scale(size, r.kind)[r.kind]
-        dirty = dirty or bool(np.abs(size).max() > 0.7 * limit)
+        dirty = dirty or bool(np.abs(size).max() > limit)
         new = _weights(size / _spread(problem, whole, c, sizes) if dirty and step >= GENTLE else size, limit, gentle=step < GENTLE)
         moved, changed = float(np.abs(r.a @ (x - before)).max()), float(np.abs(new - weight).max())
         weight = new
@@ -143,16 +143,16 @@ def _robust_scale(size: F1, kind: I1) -> F1:
 
 
 def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
-    """First gently (Huber, when something is suspicious at all), so that a bad start rejects nothing good; then redescending."""
+    """First gently (Huber, when something is grossly wrong at all), so that a bad start rejects nothing good; then redescending."""
     hard = robust.weights(size, limit)
-    if gentle and (hard < 1.0).any():
+    if gentle and (hard == 0.0).any():
         return np.asarray(np.minimum(1.0, HUBER / np.maximum(np.abs(size), HUBER)))
     return hard
 
 
 def _spread(problem: Problem, whole: Sums, c: Components, sizes: SizeModel) -> F1:
     """Standard deviation of each residual in units of its noise: what the fit took of it is missing."""
-    information, _, _ = blend(whole.turned(sizes.root), c, c.half(sizes))
+    information, _, _ = blend(whole.turned(sizes.root, sizes.blocks), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
     low = linalg.cholesky(information, lower=True)
     h = robust.leverage(problem.readings.a, linalg.solve_triangular(low, (sizes.root * c.half(sizes)).T, lower=True))
@@ -169,9 +169,10 @@ def _finish(problem: Problem, x: F1, weight: F1, c: Components, gram: Grams) -> 
     thinning = _thinning(problem, size, weight)
     parts = tuple(s.thinned(thinning) for s in parts)
     whole = total(parts)
-    sizes, found = fit_length(whole, problem.sizes, c)
+    sizes = problem.sizes
+    found = estimate(whole.turned(sizes.root, sizes.blocks), sizes, c)
     c = found.components
-    p = posterior(whole.turned(sizes.root), c, sizes)
+    p = posterior(whole.turned(sizes.root, sizes.blocks), c, sizes)
     root = typical[:, None] * sizes.root * c.half(sizes)
     cov = root @ widened(sizes, p, found.spread) @ root.T
     theta = root @ p.x

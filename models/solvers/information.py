@@ -51,9 +51,14 @@ class Sums:
         """What is left without a part of the readings."""
         return Sums(self.gram - other.gram, self.moment - other.moment, self.square - other.square, self.count - other.count)
 
-    def turned(self, root: F2) -> Sums:
-        """The same about other unknowns: the old ones are ``root`` @ the new ones."""
-        return Sums(root.T @ self.gram @ root, self.moment @ root, self.square, self.count)
+    def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> Sums:
+        """The same about other unknowns: the old ones are ``root`` @ the new ones; ``root`` is the unit matrix but for its blocks."""
+        gram = self.gram.copy()
+        for at in blocks:
+            gram[:, :, at] = gram[:, :, at] @ root[np.ix_(at, at)]
+        for at in blocks:
+            gram[:, at, :] = root[np.ix_(at, at)].T @ gram[:, at, :]
+        return Sums(gram, self.moment @ root, self.square, self.count)
 
     def thinned(self, factor: F1) -> Sums:
         """As if there were fewer independent readings by ``factor``, shape (k,): alike neighbours tell the same thing twice."""

@@ -191,7 +191,7 @@ def _six() -> tuple[Term, ...]:
 
 def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderChoice | None) -> JointSolution:
     whole, c = total(fit.parts), fit.components
-    information = np.einsum("k,kij->ij", np.exp(-c.eta), whole.gram) / np.outer(fit.sizes.typical, fit.sizes.typical)
+    information = np.tensordot(np.exp(-c.eta), whole.gram, 1) / np.outer(fit.sizes.typical, fit.sizes.typical)
     factor = np.exp(0.5 * c.eta)
     return JointSolution(
         machine=problem.machine,

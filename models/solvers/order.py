@@ -59,18 +59,34 @@ def truncated_evidence(sums: Sums, c: Components, model: SizeModel, level: I1) -
     """
     levels = tuple(int(v) for v in np.unique(level[level >= 0]))
     w = np.exp(-c.eta)
-    gram, moment = np.einsum("k,kij->ij", w, sums.gram), w @ sums.moment
-    scaled = model.root * c.half(model)
+    root = model.root * c.half(model)
+    gram, moment, fixed = _without_setup(np.tensordot(w, sums.gram, 1), w @ sums.moment, root, level)
+    at = np.flatnonzero(level >= 0)
+    covariance = root[at] @ root[at].T
     out = []
     for k in levels:
-        keep = np.flatnonzero(level <= k)
-        low = linalg.cholesky(scaled[keep] @ scaled[keep].T, lower=True)
+        keep = np.flatnonzero(level[at] <= k)
+        low = linalg.cholesky(covariance[np.ix_(keep, keep)], lower=True, check_finite=False)
         inside = low.T @ gram[np.ix_(keep, keep)] @ low
         np.fill_diagonal(inside, inside.diagonal() + 1.0)
-        factor = linalg.cholesky(inside, lower=True)
-        z = linalg.solve_triangular(factor, low.T @ moment[keep], lower=True)
-        out.append(0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum()))
+        factor = linalg.cholesky(inside, lower=True, check_finite=False)
+        z = linalg.solve_triangular(factor, low.T @ moment[keep], lower=True, check_finite=False)
+        out.append(fixed + 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum()))
     return levels, np.array(out)
+
+
+def _without_setup(gram: F2, moment: F1, root: F2, level: I1) -> tuple[F2, F1, float]:
+    """Normal equations of the smooth terms with lost motion and set-up integrated out, and the log evidence of that part."""
+    terms, rest = np.flatnonzero(level >= 0), np.flatnonzero(level < 0)
+    sd = root.diagonal()[rest]  # independent of each other
+    own = gram[np.ix_(rest, rest)] * sd[:, None] * sd
+    np.fill_diagonal(own, own.diagonal() + 1.0)
+    factor = linalg.cholesky(own, lower=True, check_finite=False)
+    both = np.column_stack([gram[np.ix_(rest, terms)], moment[rest]]) * sd[:, None]
+    half = linalg.solve_triangular(factor, both, lower=True, check_finite=False)
+    z = half[:, -1]
+    fixed = 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum())
+    return gram[np.ix_(terms, terms)] - half[:, :-1].T @ half[:, :-1], moment[terms] - half[:, :-1].T @ z, fixed
 
 
 def choose(parts: tuple[Sums, ...], c: Components, model: SizeModel, level: I1) -> OrderChoice:

@@ -97,6 +97,8 @@ SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
 MOTION_FACTOR = 2.0
 """Hyperprior of one error motion against the others of its class."""
+ROUGHNESS_SD = 0.7
+"""Hyperprior of one motion's own fading against the common one: some guideways are rougher than others of the same machine."""
 SPECTRUM_SD = 1.0
 """Hyperprior of the two numbers that bend how sizes fade with the order."""
 LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift")
@@ -149,8 +151,8 @@ class SizeModel:
     length : float
         Correlation length of the error motions, strokes.
     names : tuple of str
-        What each number of psi is: a class of unknowns (its log variance over the documented one), one error motion against its class, or
-        ``fade`` and ``cut`` of the shapes.
+        What each number of psi is: a class of unknowns (its log variance over the documented one), one error motion against its class,
+        ``fade`` and ``cut`` of the shapes, roughness of one motion against the others.
     design : array, shape (p, h)
     sd : array, shape (h,)
         Standard deviation of the normal hyperprior of each number, around 0 (the documented size).
@@ -187,6 +189,10 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
         names += ["fade", "cut"]
         columns += [-2.0 * np.log(order / 2.0), -(order**2 - 4.0) / 36.0]
         sd += [SPECTRUM_SD, SPECTRUM_SD]
+        for name in dict.fromkeys(v for v in motions if v):
+            names.append(f"roughness {name}")
+            columns.append(2.0 * np.log(order / 2.0) * np.array([float(v == name) for v in motions]))
+            sd.append(ROUGHNESS_SD)
     design = np.stack(columns, axis=1) if columns else np.zeros((len(kinds), 0))
     typical = np.concatenate([_reference(machine, terms, priors), rest_sd])
     motion = np.array(motions)
