@@ -18,6 +18,7 @@ from scipy import linalg
 from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from models.machine import Machine
+from models.solvers.evidence import OUTLIER_SHARE, Part, Posterior, conditional, scatter, together
 from models.solvers.observations import RunData, block_average, nominal_reading
 from models.solvers.observe import Setup, run_design, setup_unknowns
 from models.solvers.priors import Priors, term_prior_sd
@@ -46,9 +47,6 @@ SWAPS = {"swap_xy": (0, 1), "swap_yz": (1, 2), "swap_xz": (0, 2)}
 ON_SPHERE_MM = 1.5
 GROSS, GROSS_MM = 4.0, 2e-3
 """A run that merely does not fit is named if it misses the others' prediction by so many times what is expected, and by so much."""
-SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
-OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
-"""A reading that the rest of its run misses by so many standard deviations does not count here; at most this share of a run."""
 SURE_SIGMA = 5.0
 """A reading that all other readings of the campaign miss by so many standard deviations is an outlier, not a sign of a bad run."""
 OUTLIER_MM = 0.1
@@ -83,19 +81,6 @@ class Suspect:
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
-    """One run without its outliers: design in units of the prior and readings, both over the noise; what the units add to the evidence."""
-
-    a: F2
-    y: F1
-    log_sigma: float
-
-    @property
-    def information(self) -> F2:
-        return np.asarray(self.a.T @ self.a)
-
-
-@dataclass(frozen=True, slots=True)
 class _Run:
     """A run as it is and with each possible mistake undone.
 
@@ -103,8 +88,8 @@ class _Run:
     """
 
     label: str
-    as_is: _Part
-    undone: dict[str, _Part]
+    as_is: Part
+    undone: dict[str, Part]
     sigma_mm: float
     first_setup: int
     cleaned: bool = False
@@ -142,7 +127,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
             break
         run = next(r for r in left if r.label == worst.run)
         left.remove(run)
-        cleaned = None if run.cleaned else _cleaned(run, _together([r.as_is for r in left]))
+        cleaned = None if run.cleaned else _cleaned(run, together([r.as_is for r in left]))
         if cleaned is None:
             found.append(worst)
         else:
@@ -150,7 +135,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
     return tuple(found)
 
 
-def _cleaned(run: _Run, others: _Posterior) -> _Run | None:
+def _cleaned(run: _Run, others: Posterior) -> _Run | None:
     """The run without readings that the other runs show to be outliers, which few readings alone may not; None: there are no such."""
     part = run.as_is
     spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
@@ -166,12 +151,12 @@ def _cleaned(run: _Run, others: _Posterior) -> _Run | None:
     if not drop.any():
         return None
     lost = float(drop.sum() * (np.log(OUTLIER_MM) - np.log(run.sigma_mm)))
-    return replace(run, as_is=_Part(part.a[~drop], part.y[~drop], part.log_sigma + lost), undone=_without(run.undone, drop), cleaned=True)
+    return replace(run, as_is=Part(part.a[~drop], part.y[~drop], part.log_sigma + lost), undone=_without(run.undone, drop), cleaned=True)
 
 
-def _without(undone: dict[str, _Part], drop: NDArray[np.bool_]) -> dict[str, _Part]:
+def _without(undone: dict[str, Part], drop: NDArray[np.bool_]) -> dict[str, Part]:
     """The same readings left out of every variant that has them all."""
-    return {n: _Part(p.a[~drop], p.y[~drop], p.log_sigma) if p.y.size == drop.size else p for n, p in undone.items()}
+    return {n: Part(p.a[~drop], p.y[~drop], p.log_sigma) if p.y.size == drop.size else p for n, p in undone.items()}
 
 
 def _prepared(machine: Machine, runs: Sequence[RunData]) -> list[_Run]:
@@ -209,71 +194,16 @@ def _readings(run: RunData, factor: float = 1.0) -> F1:
     return np.asarray(short.deviation_mm - nominal_reading(short))
 
 
-def _part(a: F2, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1.0) -> _Part:
+def _part(a: F2, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1.0) -> Part:
     """A run over its noise. Readings that were multiplied answer for it in their density; an outlier may lie anywhere (`OUTLIER_MM`)."""
     if np.abs(y).max() < LARGE_MM and abs(factor) != 1.0:
         drop = scatter(a, y)[1]
     log_sigma = float(np.log(np.where(drop, OUTLIER_MM, sigma)).sum() - y.size * np.log(abs(factor)))
-    return _Part(a[~drop] / sigma, y[~drop] / sigma, log_sigma)
-
-
-def scatter(a: F2, y: F1) -> tuple[float, NDArray[np.bool_]]:
-    """Noise that the model leaves in one run, mm, and which of its readings are outliers, bool, shape (n,).
-
-    The noise is the most probable of `SIGMA_GRID_MM`; each reading is compared with what all others of the run predict.
-    """
-    drop = np.zeros(y.size, dtype=bool)
-    while True:
-        sigma, z = _against_the_rest(a[~drop], y[~drop])
-        bad = np.abs(z) > OUTLIER_SIGMA
-        if not bad.any() or drop.sum() + bad.sum() > OUTLIER_SHARE * drop.size:
-            return sigma, drop
-        drop[np.flatnonzero(~drop)[bad]] = True
-
-
-def _against_the_rest(a: F2, y: F1) -> tuple[float, F1]:
-    """Most probable noise, and every reading's distance from the prediction of the others in standard deviations.
-
-    Source: Rasmussen and Williams, Gaussian Processes, eqs 5.8 and 5.12.
-    """
-    values, vectors = linalg.eigh(a @ a.T)
-    values, turned = np.clip(values, 0.0, None), vectors.T @ y
-    spread = values[:, None] + SIGMA_GRID_MM**2
-    log_p = -0.5 * (turned[:, None] ** 2 / spread + np.log(spread)).sum(axis=0)
-    sigma = float(SIGMA_GRID_MM[int(np.argmax(log_p))])
-    over = 1.0 / (values + sigma**2)
-    return sigma, (vectors @ (over * turned)) / np.sqrt((vectors**2) @ over)
-
-
-@dataclass(frozen=True, slots=True)
-class _Posterior:
-    """What some parts together say: Cholesky factor of the information with the prior, and its log evidence."""
-
-    factor: F2
-    theta: F1
-    log_evidence: float
-
-
-def _posterior(information: F2, projection: F1, energy: float, log_sigma: float) -> _Posterior:
-    """Log evidence without the constant n log(2 pi) / 2, which all hypotheses share."""
-    lower = linalg.cholesky(information + np.eye(len(information)), lower=True)
-    half = linalg.solve_triangular(lower, projection, lower=True)
-    theta = linalg.solve_triangular(lower, half, lower=True, trans=1)
-    log_p = -0.5 * (energy - float(half @ half)) - float(np.log(np.diag(lower)).sum()) - log_sigma
-    return _Posterior(lower, theta, log_p)
-
-
-def _together(parts: Sequence[_Part]) -> _Posterior:
-    return _posterior(
-        sum((p.information for p in parts), np.zeros((parts[0].a.shape[1],) * 2)),
-        sum((p.a.T @ p.y for p in parts), np.zeros(parts[0].a.shape[1])),
-        sum(float(p.y @ p.y) for p in parts),
-        sum(p.log_sigma for p in parts),
-    )
+    return Part(a[~drop] / sigma, y[~drop] / sigma, log_sigma)
 
 
 def _worst(runs: Sequence[_Run], limit: float) -> Suspect | None:
-    as_is = _together([r.as_is for r in runs]).log_evidence
+    as_is = together([r.as_is for r in runs]).log_evidence
     found = [_judged(run, [r.as_is for r in runs if r is not run], as_is) for run in runs]
     found = [s for s in found if s.gain > limit and (s.cause != "other" or s.misfit_mm > max(GROSS * s.expected_mm, GROSS_MM))]
     if not found:
@@ -282,30 +212,15 @@ def _worst(runs: Sequence[_Run], limit: float) -> Suspect | None:
     return replace(worst, tied=tuple(s.run for s in found if s.run != worst.run and worst.gain - s.gain < limit))
 
 
-def _judged(run: _Run, rest: list[_Part], as_is: float) -> Suspect:
+def _judged(run: _Run, rest: list[Part], as_is: float) -> Suspect:
     """A run taken to be wrong in the way that explains the campaign best."""
-    others = _together(rest)
-    best, cause = others.log_evidence + _together([run.as_is]).log_evidence, "other"
-    for name, log_p in _conditional(others, run.undone).items():
+    others = together(rest)
+    best, cause = others.log_evidence + together([run.as_is]).log_evidence, "other"
+    for name, log_p in conditional(others, run.undone).items():
         if others.log_evidence + log_p > best + NAMED * (cause == "other"):
             best, cause = others.log_evidence + log_p, name
     misfit, expected = _misfit(others, run)
     return Suspect(run.label, cause, best - as_is, misfit, expected)
-
-
-def _conditional(others: _Posterior, variants: dict[str, _Part]) -> dict[str, float]:
-    """Log evidence of each variant of a run given what the others say; variants with one design share its factorisation."""
-    out: dict[str, float] = {}
-    known: list[tuple[F2, F2, F2]] = []
-    for name, part in variants.items():
-        found = next((k for k in known if np.array_equal(k[0], part.a)), None)
-        if found is None:
-            spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
-            found = (part.a, spread, linalg.cholesky(spread @ spread.T + np.eye(len(spread)), lower=True))
-            known.append(found)
-        left = linalg.solve_triangular(found[2], part.y - part.a @ others.theta, lower=True)
-        out[name] = -0.5 * float(left @ left) - float(np.log(np.diag(found[2])).sum()) - part.log_sigma
-    return out
 
 
 def _swapped(run: RunData) -> dict[str, RunData]:
@@ -323,7 +238,7 @@ def _swapped(run: RunData) -> dict[str, RunData]:
     return out
 
 
-def _misfit(others: _Posterior, run: _Run) -> tuple[float, float]:
+def _misfit(others: Posterior, run: _Run) -> tuple[float, float]:
     """Rms of what the others' prediction leaves once the run's own set-up is refitted, and its expected rms, mm."""
     part, first = run.as_is, run.first_setup
     r = part.y - part.a[:, :first] @ others.theta[:first]

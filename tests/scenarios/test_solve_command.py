@@ -1,0 +1,163 @@
+"""`abbe solve` as people use it: a folder or a campaign of the store, words, JSON, a page; what is refused leaves nothing behind."""
+
+import json
+import re
+import tarfile
+
+import pytest
+
+from service import cli
+from service.runs.exchange import import_folder
+from service.runs.solution_file import SolutionFile
+from service.storage.store import Store
+from service.workflows.campaign_folder import from_folder
+from service.workflows.solve import solve_runs
+from tests.campaigns.population import draw_case
+from tests.scenarios.campaign_files import measured, write_folder
+
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
+SEED = 7
+
+
+@pytest.fixture(autouse=True)
+def own_place(tmp_path, monkeypatch):
+    monkeypatch.delenv("ABBE_DB", raising=False)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    site, runs = measured(SEED, "one_tool")
+    return write_folder(tmp_path_factory.mktemp("c1"), site.doc, runs)
+
+
+@pytest.fixture
+def abbe(capsys):
+    def call(*words):
+        code = cli.run([str(w) for w in words])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(abbe, folder, tmp_path):
+    code, out, err = abbe("solve", folder, "--report", "page.html")
+    assert code == 0
+    text = " ".join(out.split())
+    for words in (
+        "U (k = 2)",
+        "Observability",
+        "noise found",
+        "outliers:",
+        "residuals that are not noise",
+        "Worst known point",
+        "one tool length",
+    ):
+        assert words in text
+    assert "units, axes, copies, machine" in err
+    page = (tmp_path / "page.html").read_text()
+    for words in ("Error motions", "Uncertainty in the volume", "What these runs cannot tell", "sensor noise of the laser", "SHA-256"):
+        assert words in page
+    assert page.count("<svg") > 10
+    assert not re.search(r"<script|https?://|@import|url\(", page)
+    assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_json_keeps_to_its_schema_and_holds_the_truth(abbe, folder):
+    code, out, _ = abbe("solve", folder, "--json")
+    doc = json.loads(out)
+    SolutionFile.model_validate_json(out)
+    assert code == 0
+    assert re.fullmatch(r"rigid21/legendre\d+\+order-by-heldout", doc["model"])
+    assert "solution_id" not in doc
+    assert doc["not_observable"]  # one tool: something is always hidden (math.md 4.6)
+    assert doc["rank"]["rank"] < doc["rank"]["of"]
+    assert {p["status"] for p in doc["parameters"].values()} <= {"observed", "weak", "not observable"}
+    assert sum(line["share"] for line in doc["uncertainty"]["budget"]) == pytest.approx(1.0)
+    assert 0.2 < doc["noise"]["bar"]["sigma_um"] < 1.0
+    assert set(doc["inputs"]["runs"]) == set(doc["runs"])
+    truth = draw_case(SEED, "one_tool").truth
+    for name in ("backlash_X", "backlash_Y", "backlash_Z"):
+        found = doc["parameters"][name]
+        assert abs(found["value"] - truth.parameter(name)) < 4 * found["u"]
+    assert doc["uncertainty"]["worst_point"]["expanded_vector_um"] >= max(doc["uncertainty"]["worst_point"]["expanded_um"])
+
+
+def test_a_stored_campaign_is_solved_twice_and_recognised(abbe, folder, tmp_path):
+    with Store.open("sqlite:///a.sqlite3") as store:
+        import_folder(store, folder)
+    first = json.loads(abbe("solve", "c1", "--json", "--db", "sqlite:///a.sqlite3")[1])
+    code, out, _ = abbe("solve", folder, "--db", "sqlite:///a.sqlite3")
+    assert code == 0
+    assert f"the same readings and model as solution {first['solution_id']}" in out
+    with Store.open("sqlite:///a.sqlite3") as store:
+        kept = store.solutions(store.campaign("c1").id)
+        runs = {r.id for r in store.runs("c1")}
+    assert [s.id for s in kept] == [1, 2]
+    for solution in kept:
+        assert set(solution.run_ids) == set(solution.doc["run_ids"]) == runs
+        assert solution.doc["versions"]["abbe"]
+        assert solution.doc["model"].startswith("rigid21/")
+    assert kept[0].doc["inputs"] == kept[1].doc["inputs"]
+    other = json.loads(abbe("solve", "c1", "--json", "--db", "sqlite:///a.sqlite3", "--model", "rigid6")[1])
+    assert other["model"] == "rigid6"
+    assert other["same_as"] == []
+    assert {n for n in other["parameters"] if n[0] == "E" or n in ("C0Y", "B0Z", "A0Z")} == {"EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z"}
+
+
+def test_what_is_refused_is_one_line_and_leaves_nothing(abbe, tmp_path):
+    site, runs = measured(SEED, "one_tool")
+    runs[2]["columns"]["deviation_mm"] = [v / 25.4 for v in runs[2]["columns"]["deviation_mm"]]
+    bad = write_folder(tmp_path / "bad", site.doc, runs)
+    code, out, err = abbe("solve", bad, "--db", "sqlite:///b.sqlite3", "--report", "page.html")
+    line = err.splitlines()[-1]
+    assert (code, out) == (2, "")
+    assert line.startswith(f"error SOL-003: run {runs[2]['run_id']}: ")
+    assert "inches" in line
+    assert "--without" in line
+    assert [p.name for p in tmp_path.iterdir()] == ["bad"]
+    assert abbe("solve", bad, "--without", runs[2]["run_id"], "--model", "rigid6")[0] == 0
+
+
+def test_a_bad_run_in_the_store_stores_no_solution(abbe, tmp_path):
+    site, runs = measured(SEED, "one_tool")
+    again = json.loads(json.dumps(runs[1])) | {"run_id": "twin"}
+    with Store.open("sqlite:///c.sqlite3") as store:
+        import_folder(store, write_folder(tmp_path / "twice", site.doc, [*runs, again]))
+    code, out, err = abbe("solve", "c1", "--db", "sqlite:///c.sqlite3")
+    assert (code, out) == (2, "")
+    assert f"run twin: its readings are those of run {runs[1]['run_id']}" in err
+    with Store.open("sqlite:///c.sqlite3") as store:
+        assert store.solutions() == []
+
+
+def test_a_folder_does_not_pass_for_a_stored_campaign_of_its_name(abbe, folder, tmp_path):
+    site, runs = measured(SEED + 1, "one_tool")
+    with Store.open("sqlite:///d.sqlite3") as store:
+        import_folder(store, write_folder(tmp_path / "other", site.doc, runs))
+    code, _, err = abbe("solve", folder, "--db", "sqlite:///d.sqlite3")
+    assert code == 2
+    assert "another campaign 'c1'" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [(("nowhere",), "STO-001"), (("--without", "r77"), "no run r77"), (("--model", "rigid99"), "rigid99")]
+)
+def test_mistakes_are_one_line(abbe, folder, words, told):
+    target = () if words == ("nowhere",) else (folder,)
+    code, out, err = abbe("solve", *target, *words)
+    assert (code, out) == (2, "")
+    assert told in err.splitlines()[-1]
+
+
+def test_hidden_effects_of_the_practice_cases_show_in_the_residuals(shared, tmp_path):
+    """Cases with stick-slip: no part of the model, so the tests of the residuals have to speak."""
+    with tarfile.open(shared / "data" / "blind-practice.tar.xz") as archive:
+        members = [m for m in archive if m.name.startswith("public/case0073/")]
+        archive.extractall(tmp_path, members=members, filter="data")
+    case = from_folder(tmp_path / "public" / "case0073")
+    solved = solve_runs(case.site, case.runs)
+    flagged = [t for t in solved.joint.residual_tests if t.flagged]
+    assert len(flagged) > 5
+    assert all(t.text.startswith(t.run) for t in flagged)

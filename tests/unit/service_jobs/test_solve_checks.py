@@ -1,0 +1,125 @@
+"""Geometry of runs against their set-ups, and what a refusal and a digest say."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from models.paths.helix import helix_points
+from models.paths.lines import step_diagonal
+from service.errors import CampaignRefused
+from service.workflows.campaign_checks import Finding, refuse
+from service.workflows.provenance import campaign_digest, revision, run_digest, versions
+from service.workflows.run_geometry import geometry
+
+MACHINE = {"chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
+
+
+def run(test, setup, points):
+    columns = {f"{c}_mm": points[:, k].tolist() for k, c in enumerate("xyz")}
+    columns |= {"t_s": list(range(len(points))), "deviation_mm": [1e-3 * (k % 7) for k in range(len(points))]}
+    return {"run_id": "r1", "test": test, "setup": {"setup_id": "A"} | setup, "columns": columns}
+
+
+def helix():
+    centre = np.array([300.0, 250.0, 100.0])
+    return run(
+        "ballbar_helix",
+        {"centre_mm": centre.tolist(), "radius_mm": 150.0, "turns": 5},
+        helix_points(centre, 150.0, turns=5, n=300, law="area", axis=2),
+    )
+
+
+def circle(plane="XY"):
+    centre, a = np.array([300.0, 250.0, 200.0]), np.linspace(0, 2 * np.pi, 200)
+    points = np.tile(centre, (200, 1))
+    points[:, 0] += 100 * np.cos(a)
+    points[:, 1] += 100 * np.sin(a)
+    return run("ballbar_circle", {"centre_mm": centre.tolist(), "radius_mm": 100.0, "plane": plane}, points)
+
+
+def diagonal(order="XYZ"):
+    start, end = np.array([10.0, 10.0, 10.0]), np.array([490.0, 490.0, 430.0])
+    setup = {"diagonal": "ppp", "start_mm": start.tolist(), "end_mm": end.tolist(), "steps": 10, "order": order}
+    setup |= {"increment_mm": ((end - start) / 10).tolist(), "nominal_beam": ((end - start) / np.linalg.norm(end - start)).tolist()}
+    return run("laser_diagonal", setup, step_diagonal(start, end, 10, order))
+
+
+def put(found, **keys):
+    found = copy.deepcopy(found)
+    found["setup"] |= keys
+    return found
+
+
+def text(found):
+    what = geometry(MACHINE, found)
+    assert what is not None
+    assert what.refuse
+    assert what.remedy
+    return what.text
+
+
+@pytest.mark.parametrize("good", [helix(), circle(), diagonal(), diagonal("ZYX")], ids=["helix", "circle", "diagonal", "reversed order"])
+def test_runs_as_they_should_be_are_left_alone(good):
+    assert geometry(MACHINE, good) is None
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (put(helix(), radius_mm=150 / 25.4), "radius_mm holds inches"),
+        (put(helix(), centre_mm=[300 / 25.4, 250 / 25.4, 100 / 25.4]), "centre_mm holds inches"),
+        (put(helix(), centre_mm=[250.0, 300.0, 100.0]), "columns x_mm and y_mm are exchanged"),
+        (put(helix(), radius_mm=140.0), "points lie up to 10 mm beside the sphere"),
+        (circle("YZ"), "points leave the plane YZ by up to 100 mm"),
+        (put(diagonal(), diagonal="npp"), "diagonal is npp"),
+        (put(diagonal(), nominal_beam=[1.0, 0.0, 0.0]), "nominal_beam does not point"),
+        (put(diagonal(), order="YXZ"), "steps go in the order XYZ, the run says YXZ"),
+        (put(diagonal(), steps=9), "9 steps of increment_mm do not lead"),
+        (put(diagonal(), end_mm=[500.0, 500.0, 450.0], increment_mm=None, nominal_beam=None), "positions miss the line"),
+    ],
+)
+def test_what_does_not_fit_is_told_with_its_reason(bad, words):
+    assert words in text(bad)
+
+
+def test_exchanged_axes_of_a_cube_show_in_the_order_of_the_steps():
+    bad = diagonal()
+    bad["columns"]["x_mm"], bad["columns"]["y_mm"] = bad["columns"]["y_mm"], bad["columns"]["x_mm"]
+    assert "steps go in the order YXZ" in text(bad)
+
+
+def test_a_run_beyond_the_stroke_names_axis_and_stroke():
+    small = {"stroke_mm": MACHINE["stroke_mm"] | {"Z": [0, 200]}}
+    what = geometry(small, helix())
+    assert what is not None
+    assert what.text == "Z goes 50 mm beyond the stroke 0 to 200 mm"
+
+
+def test_a_line_along_another_axis_than_it_says():
+    points = np.stack([np.linspace(10, 590, 20), np.full(20, 50.0), np.full(20, 50.0)], axis=1)
+    line = run("laser_linear", {"axis": "Y", "start_mm": [10, 50, 50], "end_mm": [590, 50, 50]}, points)
+    assert "axis is Y, but start_mm and end_mm differ in X" in text(line)
+
+
+def test_a_refusal_names_the_first_run_and_how_many_more():
+    findings = [Finding("a", "odd", "look", False), Finding("b", "bad", "mend", True), Finding("c", "bad too", "mend", True)]
+    with pytest.raises(CampaignRefused) as told:
+        refuse(findings)
+    assert str(told.value) == "run b: bad (and 1 more: c) - mend; nothing was stored"
+    refuse(findings[:1])
+
+
+def test_a_digest_is_of_the_data_not_of_the_name():
+    first, again = helix(), helix() | {"run_id": "other", "campaign": "c2"}
+    assert run_digest(first) == run_digest(again)
+    again["columns"]["deviation_mm"][3] += 1e-9
+    assert run_digest(first) != run_digest(again)
+    one, two = {"a": "1", "b": "2"}, {"x": "2", "y": "1"}
+    assert campaign_digest(one, "rigid21") == campaign_digest(two, "rigid21") != campaign_digest(one, "rigid6")
+
+
+def test_versions_say_which_program():
+    found = versions()
+    assert {"abbe", "numpy", "scipy"} <= set(found)
+    assert revision() is None or len(found["revision"]) == 40
