@@ -21,6 +21,7 @@ import numpy as np
 from models.compensation.distances import DistanceFigures, Pairs, figures, inner_box_mm, predict_distances, random_pairs
 from models.compensation.grid import grid_table, quantise_grid
 from models.compensation.tables import nine_tables, quantise
+from models.planning.instruments import Instruments
 from models.solvers.joint import JointSolution, solve_joint
 from simulators.campaign.sampler import Conditions
 from tests.campaigns.accuracy_bound import bound_mm
@@ -29,7 +30,8 @@ from tests.campaigns.population import CAMPAIGNS, Case, draw_case
 
 PAIR_COUNT, PAIR_SEED = 4000, 11
 LSB_MM = 1e-4
-CONDITIONS = Conditions(bar_noise_mm=0.5e-3, laser_noise_mm=0.3e-3)
+CONDITIONS = Conditions(bar_noise_mm=0.5e-3, laser_noise_mm=0.3e-3, bar_length_sd_mm=Instruments().u_bar_length_mm)
+"""Noise of the instruments, bars as well calibrated as the planner's instruments state; set-ups, drift and outliers as in the population."""
 Correction = Callable[[np.ndarray], np.ndarray]
 
 
@@ -154,7 +156,7 @@ def main() -> None:
     args = parser.parse_args()
     work = partial(one, campaign=args.campaign, minutes=args.minutes, nodes=args.nodes)
     rows = []
-    print(HEAD)  # noqa: T201
+    print(HEAD, flush=True)  # noqa: T201
     with multiprocessing.get_context("spawn").Pool(args.jobs) as pool:
         for row in pool.imap(work, range(args.first, args.first + args.machines)):
             rows.append(row)

@@ -5,6 +5,7 @@ coefficients belong together (from the population's own law), how well bars, cup
 enters linearly, so the posterior covariance is the bound (van Trees).
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -24,17 +25,13 @@ FUNCTIONS = 600
 
 def bound_mm(case: Case, pairs: Pairs) -> float:
     """Rms error of the distances between pairs of points that the best solver leaves, mm."""
-    conditions, magnitudes = case.truth.rig.conditions, case.truth.rig.scenario.magnitudes
-    priors = Priors(
-        backlash_mm=float(np.mean(magnitudes.backlash_um)) * 1e-3,
-        cup_mm=_rms(magnitudes.cup_offset_um) * 1e-3 / np.sqrt(3.0),
-        tilt_rad=_rms(magnitudes.mirror_tilt_urad) * 1e-6 / np.sqrt(2.0),
-        laser_scale=conditions.wavelength_sd,
-    )
+    conditions = case.truth.rig.conditions
+    priors = true_priors(case)
     terms = smooth_terms(ORDER)
-    setup = setup_unknowns(case.runs, priors)
+    runs = tuple(r if r.kind == "laser" else replace(r, u_length_mm=conditions.bar_length_sd_mm, length_calibrated=True) for r in case.runs)
+    setup = setup_unknowns(runs, priors)
     noise = {"bar": conditions.bar_noise_mm, "laser": conditions.laser_noise_mm}
-    blocks = [run_design(case.machine, terms, r, setup) * (np.sqrt(r.weight_n) / noise[r.kind])[:, None] for r in case.runs]
+    blocks = [run_design(case.machine, terms, r, setup) * (np.sqrt(r.weight_n) / noise[r.kind])[:, None] for r in runs]
     a = np.concatenate(blocks)
     sd = np.concatenate([np.full(3, priors.backlash_mm), setup.prior_sd])
     n = len(terms)
@@ -47,6 +44,22 @@ def bound_mm(case: Case, pairs: Pairs) -> float:
     rows = (both[1] - both[0]) @ root[:n]
     half = np.linalg.solve(np.linalg.cholesky(information), rows.T)
     return float(np.sqrt(np.mean(np.sum(half**2, axis=0))))
+
+
+def true_priors(case: Case) -> Priors:
+    """How well bars, cups, mirrors, beams and zeros of this population are set and how fast it drifts: standard deviations, no guesses."""
+    conditions, m = case.truth.rig.conditions, case.truth.rig.scenario.magnitudes
+    drift = m.drift_sd_um * 1e-3 / (60.0 * float(np.mean(m.drift_tau_min))) if conditions.drift else 1e-12
+    return Priors(
+        backlash_mm=_rms(m.backlash_um) * 1e-3,
+        cup_mm=_rms(m.cup_offset_um) * 1e-3 / np.sqrt(3.0),
+        tilt_rad=_rms(m.mirror_tilt_urad) * 1e-6 / np.sqrt(2.0),
+        cosine=0.5 * (_rms(m.mirror_tilt_urad) ** 2 + _rms(m.beam_misalignment_urad) ** 2) * 1e-12,
+        zero_mm=conditions.laser_noise_mm,
+        drift_mm_s=drift,
+        bar_drift_mm_s=drift,
+        laser_scale=conditions.wavelength_sd,
+    )
 
 
 def _term_root(case: Case, terms: tuple[Term, ...]) -> np.ndarray:
