@@ -29,9 +29,9 @@ SAME_PLACE_MM = 1e-3
 SAME_BEAM = 1e-4
 """Two beams of one set-up may differ by this much (components of unit vectors): rounding, not another beam."""
 
-STATED = ("laser_scale", "cosine_")
-"""How the names of unknowns begin that are known within their prior by calibration or geometry, and never free when ranks are counted:
-else a wavelength good to 0.3e-6 would hide every scale."""
+STATED = ("laser_scale", "cosine_", "drift_", "bar_drift_")
+"""How the names of unknowns begin that no hand sets and that are known within their prior, and never free when ranks are counted: else a
+wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time, as the height is in a helix) a squareness."""
 
 
 @dataclass(frozen=True)
