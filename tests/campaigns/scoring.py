@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from models.compensation.grid import grid_table, known_better_than_error, nodes_mm
+from models.compensation.grid import compensable_nodes, grid_table, nodes_mm
 from models.solvers.joint import JointSolution, solve_joint
-from models.solvers.priors import Priors, term_prior_sd
 from models.uncertainty.frame import RigidFree
 from models.uncertainty.inputs import Inputs
 from models.uncertainty.prediction import predict_deviation
@@ -23,7 +22,8 @@ from models.volumetric import remove_rigid
 from tests.campaigns.population import Case, Kind, draw_case
 from tests.campaigns.traces import Bent, Traces, traces, typical_size
 
-K_95 = 1.96
+INPUTS = Inputs(u_scale_temperature_k=0.0, u_bar_temperature_k=0.0)
+"""No temperature is wrong in the population."""
 SHARE = 0.5
 """Data share from which on a parameter counts as stated observable."""
 NO_TRACE = 0.02
@@ -102,7 +102,7 @@ def parameters(case: Case, solution: JointSolution) -> tuple[list[str], np.ndarr
 
 def predictions(case: Case, solution: JointSolution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """z, u and whether inside the stated interval, 3 components at 100 points (shared out over the tools that were used)."""
-    sources = error_sources(solution, Inputs(u_scale_temperature_k=0.0, u_bar_temperature_k=0.0))
+    sources = error_sources(solution, INPUTS)
     rng = np.random.default_rng([case.seed, 9])
     stroke, found = case.machine.stroke_mm, []
     for tool in case.tools_mm:
@@ -121,15 +121,18 @@ def no_trace(seen: Traces, stated: list[str]) -> list[str]:
 
 
 def not_hidden(solution: JointSolution, seen: Traces) -> list[str]:
-    """Combinations stated hidden that the simulated machine does show."""
-    unit = dict(zip((t.name for t in solution.terms), term_prior_sd(solution.machine, solution.terms, Priors()), strict=True))
-    traced = [(c.text, seen.of_combination({n: w * unit[n] for n, w in c.weights})) for c in solution.identifiability.hidden]
+    """Parameters of which a combination is stated hidden, although the simulated machine shows every combination of them."""
+    traced = [(c.text, seen.least([n for n, _ in c.weights])) for c in solution.identifiability.hidden]
     return [f"stated hidden, leaves a trace of {t:.1e}: {text}" for text, t in traced if t > HIDDEN_TRACE]
 
 
 def unseen_entries(case: Case, solution: JointSolution, seen: Traces) -> list[str]:
-    """Nodes that the 3-D grid compensates although what the readings cannot show moves them more than the stated uncertainty allows."""
-    table = grid_table(solution, TABLE_NODES, compensable=known_better_than_error(solution, TABLE_NODES, K_95))
+    """Nodes that the 3-D grid compensates although what no reading shows may be larger there than the whole correction.
+
+    Unseen: directions of parameter space that change all readings together by less than 0.1 sigma; errors of typical size. A node counts if
+    that is more than the correction without rigid motion, more than three stated uncertainties, and more than 0.1 um.
+    """
+    table = grid_table(solution, TABLE_NODES, compensable=compensable_nodes(solution, TABLE_NODES, inputs=INPUTS))
     points = nodes_mm(table.position_mm)
     basis = seen.hidden_basis(0.1)
     bent = Bent(case.truth.rig.machine(), points)
@@ -138,7 +141,8 @@ def unseen_entries(case: Case, solution: JointSolution, seen: Traces) -> list[st
     free = np.stack([remove_rigid(points, m.reshape(-1, 3)) for m in moved.T], axis=2) if basis.shape[1] else np.zeros((len(points), 3, 1))
     unseen = np.sqrt((free**2).sum(axis=(1, 2)))
     stated = np.linalg.norm(table.u_mm.reshape(-1, 3), axis=1)
-    bad = table.compensated.ravel() & (unseen > 3.0 * stated) & (unseen > 1e-4)
+    size = np.linalg.norm(remove_rigid(points, solution.deviation_mm(points)), axis=1)
+    bad = table.compensated.ravel() & (unseen > np.maximum(3.0 * stated, size)) & (unseen > 1e-4)
     return [f"table: {int(bad.sum())} of {bad.size} nodes compensated in an unobserved region"] if bad.any() else []
 
 

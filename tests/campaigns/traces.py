@@ -68,14 +68,11 @@ class Traces:
         gram = self.seen.T @ self.seen
         return 1.0 - np.diag(np.linalg.inv(gram + np.eye(len(self.names))))
 
-    def of_combination(self, weights: dict[str, float]) -> float:
-        """Trace of parameters changed together (mm or rad), over what they would show if nothing cancelled; 0: hidden."""
-        at = {n: i for i, n in enumerate(self.names)}
-        v = np.zeros(len(self.names))
-        for name, w in weights.items():
-            v[at[name]] = w / self.typical[at[name]]
-        shown = float(np.sqrt(np.sum((np.linalg.norm(self.raw, axis=0) * v) ** 2)))
-        return float(np.linalg.norm(self.seen @ v)) / shown if shown > 0 else 0.0
+    def least(self, names: list[str]) -> float:
+        """Smallest trace of any combination of these parameters, over what each would show by itself (unit columns); 0: hidden."""
+        at = [self.names.index(n) for n in names]
+        shown = np.linalg.norm(self.raw[:, at], axis=0)
+        return float(np.linalg.svd(self.seen[:, at] / np.where(shown > 0, shown, 1.0), compute_uv=False)[-1])
 
     def hidden_basis(self, limit: float) -> np.ndarray:
         """Directions (columns, in typical sizes) that change all readings together by less than ``limit`` sigma, shape (p, q)."""
