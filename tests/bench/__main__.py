@@ -22,6 +22,7 @@ from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS, contestants
 from tests.bench.facts import facts
 from tests.bench.trials_contestants import TRIAL_CASES
 from tests.bench.trials_judge import judged
+from tests.bench.worker import NO_RESULT
 
 ROUNDING_MM = 1e-12
 SECOND_ORDER_MM = 1e-5
@@ -61,7 +62,7 @@ def _trials(name: str, names: list[str], rounds: int, folder: Path) -> dict:
     for n in range(rounds):
         for k in names:
             _progress(f"{name}, round {n + 1} of {rounds}: {k}")
-            runs[k].append(_run(name, k, folder / f"{name}-{k}.npz"))
+            runs[k].append(_run(name, k, folder / f"{name}-{k}.npz" if n == 0 else NO_RESULT))  # results are the same in every round
     _progress("")
     results = {k: dict(np.load(folder / f"{name}-{k}.npz")) for k in names}
     return {"contestants": {k: _trial_summary(v) for k, v in runs.items()}, "agreement": judged(name, results)}
@@ -87,7 +88,7 @@ def _progress(words: str) -> None:
         print(f"\r{words:<60}" if words else f"\r{'':<60}\r", end="", file=sys.stderr, flush=True)  # noqa: T201
 
 
-def _run(case: str, name: str, result: Path) -> dict:
+def _run(case: str, name: str, result: Path | str) -> dict:
     done = subprocess.run(
         [sys.executable, "-m", "tests.bench.worker", case, name, str(result)], capture_output=True, text=True, check=False
     )
