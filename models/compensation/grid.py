@@ -16,6 +16,7 @@ from models.compensation.interpolation import fit_operator, fit_positions, trili
 from models.compensation.masking import blend
 from models.compensation.tables import grid_positions
 from models.geometry.chain import design
+from models.machine import AXES
 from models.solvers.joint import JointSolution
 from models.uncertainty.frame import RigidFree
 from models.uncertainty.inputs import Inputs
@@ -152,6 +153,25 @@ def compensable_nodes(
 def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:
     """The grid as the controller will store it: every correction rounded to its unit; the reference stays zero."""
     return replace(table, correction_mm=np.round(table.correction_mm / lsb_mm) * lsb_mm)
+
+
+def check_steps(table: GridTable, limit_mm: float) -> None:
+    """Refuse a grid whose correction changes by more than the controller allows from one node to the next.
+
+    Raises
+    ------
+    ValueError
+        Names the axis of the step, its node and its size.
+    """
+    for a in range(3):
+        step = np.abs(np.diff(table.correction_mm, axis=a)).max(axis=3)
+        worst = np.unravel_index(int(step.argmax()), step.shape)
+        if step[worst] > limit_mm:
+            at = ", ".join(f"{axis} {table.position_mm[k][i]:g}" for k, (axis, i) in enumerate(zip(AXES, worst, strict=True)))
+            raise ValueError(
+                f"grid table: from the node at {at} to the next on {AXES[a]} the correction changes by {1e3 * step[worst]:.1f} um, "
+                f"the controller allows {1e3 * limit_mm:.1f} um: take more nodes on {AXES[a]}"
+            )
 
 
 def quantisation_mm(lsb_mm: float) -> float:

@@ -31,7 +31,7 @@ from tests.campaigns.population import CAMPAIGNS, Case, draw_case
 PAIR_COUNT, PAIR_SEED = 4000, 11
 LSB_MM = 1e-4
 CONDITIONS = Conditions(bar_noise_mm=0.5e-3, laser_noise_mm=0.3e-3, bar_length_sd_mm=Instruments().u_bar_length_mm)
-"""Noise of the instruments, bars as well calibrated as the planner's instruments state; set-ups, drift and outliers as in the population."""
+"""Bars calibrated as well as the planner's instruments state; set-ups, drift and outliers as in the population."""
 Correction = Callable[[np.ndarray], np.ndarray]
 
 

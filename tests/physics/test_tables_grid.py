@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.compensation.distances import correction_error_mm, figures, inner_box_mm, pair_design, predict_distances, random_pairs
-from models.compensation.grid import grid_table, node_design, nodes_mm, quantisation_mm, quantise_grid
+from models.compensation.grid import check_steps, grid_table, node_design, nodes_mm, quantisation_mm, quantise_grid
 from models.compensation.interpolation import cells, fit_positions, trilinear
 from models.compensation.tables import grid_positions
 from models.geometry.chain import design
@@ -144,6 +144,9 @@ def test_the_largest_step_is_that_of_neighbouring_nodes(solved):
     c = table.correction_mm
     steps = [np.abs(c[1:] - c[:-1]).max(), np.abs(c[:, 1:] - c[:, :-1]).max(), np.abs(c[:, :, 1:] - c[:, :, :-1]).max()]
     assert table.largest_step_mm == pytest.approx(max(steps))
+    check_steps(table, table.largest_step_mm)
+    with pytest.raises(ValueError, match=r"from the node at X .* to the next on [XYZ] the correction changes by .* um"):
+        check_steps(table, 0.99 * table.largest_step_mm)
     finer = grid_table(s, (11, 9, 7))
     assert finer.largest_step_mm < table.largest_step_mm
 
