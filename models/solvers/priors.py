@@ -103,9 +103,11 @@ SPECTRUM_SD = 1.0
 """Hyperprior of the two numbers that bend how sizes fade with the order."""
 LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift")
 """Set-up unknowns that hands and temperatures make, so that their size may be learned. Stated calibrations never are."""
-LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(14) / 4.0), 4))
-"""Correlation lengths of the error motions that are tried, in strokes: 0.1 to 0.95."""
-FIRST_LENGTH = LENGTHS[5]
+LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4))
+"""Correlation lengths of the error motions that are tried, in strokes: 0.1 to 1.35."""
+FIRST_LENGTH = LENGTHS[7]
+LENGTH_SPREAD = 0.4
+"""How much the lengths of the motions of one machine differ, standard deviation of the logarithm: a factor of 1.5."""
 SMALLEST_SHARE = 1e-7
 """Variance that every shape keeps of the largest one's, so that none is ruled out."""
 
@@ -116,7 +118,8 @@ def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
 
     An error motion is equally large and equally smooth everywhere on its stroke, its line taken away. Independent Legendre coefficients
     would not say so: all polynomials are largest at the ends of the stroke. So the coefficients are those of a stationary process with a
-    squared exponential correlation of ``length`` strokes, whose independent shapes are the eigenvectors of their covariance.
+    squared exponential correlation of about ``length`` strokes (log-normal, `LENGTH_SPREAD`: one length alone would pretend to know how a
+    motion goes on where nothing was measured), whose independent shapes are the eigenvectors of their covariance.
 
     Returns
     -------
@@ -126,7 +129,11 @@ def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
         Of every shape, for a process of variance 1 (before its line is taken away).
     """
     u, weight = legendre.leggauss(96)
-    kernel = np.exp(-0.5 * ((u[:, None] - u) / 2.0 / length) ** 2)
+    gap = (u[:, None] - u) / 2.0
+    spread = np.linspace(-2.0, 2.0, 9)
+    share = np.exp(-0.5 * spread**2) / np.exp(-0.5 * spread**2).sum()
+    own = length * np.exp(LENGTH_SPREAD * spread)
+    kernel = np.einsum("s,sij->ij", share, np.exp(-0.5 * (gap / own[:, None, None]) ** 2))
     k = np.arange(2, order + 1)
     project = (k + 0.5)[:, None] * legendre.legvander(u, order)[:, 2:].T * weight
     values, vectors = np.linalg.eigh(project @ kernel @ project.T)
