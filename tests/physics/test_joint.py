@@ -25,8 +25,8 @@ def test_the_identified_field_is_the_true_one_within_its_own_uncertainty(solved)
     gap = remove_rigid(grid, truth.deviation(grid) - s.deviation_mm(grid))
     rms = np.sqrt(np.mean(np.sum(gap**2, axis=1)))
     stated = predict_residual(s, nine_tables(s, (13, 11, 10))).u_model_mm
-    assert 0.2 < rms / stated < 1.0  # 0.36 to 0.75 over ten seeds (tests/physics/test_coverage.py): the priors are wider than this machine
-    assert rms < 4e-3
+    assert 0.4 < rms / stated < 1.6  # one machine; ten of them in tests/physics/test_coverage.py
+    assert rms < 1e-3
 
 
 def test_scale_squareness_and_lost_motion_are_covered_by_their_uncertainties(solved):
