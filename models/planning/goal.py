@@ -68,15 +68,15 @@ def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, pass
     """The shortest plan found that reaches the goal within the budget, or the best plan for the budget and False."""
     first = minutes_needed(search, rows, wanted_mm, {}, budget_min)
     if first is None:
-        chosen = search.exchange(search.fill({}, budget_min), budget_min, passes)
+        chosen = search.exchange(search.best_fill(budget_min), budget_min, passes)
         return chosen, bool(chosen) and _enough(search, rows, chosen, wanted_mm)
-    chosen = search.exchange(search.fill({}, first), first, passes)
+    chosen = search.exchange(search.best_fill(first), first, passes)
     if not _enough(search, rows, chosen, wanted_mm):  # the criterion leans on the worst node, it is not the worst node
-        chosen = search.exchange(search.fill({}, budget_min), budget_min, passes)
+        chosen = search.exchange(search.best_fill(budget_min), budget_min, passes)
         return chosen, _enough(search, rows, chosen, wanted_mm)
     while True:
         tighter = 0.93 * search.total_min(chosen)
-        trial = search.exchange(search.fill({}, tighter), tighter, passes)
+        trial = search.exchange(search.best_fill(tighter), tighter, passes)
         if not trial or not _enough(search, rows, trial, wanted_mm):
             return chosen, True
         chosen = trial

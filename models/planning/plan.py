@@ -133,7 +133,7 @@ def plan_campaign(
     search = searcher(machine, tools or Instruments(), priors, vertical, progress)
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     if goal_mm is None:
-        chosen, reached = search.exchange(search.fill({}, minutes), minutes, PASSES), False
+        chosen, reached = search.exchange(search.best_fill(minutes), minutes, PASSES), False
     else:
         chosen, reached = shortest(search, rows, goal_mm, minutes, PASSES)
     if not chosen:

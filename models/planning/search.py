@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from scipy import linalg
@@ -21,6 +22,8 @@ from models.planning.measurements import HelixTest, LineTest, Measurement, machi
 POWER = 4.0
 """Of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
 SEARCH_NODES = 4
+THRIFTS = (1.0, 0.5, 0.0)
+"""Exponents of the minutes by which gains are compared: by gain per minute the cheap comes first, by gain alone the large."""
 LOOK_AT_ALL = 4
 """Every so many additions all candidates are looked at again, else only the best third of the last look."""
 
@@ -105,8 +108,8 @@ class Search:
         ranked = self.ranking(chosen, budget_min, self.candidates)
         return ranked[0] if ranked else None
 
-    def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...]) -> list[Measurement]:
-        """Affordable tests of the pool, and what fits to the cups that stand, by gain per minute, the best first."""
+    def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...], thrift: float = 1.0) -> list[Measurement]:
+        """Affordable tests of the pool, and what fits to the cups that stand, by gain / minutes^thrift, the best first."""
         lower = linalg.cholesky(self.information(chosen), lower=True)
         half = linalg.solve_triangular(lower, self._rows.T, lower=True)
         start = (half**2).sum(axis=0)
@@ -121,7 +124,7 @@ class Search:
             b = linalg.solve_triangular(lower, self._gain_factor(before, test).T, lower=True).T
             s = linalg.cholesky(np.eye(len(b)) + b @ b.T, lower=True)
             less = linalg.solve_triangular(s, b @ half, lower=True)
-            rates[test] = (now - self._judge(start - (less**2).sum(axis=0))) / cost
+            rates[test] = (now - self._judge(start - (less**2).sum(axis=0))) / cost**thrift
         return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
 
     def _at_cups(self, chosen: Chosen) -> list[Measurement]:
@@ -135,12 +138,12 @@ class Search:
                 found.append(replace(last, direction=-last.direction))
         return [t for t in found if t not in self._known]
 
-    def fill(self, chosen: Chosen, budget_min: float) -> Chosen:
-        """Add tests by gain per minute until nothing more fits."""
+    def fill(self, chosen: Chosen, budget_min: float, thrift: float = 1.0) -> Chosen:
+        """Add tests by gain per minute (``thrift`` 1) or by gain alone (0) until nothing more fits."""
         chosen = dict(chosen)
         left = budget_min - self.total_min(chosen)
         pool, looks = self.candidates, 0
-        while ranked := self.ranking(chosen, left, pool):
+        while ranked := self.ranking(chosen, left, pool, thrift):
             test = ranked[0]
             before = chosen.get(test.mounting, ())
             left -= self.cost_min(test, before)
@@ -151,8 +154,12 @@ class Search:
                 self.candidates if looks % LOOK_AT_ALL == 0 else tuple(t for t in ranked[: len(self.candidates) // 3] if t in self._known)
             )
         if pool is not self.candidates and self.best_addition(chosen, left) is not None:
-            return self.fill(chosen, budget_min)
+            return self.fill(chosen, budget_min, thrift)
         return chosen
+
+    def best_fill(self, budget_min: float) -> Chosen:
+        """The best of three ways to fill the time from nothing."""
+        return min((self.fill({}, budget_min, thrift) for thrift in THRIFTS), key=self.criterion)
 
     def exchange(self, chosen: Chosen, budget_min: float, passes: int) -> Chosen:
         """Take every mounting, and every last test of one, out in turn; fill the time again; keep what is better."""
@@ -160,8 +167,8 @@ class Search:
         for number in range(passes):
             improved = False
             self.tick(number / passes)
-            for smaller in _without_one(chosen):
-                trial = self.fill(smaller, budget_min)
+            for smaller, thrift in product(_without_one(chosen), THRIFTS[::2]):
+                trial = self.fill(smaller, budget_min, thrift)
                 value = self.criterion(trial)
                 if value < best - 1e-4:
                     chosen, best, improved = trial, value, True

@@ -59,7 +59,7 @@ def site() -> Site:
 
 @pytest.fixture(scope="module")
 def planned():
-    return plan_for(site(), minutes=25.0)
+    return plan_for(site(), minutes=15.0)
 
 
 def test_a_plan_written_and_read_is_the_same_campaign(planned, tmp_path):
