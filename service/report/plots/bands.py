@@ -12,7 +12,7 @@ from service.report.solution_model import MotionCurve
 from service.report.svg import Svg
 
 WIDTH, CELL_HEIGHT = 1010.0, 132.0
-LEFT, GAP, TOP, BOTTOM = 68.0, 14.0, 30.0, 48.0
+LEFT, GAP, TOP, BOTTOM = 68.0, 30.0, 30.0, 48.0
 OPEN = "not observable"
 
 
