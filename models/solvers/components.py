@@ -168,6 +168,17 @@ def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeMod
     return models[at], found[at]
 
 
+def cautious(model: SizeModel, found: Found) -> Components:
+    """The components with every motion as rough as one standard deviation of what is known of its roughness allows.
+
+    A motion looks as rough as it is where it was measured; beyond, near the ends of the stroke, it may be rougher, and what was measured
+    does not speak against it. Where readings are plenty this changes nothing.
+    """
+    rough = np.array([name.startswith("roughness ") for name in model.names])
+    sd = np.sqrt(found.spread.diagonal()[: rough.size])
+    return Components(found.components.psi + np.where(rough, sd, 0.0), found.components.eta)
+
+
 def widened(model: SizeModel, p: Posterior, spread: F2) -> F2:
     """Covariance of the unknowns with the uncertainty of the sizes in it, shape (p, p), in units of the prior.
 

@@ -12,7 +12,7 @@ from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term
 from models.machine import Machine
 from models.solvers import robust
-from models.solvers.components import Components, Posterior, blend, estimate, fit_length, posterior, widened
+from models.solvers.components import Components, Posterior, blend, cautious, estimate, fit_length, posterior, widened
 from models.solvers.information import I1, KINDS, Grams, Readings, Sums, grams, sums, total
 from models.solvers.noise import DEFAULT_SIGMA_MM, RESOLUTION_MM, repeat_noise_mm
 from models.solvers.observations import RunData
@@ -171,7 +171,7 @@ def _finish(problem: Problem, x: F1, weight: F1, c: Components, gram: Grams) -> 
     whole = total(parts)
     sizes = problem.sizes
     found = estimate(whole.turned(sizes.root, sizes.blocks), sizes, c)
-    c = found.components
+    c = cautious(sizes, found)
     p = posterior(whole.turned(sizes.root, sizes.blocks), c, sizes)
     root = typical[:, None] * sizes.root * c.half(sizes)
     cov = root @ widened(sizes, p, found.spread) @ root.T
