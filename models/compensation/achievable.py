@@ -21,7 +21,7 @@ from models.compensation.distances import (
 )
 from models.compensation.grid import Mask, grid_table, quantise_grid
 from models.compensation.one_axis import positioning_only, squareness_tables
-from models.compensation.per_motion import enough_for_the_field, motion_tables, seen_by_rank
+from models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
 from models.compensation.tables import NineTables, nine_tables, quantise
 from models.solvers.joint import JointSolution
 
@@ -70,7 +70,7 @@ def achievable(
     lsb_mm : float
         The controller's unit; 0: no rounding. Tables of single motions and squareness parameters are not rounded.
     observable : set of str, optional
-        Motions that are observable by themselves (`models.solvers.observability`); default: by rank alone.
+        Motions that are observable by themselves; default: `observable_alone`.
     """
     pairs = random_pairs(inner_box_mm(solution.machine))
     nine = nine_tables(solution, counts)
@@ -88,7 +88,7 @@ def achievable(
         lambda p: alone.correction_at(p) + square.squareness_at(p),
     )
     rows += [both, _one_axis(solution, pairs, "nine tables", nine, lsb_mm, outputs=3)]
-    seen = seen_by_rank(solution) if observable is None else observable
+    seen = observable_alone(solution) if observable is None else observable
     for kind, motions, any_tool in (
         ("tables of the motions that are observable by themselves", seen, True),
         ("tables of single motions, right for this tool only", enough_for_the_field(solution), False),

@@ -3,8 +3,8 @@
 One campaign with one tool does not see every motion by itself: turning and shifting a carriage look alike at one tool length (math.md 4.6).
 A motion that the data do not tell apart is not written under its name. Two ways are left, and the caller chooses by naming the motions:
 
-- only motions that are observable by themselves (`models.solvers.observability`, or `seen_by_rank`): true for every tool, but what is only
-  known together with a hidden motion stays uncorrected;
+- only motions that are observable by themselves (`observable_alone`): true for every tool, but what is only known together with a hidden
+  motion, or is mostly an assumption, stays uncorrected;
 - `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Right at this tool length only, and so labelled.
 
 In the first case every motion has its own estimate; in the second those that are written take over what the others did at this tool.
@@ -25,6 +25,8 @@ from models.geometry.chain import design, deviation_mm
 from models.geometry.jacobian import squareness_motions
 from models.machine import Machine
 from models.solvers.joint import JointSolution
+from models.solvers.observability import motions_of
+from models.solvers.observability_parameters import observable_motions
 from models.volumetric import rigid_design, volume_grid
 
 NODES = 7
@@ -127,10 +129,12 @@ def _entries(solution: JointSolution, name: str, grids: tuple[F1, F1, F1], keep:
     return gradient @ solution.coefficients, np.sqrt(np.maximum(variance, 0.0))
 
 
-def seen_by_rank(solution: JointSolution) -> frozenset[str]:
-    """Motions no order of which is part of a combination that the data do not see (`models.solvers.identifiability`)."""
-    hidden = {name.split(".")[0] for c in solution.identifiability.hidden for name, _ in c.weights}
-    return frozenset({t.motion for t in solution.terms} - hidden)
+def observable_alone(solution: JointSolution, *, weak: bool = False) -> frozenset[str]:
+    """Motions that the report on this solution calls observed (with ``weak``: or weak), by the same rule (`observable_motions`).
+
+    None of their coefficients takes part in a hidden combination, and the readings carry at least 90 % (10 %) of what is known of them.
+    """
+    return frozenset(observable_motions(motions_of(solution), weak=weak))
 
 
 def enough_for_the_field(solution: JointSolution) -> frozenset[str]:

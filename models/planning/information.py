@@ -20,6 +20,7 @@ from models.planning.instruments import Instruments
 from models.planning.measurements import BAR_VALUES, HelixTest, Measurement, expected_run
 from models.solvers.observations import RunData
 from models.solvers.observe import run_design, setup_unknowns
+from models.solvers.observe_setup import bar_length_name
 from models.solvers.priors import Priors, term_prior_sd
 from models.volumetric import rigid_design, volume_grid
 
@@ -50,7 +51,7 @@ class Problem:
 def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | None = None) -> Problem:
     """Set up what a plan is about; ``order``: highest Legendre order of the error motions."""
     priors, terms = priors or Priors(), smooth_terms(order)
-    bars = [f"bar_length_{r:g}" for r in sorted(tools.bar_lengths_mm)]
+    bars = [bar_length_name(r) for r in sorted(tools.bar_lengths_mm)]
     names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *bars, LASER_SCALE)
     rest = [priors.backlash_mm] * 3 + [tools.u_bar_length_mm] * len(bars) + [tools.u_wavelength]
     return Problem(machine, tools, priors, terms, names, np.concatenate([term_prior_sd(machine, terms, priors), rest]))

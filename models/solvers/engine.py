@@ -92,7 +92,7 @@ def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None,
 
 def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: Noise) -> Problem:
     """Linearise all runs about the perfect machine."""
-    setup = setup_unknowns(runs, priors)
+    setup = setup_unknowns(runs, priors, machine)
     rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
     rest_sd = np.concatenate([np.full(len(DIRECTIONS), priors.backlash_mm), setup.prior_sd])
     sizes = size_model(machine, terms, rest, rest_sd, priors)

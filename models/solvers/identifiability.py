@@ -11,6 +11,8 @@ from models.arrays import F1, F2
 
 RANK_TOLERANCE = 1e-9
 EFFECTIVE_TOLERANCE = 1e-3
+HIDDEN = 1e-6
+"""A parameter takes part in what is hidden if its unit column has this component in the null space."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +38,8 @@ class Identifiability:
         Largest over smallest singular value counted in ``rank``.
     hidden : tuple of Combination
         The null space (beyond ``rank``) as sparse combinations.
+    involved : frozenset of str
+        Parameters that take part in the null space at all (`taking_part`): none of them has a value of its own.
     """
 
     n_parameters: int
@@ -43,6 +47,18 @@ class Identifiability:
     effective_rank: int
     condition: float
     hidden: tuple[Combination, ...]
+    involved: frozenset[str] = frozenset()
+
+
+def taking_part(names: tuple[str, ...], null_space: F2) -> frozenset[str]:
+    """Parameters that take part in a hidden combination; ``null_space``: orthonormal in unit columns, shape (p, k)."""
+    size = np.linalg.norm(null_space, axis=1) if null_space.shape[1] else np.zeros(len(names))
+    return frozenset(n for n, s in zip(names, size, strict=True) if s > HIDDEN)
+
+
+def combinations_of(names: tuple[str, ...], null_space: F2) -> tuple[Combination, ...]:
+    """A null space, shape (p, k), as sparse combinations in words."""
+    return tuple(_in_words(names, v) for v in sparse_rows(null_space.T))
 
 
 def project_out(a: F2, nuisance: F2) -> F2:
@@ -74,8 +90,8 @@ def analyse(names: tuple[str, ...], a: F2, typical: F1 | None = None, *, toleran
     rank = int((s > tolerance * top).sum())
     effective = int((s > EFFECTIVE_TOLERANCE * top).sum())
     condition = float(top / s[rank - 1]) if rank else float("inf")
-    hidden = tuple(_in_words(names, v) for v in sparse_rows(vt[rank:]))
-    return Identifiability(len(names), rank, effective, condition, hidden)
+    null = vt[rank:].T
+    return Identifiability(len(names), rank, effective, condition, combinations_of(names, null), taking_part(names, null))
 
 
 def sparse_rows(null: F2) -> F2:

@@ -11,19 +11,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import linalg
 
 from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from models.geometry.chain import design
 from models.machine import Machine
 from models.solvers.engine import Fit, Problem, Progress, build, expected_noise, settle
-from models.solvers.identifiability import Identifiability, analyse, project_out
+from models.solvers.identifiability import Identifiability, combinations_of, taking_part
 from models.solvers.information import KINDS, total
 from models.solvers.least_squares import Estimate
+from models.solvers.observability_rank import campaign_columns, compressed, stated_knowledge, what_is_seen
 from models.solvers.observations import RunData
 from models.solvers.observe import Setup, with_tool
-from models.solvers.observe_setup import STATED
 from models.solvers.order import RIGID6, OrderChoice, choose, term_levels
 from models.solvers.priors import Priors
 from models.solvers.residual_tests import ResidualTest, residual_tests
@@ -62,7 +61,7 @@ class JointSolution:
     information : array, shape (p, p)
         What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
-        Of the terms up to ``order`` only.
+        Of the terms up to ``order`` only, by the rule of the whole report (`models.solvers.observability_rank.stated_knowledge`).
     prior_root : array, shape (p, p)
         Factor of the prior covariance of the unknowns, root root^T: orders of one motion are alike, so ``prior_sd`` alone is not all of it.
     weight_per_mm2 : array, shape (n,)
@@ -228,14 +227,16 @@ def _estimate(problem: Problem, fit: Fit) -> Estimate:
 
 
 def _rank(problem: Problem, order: int) -> Identifiability:
-    """What the runs see of the terms up to ``order`` when lost motion and set-up are free; the orders above are held by their prior."""
-    n = len(problem.terms)
+    """What the runs see of the terms up to ``order``, by the rule of the report: lost motion, and what nobody states of a set-up, is free.
+
+    The orders above are held by their prior. Combinations are in units of typical sizes.
+    """
     inside = [i for i, t in enumerate(problem.terms) if t.order <= order]
-    free = [i for i in range(n, len(problem.names)) if not problem.names[i].startswith(STATED)]
-    columns = problem.readings.a[:, inside + free]
-    r = linalg.qr(columns, mode="r", check_finite=False)[0][: columns.shape[1]]
-    k = len(inside)
-    return analyse(tuple(problem.names[i] for i in inside), project_out(r[:, :k], r[:, k:]), np.ones(k))
+    terms, names = tuple(problem.terms[i] for i in inside), tuple(problem.names[i] for i in inside)
+    columns = compressed(campaign_columns(problem.machine, terms, problem.runs, problem.setup))
+    seen = what_is_seen(columns, stated_knowledge(terms, problem.runs, problem.setup.names))
+    hidden = combinations_of(names, seen.null_space * (seen.factor / problem.sizes.typical[inside])[:, None])
+    return Identifiability(len(names), seen.rank, seen.effective_rank, seen.condition, hidden, taking_part(names, seen.null_space))
 
 
 def _fits(problem: Problem, fit: Fit) -> tuple[RunFit, ...]:

@@ -17,6 +17,7 @@ from models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from models.machine import Machine
 from models.solvers.joint import JointSolution
 from models.solvers.observability_cures import Campaign
+from models.solvers.observability_free import hidden_free
 from models.solvers.observability_hidden import Advice, HiddenGroup, picture
 from models.solvers.observability_parameters import Correlation, Motion, Parameter, correlations, hidden_terms, motions, parameters
 from models.solvers.observability_rank import (
@@ -25,7 +26,6 @@ from models.solvers.observability_rank import (
     Seen,
     campaign_columns,
     compressed,
-    hidden_lost_motion,
     stated_knowledge,
     what_is_seen,
 )
@@ -34,7 +34,7 @@ from models.solvers.observations import RunData
 from models.solvers.observe import setup_unknowns
 from models.solvers.priors import Priors, size_model
 
-__all__ = ["Observability", "observability", "observability_of"]
+__all__ = ["Observability", "motions_of", "observability", "observability_of"]
 
 SIGMA_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
 FLOOR_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
@@ -126,8 +126,10 @@ def observability(
     ----------
     terms : int or tuple of Term
         The model: highest Legendre order of the 21 error motions, or its coefficients.
-    priors, sigma_mm, floor_mm
+    priors
         As in `models.solvers.joint.solve_joint`.
+    sigma_mm, floor_mm : dict with keys "bar", "laser", optional
+        Standard uncertainty of one raw reading, and the least one of an averaged value, mm (the larger of the two counts).
     known : Knowledge, optional
         What is known of the set-up, for the rank; default `stated_knowledge`: what the runs themselves state.
 
@@ -140,11 +142,11 @@ def observability(
         raise ValueError("observability: no runs")
     terms = smooth_terms(terms) if isinstance(terms, int) else terms
     priors = priors or Priors()
-    setup = setup_unknowns(runs, priors)
+    setup = setup_unknowns(runs, priors, machine)
     sigma, floor = sigma_mm or SIGMA_MM, floor_mm or FLOOR_MM
     rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
     sizes = size_model(machine, terms, rest, np.concatenate([np.full(3, priors.backlash_mm), setup.prior_sd]), priors)
-    u = np.concatenate([np.hypot(sigma[r.kind] / np.sqrt(r.weight_n), floor[r.kind]) for r in runs])
+    u = np.concatenate([np.maximum(sigma[r.kind] / np.sqrt(r.weight_n), floor[r.kind]) for r in runs])
     columns = campaign_columns(machine, terms, runs, setup)
     whitened = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1) / u[:, None]
     information, root = whitened.T @ whitened, sizes.typical[:, None] * sizes.root
@@ -163,6 +165,13 @@ def observability_of(solution: JointSolution, known: Knowledge | None = None) ->
     beliefs = _Beliefs(e.theta, e.covariance, s.prior_root, s.information, float(np.sqrt(np.mean(noise**2))))
     columns = campaign_columns(s.machine, s.terms, s.data, s.setup)
     return _report(_Model(s.machine, s.terms, s.order), s.data, columns, beliefs, known)
+
+
+def motions_of(solution: JointSolution) -> tuple[Motion, ...]:
+    """Every error motion of a solution judged, as in its whole report, without the report's other parts."""
+    p = len(solution.terms)
+    root = solution.prior_root[:p]
+    return motions(solution.machine, solution.terms, solution.term_covariance, root @ root.T, solution.identifiability.involved)
 
 
 def posterior_covariance(information: F2, prior_root: F2) -> F2:
@@ -202,7 +211,6 @@ def _report(model: _Model, runs: tuple[RunData, ...], columns: Columns, beliefs:
     found = picture(Campaign(machine, terms, runs, few, known), seen, prior_sd[counted])
     names = (*(t.name for t in model.terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
     secret = hidden_terms(terms, seen.null_space)
-    lost = frozenset(f"backlash_{a}" for a in hidden_lost_motion(few, known)) if known.lost_motion else frozenset()
     knowing = _knowing(beliefs, p)
     volume = whole_volume(machine, model.terms, knowing)
     return Observability(
@@ -214,7 +222,7 @@ def _report(model: _Model, runs: tuple[RunData, ...], columns: Columns, beliefs:
         known=tuple(known.held),
         hidden=found.groups,
         advice=found.advice,
-        parameters=parameters(names, beliefs.theta, beliefs.covariance, prior_sd, secret | lost),
+        parameters=parameters(names, beliefs.theta, beliefs.covariance, prior_sd, secret | hidden_free(few, known, seen)),
         correlations=correlations(names, beliefs.covariance),
         motions=motions(machine, model.terms, knowing.posterior, knowing.prior, secret),
         knowing=knowing,

@@ -13,9 +13,9 @@ from scipy import linalg
 from models.arrays import F2
 from models.geometry.bases import Term
 from models.machine import Machine
-from models.solvers.designs import unit_columns
-from models.solvers.identifiability import RANK_TOLERANCE, project_out
+from models.solvers.identifiability import project_out
 from models.solvers.observability_additions import Addition, additions
+from models.solvers.observability_free import Play, play
 from models.solvers.observability_rank import Columns, Knowledge, Seen, campaign_columns, stated_knowledge, with_knowledge
 from models.solvers.observations import RunData
 from models.solvers.observe import Setup, setup_unknowns
@@ -60,8 +60,8 @@ def trials(campaign: Campaign, seen: Seen) -> list[Trial]:
         return []
     order = max(t.order for t in campaign.terms)
     tried = additions(campaign.machine, campaign.runs, campaign.known, campaign.columns.setup_names, order)
-    play = _play(campaign, seen)
-    return [Trial(a, _shown(campaign, a, play)) for a in tried]
+    hidden = play(campaign.columns, campaign.known, seen)
+    return [Trial(a, _shown(campaign, a, hidden)) for a in tried]
 
 
 def best_sequence(found: list[Trial], hidden: int) -> list[tuple[Addition, int]]:
@@ -79,53 +79,23 @@ def best_sequence(found: list[Trial], hidden: int) -> list[tuple[Addition, int]]
     return out
 
 
-@dataclass(frozen=True)
-class _Play:
-    """What leaves no trace in the campaign: hidden combinations together with the set-up changes that cancel them.
-
-    Attributes
-    ----------
-    groups : names behind each free unknown.
-    machine, setup : arrays, shape (p, k) and (q, k)
-        Coefficients of each hidden combination and the free unknowns that go with it, own units.
-    loose : array, shape (q, m)
-        Changes of free unknowns alone that leave no trace.
-    """
-
-    groups: tuple[tuple[str, ...], ...]
-    machine: F2
-    setup: F2
-    loose: F2
-
-
-def _play(campaign: Campaign, seen: Seen) -> _Play:
-    machine, free, groups = with_knowledge(campaign.columns, campaign.known)
-    unit, factor = unit_columns(free)
-    u, s, vt = linalg.svd(unit, full_matrices=True, check_finite=False)
-    rank = int((s > RANK_TOLERANCE * s[0]).sum()) if s.size else 0
-    hidden = seen.null_space * seen.factor[:, None]
-    answer = vt[:rank].T @ ((u[:, :rank].T @ (machine @ hidden)) / s[:rank, None])
-    loose = np.where(np.abs(vt[rank:].T) > SHOWN, vt[rank:].T, 0.0)  # rounding must not count as an unknown of its own
-    return _Play(groups, hidden, -answer * factor[:, None], loose * factor[:, None])
-
-
-def _shown(campaign: Campaign, addition: Addition, play: _Play) -> F2:
+def _shown(campaign: Campaign, addition: Addition, hidden: Play) -> F2:
     """What an addition shows per unit of each hidden combination (unit columns), shape (at most k, k); its own set-up unknowns out."""
     if not addition.runs:
-        at = [i for i, group in enumerate(play.groups) if set(group) & set(addition.knows)]
-        size = np.linalg.norm(campaign.columns.setup[:, [campaign.columns.setup_names.index(play.groups[i][0]) for i in at]], axis=0)
-        return _upper(project_out(play.setup[at] * size[:, None], play.loose[at] * size[:, None]))
+        at = [i for i, group in enumerate(hidden.groups) if set(group) & set(addition.knows)]
+        size = np.linalg.norm(campaign.columns.setup[:, [campaign.columns.setup_names.index(hidden.groups[i][0]) for i in at]], axis=0)
+        return _upper(project_out(hidden.free[at] * size[:, None], hidden.loose[at] * size[:, None]))
     runs = (*campaign.runs, *addition.runs)
-    setup = setup_unknowns(runs, Priors())
+    setup = setup_unknowns(runs, Priors(), campaign.machine)
     new = campaign_columns(campaign.machine, campaign.terms, addition.runs, setup)
     known = _known_with(campaign, runs, setup, new)
     machine, free, groups = with_knowledge(new, known)
-    old = [next((k for k, g in enumerate(play.groups) if set(g) & set(group)), -1) for group in groups]
+    old = [next((k for k, g in enumerate(hidden.groups) if set(g) & set(group)), -1) for group in groups]
     shared, fresh = [i for i, k in enumerate(old) if k >= 0], [i for i, k in enumerate(old) if k < 0]
     there = [old[i] for i in shared]
-    response = machine @ play.machine + free[:, shared] @ play.setup[there]
-    size = np.linalg.norm(free[:, shared], axis=0) @ np.abs(play.loose[there])
-    loose = free[:, shared] @ play.loose[there]
+    response = machine @ hidden.machine + free[:, shared] @ hidden.free[there]
+    size = np.linalg.norm(free[:, shared], axis=0) @ np.abs(hidden.loose[there])
+    loose = free[:, shared] @ hidden.loose[there]
     loose = loose[:, np.linalg.norm(loose, axis=0) > SHOWN * size]
     return _upper(project_out(response, np.concatenate([loose, free[:, fresh]], axis=1)))
 

@@ -13,13 +13,12 @@ import numpy as np
 from models.arrays import F1, F2
 from models.geometry.bases import Term, term_values
 from models.machine import Machine
+from models.solvers.identifiability import taking_part
 
 Status = Literal["observed", "weak", "not observable"]
 OBSERVED, SEEN = 0.9, 0.1
 """Share of information from data: from 0.9 on (u at most 0.32 of the prior's) a parameter is observed, below 0.1 (u at least 0.95 of it)
 not observable; weak between."""
-HIDDEN = 1e-6
-"""A parameter takes part in what is hidden if its unit column has this component there."""
 CORRELATED = 0.9
 NODES = 41
 
@@ -96,8 +95,7 @@ def correlations(names: tuple[str, ...], covariance: F2) -> tuple[Correlation, .
 
 def hidden_terms(terms: tuple[Term, ...], null_space: F2) -> frozenset[str]:
     """Coefficients that take part in a hidden combination; ``null_space``: orthonormal in unit columns, shape (p, k)."""
-    size = np.linalg.norm(null_space, axis=1) if null_space.shape[1] else np.zeros(len(terms))
-    return frozenset(t.name for t, s in zip(terms, size, strict=True) if s > HIDDEN)
+    return taking_part(tuple(t.name for t in terms), null_space)
 
 
 def motions(machine: Machine, terms: tuple[Term, ...], covariance: F2, prior: F2, hidden: frozenset[str]) -> tuple[Motion, ...]:

@@ -24,14 +24,20 @@ from models.solvers.designs import unit_columns
 from models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
 from models.solvers.observations import RunData
 from models.solvers.observe import Setup, run_design
+from models.solvers.observe_setup import bar_length_name
+from models.solvers.rounding import as_meant
 
 HAND_SET = ("cup", "tilt", "zero")
-"""Set-up unknowns that hands make and nobody states; with uncalibrated bar lengths they are free. All others have a stated limit: slow
-drifts, the laser's wavelength, its cosine error (`models.solvers.priors`). They are known for the rank, and in every uncertainty."""
+"""Set-up unknowns that hands make and nobody states; with uncalibrated bar lengths they are free, in the solver's rank as in the report's.
+All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`models.solvers.priors`). They are known for the
+rank, and count in every uncertainty: else a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time, as
+the height is in a helix) a squareness."""
 
 
-ROUNDING = 1e-12
-"""Columns shorter than this share of the longest one are zero: a lever that cancels leaves 1e-16 of its parts."""
+ROUNDING = 1e-6
+"""Columns shorter than this share of the longest one are zero. The longest are levers, about 1000 mm of reading per rad, so such a column
+is a lever of 1 um, or a direction cosine of 0.001: rounding of positions, tools and pivots. A motion of typical size (20 urad, 5 um) moves
+no reading by more than 5 nm through it. Columns of motions that are seen are longer than 1e-4 of the longest."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +98,8 @@ class Seen:
 
 
 def campaign_columns(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: Setup) -> Columns:
-    """Linearised readings of all runs, unweighted: what a reading shows does not depend on its noise."""
-    a = np.concatenate([run_design(machine, terms, run, setup) for run in runs])
+    """Linearised readings of all runs as they were meant (`as_meant`), unweighted: what a reading shows does not depend on its noise."""
+    a = np.concatenate([run_design(machine, terms, as_meant(run), setup) for run in runs])
     p = len(terms)
     return Columns(a[:, :p], a[:, p : p + len(DIRECTIONS)], a[:, p + len(DIRECTIONS) :], setup.names)
 
@@ -116,7 +122,7 @@ def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup_n
     (`models.solvers.priors.bar_length_sd`); how well it was calibrated enters the uncertainties, not the rank. Cup offsets, mirror tilts,
     laser zeros and uncalibrated lengths are free, however narrow their priors.
     """
-    vague = {f"bar_length_{r.radius_mm:g}" for r in runs if r.kind == "bar" and not _calibrated(r)}
+    vague = {bar_length_name(r.radius_mm) for r in runs if r.radius_mm is not None and not _calibrated(r)}
     return Knowledge({n: np.zeros(len(terms)) for n in setup_names if n.partition("_")[0] not in HAND_SET and n not in vague})
 
 
@@ -172,16 +178,3 @@ def _without_rounding(a: F2) -> F2:
     """The design with columns that are nothing but rounding set to zero: brought to unit length they would count as seen."""
     norm = np.linalg.norm(a, axis=0)
     return np.where(norm > ROUNDING * norm.max(initial=0.0), a, 0.0)
-
-
-def hidden_lost_motion(columns: Columns, known: Knowledge) -> tuple[str, ...]:
-    """Axes whose lost motion other unknowns can imitate completely: mostly axes that never reverse, like the pole axis of one helix."""
-    machine, free, _ = with_knowledge(columns, replace(known, lost_motion=False))
-    out = []
-    for k, axis in enumerate(DIRECTIONS):
-        column = columns.lost[:, k : k + 1]
-        others = unit_columns(np.concatenate([machine, free, np.delete(columns.lost, k, axis=1)], axis=1))[0]
-        size = float(np.linalg.norm(column))
-        if size == 0.0 or float(np.linalg.norm(project_out(column, others))) < RANK_TOLERANCE * size:
-            out.append(axis)
-    return tuple(out)

@@ -17,6 +17,9 @@ REJECT_SIGMA = 5.0
 LEAST_SPREAD_MM = 1e-4
 """Resolution of a usual ball-bar: readings that differ by rounding alone are no outliers of each other."""
 
+LEAST_BAR_MM = 1.0
+"""No ball-bar is shorter; nearer to the cup than this a position is a mistake, and the direction of the bar means nothing."""
+
 
 @dataclass(frozen=True)
 class RunData:
@@ -69,21 +72,50 @@ class RunData:
 
     def __post_init__(self) -> None:
         """Refuse what no solver could use, naming the run."""
-        n = self.deviation_mm.size
-        shapes = {"axes_mm": (n, 3), "sign": (n, 3), "t_s": (n,), "weight_n": (n,)}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"run {self.label}: {name} has shape {getattr(self, name).shape}, expected {shape}")
-        if n == 0 or not (np.isfinite(self.axes_mm).all() and np.isfinite(self.deviation_mm).all()):
-            raise ValueError(f"run {self.label}: no finite readings")
-        if self.kind == "bar" and (self.centre_mm is None or self.radius_mm is None):
-            raise ValueError(f"run {self.label}: a ball-bar run needs centre_mm and radius_mm")
-        if self.kind == "laser" and (self.beam is None or self.beam.shape != (3,) or not abs(np.linalg.norm(self.beam) - 1.0) < 1e-6):
-            raise ValueError(f"run {self.label}: a laser run needs its nominal beam, a unit vector")
+        _check_columns(self)
+        if self.kind == "bar":
+            _check_bar(self)
+        else:
+            _check_beam(self)
         if self.tool_mm is not None and (self.tool_mm.shape != (3,) or not np.isfinite(self.tool_mm).all()):
             raise ValueError(f"run {self.label}: tool_mm must be three finite numbers")
         if self.u_length_mm is not None and not (np.isfinite(self.u_length_mm) and self.u_length_mm >= 0):
             raise ValueError(f"run {self.label}: u_length_mm must be a number of 0 or more")
+
+
+def _check_columns(run: RunData) -> None:
+    """Every column as long as the readings, and nothing in it that is no number."""
+    n = run.deviation_mm.size
+    shapes = {"deviation_mm": (n,), "axes_mm": (n, 3), "sign": (n, 3), "t_s": (n,), "weight_n": (n,)}
+    if n == 0:
+        raise ValueError(f"run {run.label}: no readings")
+    for name, shape in shapes.items():
+        column = getattr(run, name)
+        if column.shape != shape:
+            raise ValueError(f"run {run.label}: {name} has shape {column.shape}, expected {shape}")
+        bad = np.flatnonzero(~np.isfinite(column).reshape(n, -1).all(axis=1))
+        if bad.size:
+            raise ValueError(f"run {run.label}: {name} is no finite number in {bad.size} of {n} readings, first in reading {bad[0] + 1}")
+    if not (run.weight_n > 0).all():
+        raise ValueError(f"run {run.label}: every weight_n must be above 0")
+
+
+def _check_bar(run: RunData) -> None:
+    """A cup somewhere, a bar of some length, and no reading where the bar would have none."""
+    if run.centre_mm is None or run.radius_mm is None:
+        raise ValueError(f"run {run.label}: a ball-bar run needs centre_mm and radius_mm")
+    if run.centre_mm.shape != (3,) or not np.isfinite(run.centre_mm).all():
+        raise ValueError(f"run {run.label}: centre_mm must be three finite numbers")
+    if not (np.isfinite(run.radius_mm) and run.radius_mm > 0):
+        raise ValueError(f"run {run.label}: radius_mm must be above 0, it is {run.radius_mm:g}")
+    at = np.flatnonzero(np.linalg.norm(run.axes_mm - run.centre_mm, axis=1) < LEAST_BAR_MM)
+    if at.size:
+        raise ValueError(f"run {run.label}: reading {at[0] + 1} is on the cup's centre, where the bar has no direction")
+
+
+def _check_beam(run: RunData) -> None:
+    if run.beam is None or run.beam.shape != (3,) or not abs(np.linalg.norm(run.beam) - 1.0) < 1e-6:
+        raise ValueError(f"run {run.label}: a laser run needs its nominal beam, a unit vector")
 
 
 def block_average(run: RunData, blocks: int) -> RunData:

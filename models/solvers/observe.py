@@ -17,7 +17,7 @@ from models.geometry.bases import Term
 from models.machine import Machine
 from models.solvers.observations import RunData
 from models.solvers.observe_kinematics import LOST, Places, with_tool
-from models.solvers.observe_setup import Setup, perpendicular, setup_unknowns
+from models.solvers.observe_setup import Setup, bar_length_name, perpendicular, setup_unknowns
 
 __all__ = [
     "Setup",
@@ -124,7 +124,8 @@ class _Bar:
 
     def _names(self) -> tuple[list[str], list[str], str]:
         s = self.run.setup
-        return [f"cup_{s}_{a}" for a in "xyz"], [f"bar_drift_{s}_{a}" for a in "xyz"], f"bar_length_{self.run.radius_mm:g}"
+        assert self.run.radius_mm is not None
+        return [f"cup_{s}_{a}" for a in "xyz"], [f"bar_drift_{s}_{a}" for a in "xyz"], bar_length_name(self.run.radius_mm)
 
     def _bar(self) -> F2:
         """From the cup to the tool, shape (n, 3), mm."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
+from models.arrays import F1, F2
 from models.geometry.chain import travel_sign
 from models.solvers.observations import RunData, Test, block_average, reading_noise_mm
 from service.errors import MeasurementFault
@@ -25,8 +25,16 @@ def run_data(run: dict[str, Any], *, blocks: int = BLOCKS) -> RunData:
     Raises
     ------
     MeasurementFault
-        The run holds fewer than 10 valid readings, or none at all because it is sealed, or its test is none that this solver knows.
+        The run holds fewer than 10 valid readings, or none at all because it is sealed, or its test is none that this solver knows; or
+        something in it is no number, no length or no direction (named).
     """
+    try:
+        return _run_data(run, blocks)
+    except ValueError as exc:
+        raise MeasurementFault(str(exc), "correct the run or leave it out") from exc
+
+
+def _run_data(run: dict[str, Any], blocks: int) -> RunData:
     columns, setup, label = run["columns"], run["setup"], run["run_id"]
     if run["test"] not in TESTS:
         raise MeasurementFault(f"run {label}: test {run['test']!r} is not one this solver knows")
@@ -41,7 +49,7 @@ def run_data(run: dict[str, Any], *, blocks: int = BLOCKS) -> RunData:
         "setup": setup["setup_id"],
         "axes_mm": axes[valid],
         "deviation_mm": np.asarray(columns["deviation_mm"], dtype=np.float64)[valid],
-        "sign": travel_sign(axes)[valid],
+        "sign": _signs(axes)[valid],
         "t_s": np.asarray(columns["t_s"], dtype=np.float64)[valid],
         "weight_n": np.ones(int(valid.sum())),
         "tool_mm": _tool(setup),
@@ -49,10 +57,18 @@ def run_data(run: dict[str, Any], *, blocks: int = BLOCKS) -> RunData:
     }
     if run["test"].startswith("laser"):
         common["deviation_mm"] = _since_first(common["deviation_mm"], first_valid=bool(valid[0]))
-        return RunData(kind="laser", **common, beam=_beam(setup))
+        return RunData(kind="laser", **common, beam=_beam(setup, label))
     centre = np.asarray(setup["centre_mm"], dtype=np.float64)
     common |= {"u_length_mm": setup.get("u_length_mm"), "length_calibrated": setup.get("length_calibrated")}
     return block_average(RunData(kind="bar", **common, centre_mm=centre, radius_mm=float(setup["radius_mm"])), blocks)
+
+
+def _signs(axes_mm: F2) -> F2:
+    """Direction in which each axis last moved, from the rows that say where the machine was; an invalid one may not."""
+    there = np.isfinite(axes_mm).all(axis=1)
+    out = np.full(axes_mm.shape, np.nan)
+    out[there] = travel_sign(axes_mm[there])
+    return out
 
 
 def _since_first(deviation_mm: F1, *, first_valid: bool) -> F1:
@@ -70,7 +86,7 @@ def _tool(setup: dict[str, Any]) -> F1 | None:
     return None if tool is None else np.asarray(tool, dtype=np.float64)
 
 
-def _beam(setup: dict[str, Any]) -> F1:
+def _beam(setup: dict[str, Any], label: str) -> F1:
     """Nominal beam, a unit vector: as stated, else along the test, from its start to its end (a laser_linear along its axis)."""
     if setup.get("nominal_beam") is not None:
         beam = np.asarray(setup["nominal_beam"], dtype=np.float64)
@@ -78,9 +94,14 @@ def _beam(setup: dict[str, Any]) -> F1:
         beam = np.subtract(setup["end_mm"], setup["start_mm"]).astype(np.float64)
         if setup.get("axis") is not None:
             beam = beam * np.eye(3)["XYZ".index(setup["axis"])]
-    return np.asarray(beam / np.linalg.norm(beam))
+    length = float(np.linalg.norm(beam))
+    if not (np.isfinite(length) and length > 0.0):
+        raise ValueError(f"run {label}: a laser run needs a beam: nominal_beam, or start and end apart")
+    return np.asarray(beam / length)
 
 
 def bar_noise_mm(run: dict[str, Any]) -> float:
-    """Standard deviation of one ball-bar reading (`models.solvers.observations.reading_noise_mm`)."""
-    return reading_noise_mm(np.asarray(run["columns"]["deviation_mm"], dtype=np.float64))
+    """Standard deviation of one valid ball-bar reading (`models.solvers.observations.reading_noise_mm`)."""
+    columns = run["columns"]
+    values = np.asarray(columns["deviation_mm"], dtype=np.float64)
+    return reading_noise_mm(values[np.asarray(columns.get("valid", np.ones(values.size))).astype(bool)])

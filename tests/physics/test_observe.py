@@ -258,7 +258,59 @@ def test_what_was_re_mounted_is_not_one_set_up(what):
             first = replace(line, label="a", beam=-line.beam)
         second = line
     with pytest.raises(ValueError, match=f"run b: set-up S has another {what} than in run a"):
-        setup_unknowns((first, second), Priors())
+        setup_unknowns((first, second), Priors(), Machine("w-b-X-Y-Z-t", STROKE))
+
+
+def test_a_tool_that_is_not_stated_is_the_machine_s():
+    """Said or left unsaid, one tool is one set-up; two stated ones are not, whatever stands between them."""
+    machine = machine_of("w-X-Y-b-Z-t", 1)
+    unsaid = bar("a", arc("XY", 0.0, 6.0), setup="S")
+    said = replace(unsaid, label="b", tool_mm=machine.tool_mm)
+    other = replace(unsaid, label="c", tool_mm=machine.tool_mm + 5.0)
+    both = setup_unknowns((unsaid, said), Priors(), machine)
+    assert both.names == setup_unknowns((said, unsaid), Priors()).names == setup_unknowns((unsaid,), Priors()).names
+    for runs in ((unsaid, said, other), (said, unsaid, other)):
+        with pytest.raises(ValueError, match="run c: set-up S has another tool"):
+            setup_unknowns(runs, Priors())
+    with pytest.raises(ValueError, match="run c: set-up S has another tool"):
+        setup_unknowns((unsaid, other), Priors(), machine)
+
+
+def test_a_bar_is_one_whatever_the_last_digits_of_its_stored_length():
+    """A calibrated length rounded up or down, and 150.0004 beside 150.0006, are one bar; 0.3 mm more is another."""
+    radii = (150.00049, 150.00051, 150.0, 149.9999)
+    runs = tuple(replace(bar(f"r{k}", arc("XY", 0.0, 6.0)), radius_mm=r) for k, r in enumerate(radii))
+    assert [n for n in setup_unknowns(runs, Priors()).names if n.startswith("bar_length")] == ["bar_length_150"]
+    longer = replace(runs[0], label="l", radius_mm=150.3)
+    names = setup_unknowns((*runs, longer), Priors()).names
+    assert [n for n in names if n.startswith("bar_length")] == ["bar_length_150", "bar_length_150.3"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"radius_mm": 0.0}, "radius_mm must be above 0"),
+        ({"radius_mm": -5.0}, "radius_mm must be above 0"),
+        ({"radius_mm": np.nan}, "radius_mm must be above 0"),
+        ({"centre_mm": np.full(3, np.nan)}, "centre_mm must be three finite numbers"),
+        ({"deviation_mm": (3, np.nan)}, "deviation_mm is no finite number in 1 of 8 readings, first in reading 4"),
+        ({"t_s": (0, np.nan)}, "t_s is no finite number in 1 of 8 readings, first in reading 1"),
+        ({"sign": (7, np.nan)}, "sign is no finite number in 1 of 8 readings, first in reading 8"),
+        ({"axes_mm": (2, np.inf)}, "axes_mm is no finite number in 1 of 8"),
+        ({"weight_n": (1, 0.0)}, "every weight_n must be above 0"),
+        ({"weight_n": (1, np.nan)}, "weight_n is no finite number"),
+        ({"axes_mm": (5, CENTRE)}, "reading 6 is on the cup's centre"),
+    ],
+)
+def test_what_is_no_measurement_is_refused_by_the_name_of_its_run(change, said):
+    run = bar("h7", arc("XY", 0.0, 6.0, 8))
+    for name, value in change.items():
+        if isinstance(value, tuple):
+            column = getattr(run, name).copy()
+            column[value[0]] = value[1]
+            change = {name: column}
+    with pytest.raises(ValueError, match=f"run h7: {said}"):
+        replace(run, **change)
 
 
 def test_unknowns_of_another_campaign_are_refused():

@@ -15,7 +15,7 @@ from models.solvers.observations import RunData, block_average, nominal_reading,
 from models.solvers.observe import bar_normals, predict, setup_unknowns
 from models.solvers.priors import Priors
 from service.errors import MeasurementFault
-from service.runs.observations import BLOCKS, run_data
+from service.runs.observations import BLOCKS, bar_noise_mm, run_data
 
 CENTRE = np.array([300.0, 250.0, 100.0])
 NOISE_MM = 5e-4
@@ -178,6 +178,35 @@ def test_what_cannot_be_solved_says_so():
     few["columns"]["valid"] = [1] * 9 + [0] * 7
     with pytest.raises(MeasurementFault, match="run r1: only 9 valid readings of 16"):
         run_data(few)
+
+
+def test_an_invalid_row_may_hold_nothing_at_all():
+    """No position, no reading: the rows beside it keep their direction of travel, the noise is that of the others."""
+    path = helix_points(CENTRE, 150.0, turns=3, n=50)
+    reading = np.random.default_rng(2).normal(0, 1e-3, 50)
+    whole = stored("ballbar_helix", path, reading, centre_mm=list(CENTRE), radius_mm=150, turns=3)
+    holed = json.loads(json.dumps(whole))
+    holed["columns"]["valid"] = [int(k != 3) for k in range(50)]
+    for name in ("x_mm", "y_mm", "z_mm", "deviation_mm"):
+        holed["columns"][name][3] = None
+    found, left = run_data(holed), np.delete(np.arange(50), 3)
+    assert np.array_equal(found.sign, run_data(whole).sign[left])
+    assert bar_noise_mm(holed) == reading_noise_mm(reading[left])
+    assert bar_noise_mm(whole) == reading_noise_mm(reading)
+
+
+@pytest.mark.parametrize(
+    ("test", "setup", "said"),
+    [
+        ("ballbar_helix", {"centre_mm": list(CENTRE), "radius_mm": 0}, "radius_mm must be above 0"),
+        ("laser_diagonal", {"start_mm": [1, 2, 3], "end_mm": [1, 2, 3]}, "a laser run needs a beam"),
+        ("laser_diagonal", {"nominal_beam": [0, 0, 0]}, "a laser run needs a beam"),
+    ],
+)
+def test_a_set_up_without_length_or_direction_is_named(test, setup, said):
+    path = helix_points(CENTRE, 150.0, turns=3, n=50)
+    with pytest.raises(MeasurementFault, match=f"run r1: {said}"):
+        run_data(stored(test, path, np.zeros(50), **setup))
 
 
 def test_a_beam_that_is_no_direction_is_refused():

@@ -9,10 +9,11 @@ from models.compensation.achievable import achievable
 from models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
 from models.compensation.grid import quantisation_mm
 from models.compensation.one_axis import cross_only, positioning_only, squareness_tables
-from models.compensation.per_motion import enough_for_the_field, motion_tables, seen_by_rank
+from models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
 from models.compensation.stages import Stage, applied, at_corrected_position, of_corrected_position, second_order_mm
 from models.compensation.tables import NineTables, nine_tables
 from models.solvers.joint import solve_joint
+from models.solvers.observability import observability_of
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 
 COUNTS = (25, 21, 19)
@@ -120,12 +121,14 @@ def test_all_motions_in_tables_are_the_deviation(solved):
 
 def test_only_motions_that_are_told_apart_are_written_under_their_names(solved):
     _, s = solved
-    seen = seen_by_rank(s)
+    seen = observable_alone(s)
+    told = {m.name: m.status for m in observability_of(s).motions}
     hidden = {name.split(".")[0] for c in s.identifiability.hidden for name, _ in c.weights}
     tables = motion_tables(s, COUNTS, seen)
     assert hidden
     assert not hidden & (set(tables.motions) | set(tables.squareness_rad))
-    assert set(tables.left_out) == hidden
+    assert set(tables.left_out) == {name for name, status in told.items() if status != "observed"}
+    assert observable_alone(s, weak=True) == {name for name, status in told.items() if status != "not observable"}
     for name, values in tables.motions.items():
         mine = {n: s.estimate.value(n) for n in s.estimate.names if n.split(".")[0] == name}
         alone = only(s, **{n.replace(".", "_"): v for n, v in mine.items()})
