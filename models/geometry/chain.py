@@ -114,13 +114,18 @@ def design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2) -> F3:
     return out
 
 
+REST_MM = 1e-8
+"""A difference of two commanded positions below this is rounding (1e-13 of a metre), not a motion: no axis reverses by it."""
+
+
 def travel_sign(axes_mm: F2) -> F2:
     """Direction in which each axis last moved, -1, 0 or +1, shape (n, 3), for a sequence of positions.
 
     An axis that rests keeps its last sign; before its first motion it has the sign of that first motion (sequences approach their start
     in that direction), 0 if it never moves.
     """
-    step = np.sign(np.diff(axes_mm, axis=0, prepend=axes_mm[:1]))
+    moved_mm = np.diff(axes_mm, axis=0, prepend=axes_mm[:1])
+    step = np.sign(np.where(np.abs(moved_mm) > REST_MM, moved_mm, 0.0))
     for a in range(3):
         s: F1 = step[:, a]
         moved = np.flatnonzero(s)

@@ -152,6 +152,9 @@ class Rig:
         return vector
 
 
+ROUNDING_MM = 1e-8
+
+
 def _first_sign(track_mm: F) -> float:
-    moved = np.flatnonzero(np.diff(track_mm))
+    moved = np.flatnonzero(np.abs(np.diff(track_mm)) > ROUNDING_MM)
     return float(np.sign(np.diff(track_mm)[moved[0]])) if moved.size else 1.0
