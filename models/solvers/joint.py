@@ -20,6 +20,7 @@ from models.solvers.engine import Fit, Problem, Progress, build, expected_noise,
 from models.solvers.identifiability import Identifiability, combinations_of, taking_part
 from models.solvers.information import KINDS, total
 from models.solvers.least_squares import Estimate
+from models.solvers.observability_free import hidden_free
 from models.solvers.observability_rank import campaign_columns, compressed, stated_knowledge, what_is_seen
 from models.solvers.observations import RunData
 from models.solvers.observe import Setup, with_tool
@@ -61,7 +62,8 @@ class JointSolution:
     information : array, shape (p, p)
         What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
-        Of the terms up to ``order`` only, by the rule of the whole report (`models.solvers.observability_rank.stated_knowledge`).
+        Of the terms up to ``order`` only, by the rule of the whole report (`models.solvers.observability_rank.stated_knowledge`); its
+        ``involved`` also names lost motion and free set-up unknowns that the readings leave open.
     prior_root : array, shape (p, p)
         Factor of the prior covariance of the unknowns, root root^T: orders of one motion are alike, so ``prior_sd`` alone is not all of it.
     weight_per_mm2 : array, shape (n,)
@@ -234,9 +236,11 @@ def _rank(problem: Problem, order: int) -> Identifiability:
     inside = [i for i, t in enumerate(problem.terms) if t.order <= order]
     terms, names = tuple(problem.terms[i] for i in inside), tuple(problem.names[i] for i in inside)
     columns = compressed(campaign_columns(problem.machine, terms, problem.runs, problem.setup))
-    seen = what_is_seen(columns, stated_knowledge(terms, problem.runs, problem.setup.names))
+    known = stated_knowledge(terms, problem.runs, problem.setup.names)
+    seen = what_is_seen(columns, known)
     hidden = combinations_of(names, seen.null_space * (seen.factor / problem.sizes.typical[inside])[:, None])
-    return Identifiability(len(names), seen.rank, seen.effective_rank, seen.condition, hidden, taking_part(names, seen.null_space))
+    involved = taking_part(names, seen.null_space) | hidden_free(columns, known, seen)
+    return Identifiability(len(names), seen.rank, seen.effective_rank, seen.condition, hidden, involved)
 
 
 def _fits(problem: Problem, fit: Fit) -> tuple[RunFit, ...]:

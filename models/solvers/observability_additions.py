@@ -13,6 +13,7 @@ from models.arrays import F1, F2
 from models.machine import AXES, Machine
 from models.paths.helix import helix_points
 from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from models.solvers.observability_present import Present, free_corner, on_opposite_edges, place_words, present
 from models.solvers.observability_rank import Knowledge
 from models.solvers.observations import RunData
 from models.solvers.observe import with_tool
@@ -42,7 +43,7 @@ class Addition:
 
 
 def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, names: tuple[str, ...], order: int) -> tuple[Addition, ...]:
-    """What could be added to these runs, cheapest first.
+    """What could be added to these runs, cheapest first; every cause is a fact about them (`models.solvers.observability_present`).
 
     Parameters
     ----------
@@ -51,42 +52,83 @@ def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, nam
     order : int
         Highest order of the error motions: lines and diagonals get enough positions for it.
     """
-    return (*_certificates(known, names), *_laser_additions(machine, runs, order), *_bar_additions(machine, runs))
+    there = present(runs)
+    lasers = (*_lines(machine, there, order), _edges(machine, there, order), _diagonals(machine, there, order))
+    return (*_certificates(known, names), *lasers, *_bar_additions(machine, runs, there))
 
 
 def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
     """What need not be measured on the machine."""
     out = []
     if lengths := tuple(n for n in names if n.startswith("bar_length_") and n not in known.held):
-        out.append(Addition("bar", "no bar length here is calibrated", "a calibrated bar", knows=lengths))
+        some = any(n.startswith("bar_length_") for n in known.held)
+        radii = " and ".join(n.removeprefix("bar_length_") for n in lengths)
+        cause = f"the length of the bar of {radii} mm is not calibrated" if some else "no bar length here is calibrated"
+        out.append(Addition("bar", cause, "a calibrated bar", knows=lengths))
     if tilts := tuple(n for n in names if n.startswith("tilt_") and n not in known.held):
         out.append(Addition("tilt", "the tilt of the mirror is unknown and reads like it", "a mirror of measured tilt", knows=tilts))
     return out
 
 
-def _laser_additions(machine: Machine, runs: tuple[RunData, ...], order: int) -> list[Addition]:
-    near, far = (tuple(_line(machine, a, side, order) for a in AXES) for side in (0, 1))
-    out = [
-        Addition(f"line {a}", f"nothing here measures {a} alone against a known length", f"a laser line along {a}", (run,))
-        for a, run in zip(AXES, near, strict=True)
-    ]
-    out.append(Addition("edges", "no laser lines on opposite edges", "laser lines along X, Y and Z on two opposite edges", near + far))
-    stepped = any(r.beam is not None and (np.abs(r.beam) > 1e-3).all() for r in runs)
-    sequence = "ZYX" if stepped else "XYZ"
-    cause = "all diagonals were stepped in one order" if stepped else "nothing here crosses the volume step by step"
-    cure = "step diagonals in a second step order (ZYX)" if stepped else "four step diagonals"
-    return [*out, Addition("diagonals", cause, cure, tuple(_diagonal(machine, d, sequence, order) for d in DIAGONALS))]
+def _lines(machine: Machine, there: Present, order: int) -> list[Addition]:
+    """One laser line along each axis: where none is yet, or far from those that are."""
+    out = []
+    for k, a in enumerate(AXES):
+        places = there.lines[k]
+        corner = free_corner(machine, k, _inner(machine), places)
+        if not places:
+            cause, cure = f"nothing here measures {a} alone against a known length", f"a laser line along {a}"
+        else:
+            where = "; ".join(place_words(k, p) for p in places[:2]) + ("; ..." if len(places) > 2 else "")
+            count = "one line" if len(places) == 1 else f"{len(places)} lines"
+            cause = f"{a} alone was measured along {count} only ({where})"
+            cure = f"another laser line along {a} at {place_words(k, corner)}"
+        out.append(Addition(f"line {a}", cause, cure, (_line(machine, k, corner, order),)))
+    return out
 
 
-def _bar_additions(machine: Machine, runs: tuple[RunData, ...]) -> list[Addition]:
+def _edges(machine: Machine, there: Present, order: int) -> Addition:
+    """Lines along all axes on two opposite edges; where these are there, on the two others."""
+    inner, cure = _inner(machine), "laser lines along X, Y and Z on two opposite edges"
+    sides = np.array([[0, 0, 0], [1, 1, 1]])
+    if not any(there.lines):
+        cause = "there are no laser lines here"
+    elif all(on_opposite_edges(machine, k, there.lines[k]) for k in range(3)):
+        cause, cure = "the laser lines here stand on too few edges", "laser lines along X, Y and Z on two more edges"
+        sides = np.array([[0, 0, 1], [0, 1, 0]])  # turned with the axis: low in one of the other two, high in the other
+    else:
+        cause = "the laser lines here do not stand on opposite edges in all three axes"
+    runs = tuple(_line(machine, k, inner[range(3), np.roll(side, k)], order, i) for k in range(3) for i, side in enumerate(sides))
+    return Addition("edges", cause, cure, runs)
+
+
+def _diagonals(machine: Machine, there: Present, order: int) -> Addition:
+    """Step diagonals, in an order of steps that was not used yet."""
+    sequence, done = there.next_order, " and ".join(there.orders)
+    if there.stepped and there.diagonals < len(DIAGONALS):
+        cause = f"only {there.diagonals} of the four body diagonals {'was' if there.diagonals == 1 else 'were'} stepped ({done})"
+        cure = f"step diagonals along all four body diagonals in another step order ({sequence})"
+    elif len(there.orders) == 1:
+        cause, cure = f"all step diagonals were stepped in one order ({done})", f"step diagonals in a second step order ({sequence})"
+    elif there.stepped:
+        cause, cure = f"the diagonals were stepped in {done} only", f"step diagonals in another step order ({sequence})"
+    else:
+        cause = "the diagonals here were run straight, without steps" if there.plain else "nothing here crosses the volume step by step"
+        cure = "four step diagonals"
+    return Addition("diagonals", cause, cure, tuple(_diagonal(machine, d, sequence, order) for d in DIAGONALS))
+
+
+def _bar_additions(machine: Machine, runs: tuple[RunData, ...], there: Present) -> list[Addition]:
     longer, aside = _other_tools(machine, runs)
     one = len({tuple(np.round(with_tool(machine, r.tool_mm).tool_mm, 6)) for r in runs}) == 1
     length = "all runs used one tool length" if one else "the tools of these runs give it no lever of its own"
     beside = "in all runs the tool's end stood on one line, so that turning about it is not seen" if one else length
     short = " with one tool length" if one else " with these tools"
     lined = " with tools that end on one line" if one else short
+    count = "at one place" if there.cups == 1 else f"at {there.cups} places"
+    cups = f"the ball-bar stood {count} only" if there.cups else "no ball-bar was used"
     return [
-        Addition("centres", "the ball-bar stood at too few places", "ball-bar helices about five centres", _helices(machine, runs)),
+        Addition("centres", cups, "ball-bar helices about five centres", _helices(machine, runs)),
         Addition("tool", length, "a second tool length" if one else "another tool length", _with(runs, longer, "long"), (), short),
         Addition("aside", beside, "a tool whose end stands off to the side", _with(runs, aside, "aside"), (), lined),
     ]
@@ -98,12 +140,11 @@ def _laser(label: str, path_mm: F2) -> RunData:
     return RunData(label, label, "laser", path_mm, np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.ones(n), beam=beam)
 
 
-def _line(machine: Machine, axis: str, side: int, order: int) -> RunData:
-    """Along an axis at the low (0) or high (1) end of the others, MARGIN inside the strokes."""
-    a, inner = AXES.index(axis), _inner(machine)
-    start, end = inner[:, side].copy(), inner[:, side].copy()
-    start[a], end[a] = inner[a]
-    return _laser(f"virtual {axis}{side}", straight_line(start, end, 2 * order + 3, back=False))
+def _line(machine: Machine, axis: int, through_mm: F1, order: int, number: int = 0) -> RunData:
+    """Along an axis through a place, MARGIN inside the stroke."""
+    start, end = through_mm.copy(), through_mm.copy()
+    start[axis], end[axis] = _inner(machine)[axis]
+    return _laser(f"virtual {AXES[axis]}{number}", straight_line(start, end, 2 * order + 3, back=False))
 
 
 def _diagonal(machine: Machine, name: str, sequence: str, order: int) -> RunData:

@@ -172,5 +172,5 @@ def _cure_words(group: HiddenGroup, partly: tuple[Addition, int] | None) -> str:
     if group.cures:
         return f"Why: {group.cause}. It would be seen with {' or '.join(group.cures)}."
     if partly is None or not partly[1]:
-        return "None of the usual measurements shows it."
+        return "None of the usual additions alone shows it; two of them together were not tried."
     return f"No single usual measurement shows all of it; {partly[0].cure} would show {partly[1]} of {group.count}."

@@ -94,7 +94,7 @@ def parameters(case: Case, solution: JointSolution) -> tuple[list[str], np.ndarr
     highest = max(t.order for t in solution.terms)
     u = np.sqrt(np.diag(e.covariance)[:n])
     error = e.theta[:n] - case.truth.parameters(names, highest)
-    hidden = {name for c in solution.identifiability.hidden for name, _ in c.weights}
+    hidden = solution.identifiability.involved
     covered = {t.name for t in solution.terms if t.order <= solution.order} | set(names[-3:])
     identifiable = [name in covered and name not in hidden and float(s) >= SHARE for name, s in zip(names, e.data_share[:n], strict=True)]
     return names, error / u, u, e.data_share[:n], identifiable

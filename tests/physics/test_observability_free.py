@@ -64,8 +64,12 @@ def test_the_solver_s_rank_the_report_and_the_tables_say_the_same(certified):
     rank = solution.identifiability
     assert (rank.rank, rank.effective_rank, rank.n_parameters) == (report.rank, report.seen.effective_rank, len(report.terms))
     assert rank.rank == (11 if certified else 10)
-    assert rank.involved == {n for m in report.motions for n in m.hidden}
-    assert {n for c in rank.hidden for n, _ in c.weights} == rank.involved
+    involved = {n for m in report.motions for n in m.hidden}
+    assert {n for c in rank.hidden for n, _ in c.weights} == involved == rank.involved & {t.name for t in report.terms}
+    free = tuple(f"{kind}_" for kind in ("backlash", "cup", *([] if certified else ["bar_length"])))
+    assert rank.involved - involved == {p.name for p in report.parameters if p.name.startswith(free) and p.name in rank.involved}
+    assert {p.status for p in report.parameters if p.name in rank.involved} == {"not observable"}
+    assert ("bar_length_175" in rank.involved) == (not certified)
     assert motions_of(solution) == report.motions
     assert observable_alone(solution) == {m.name for m in report.motions if m.status == "observed"}
 
