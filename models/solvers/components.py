@@ -18,6 +18,9 @@ from models.solvers.priors import LENGTHS, SizeModel, with_length
 
 NOISE_SD = 2.0
 """Hyperprior of an instrument's log noise variance about what its repeats say: a factor of e in the standard deviation, weak."""
+LEAST_ETA = -8.0
+"""Least log noise variance over the expected one: a factor of 55 in the standard deviation, under the resolution of every instrument that
+is sold. Readings without any noise would drive it to minus infinity and the normal equations out of the digits of a double."""
 STEPS = 25
 TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
@@ -118,7 +121,6 @@ class Found:
 def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
     """Most probable components from a start; ``sums`` about the independent unknowns of the model (`Sums.turned`)."""
     weight = np.concatenate([model.sd, np.full(start.eta.size, NOISE_SD)]) ** -2.0
-    h = model.sd.size
 
     def objective(c: Components) -> tuple[float, Posterior]:
         p = posterior(sums, c, model)
@@ -132,18 +134,23 @@ def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
         info = info + np.diag(weight)
         step = linalg.solve(info, gradient - weight * np.concatenate([c.psi, c.eta]), assume_a="pos")
         step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
-        trial = Components(c.psi + step[:h], c.eta + step[h:])
+        trial = _moved(c, step)
         better, found = objective(trial)
         for _ in range(HALVINGS):  # expected information may overshoot
             if better >= value - 1e-9:
                 break
             step *= 0.5
-            trial = Components(c.psi + step[:h], c.eta + step[h:])
+            trial = _moved(c, step)
             better, found = objective(trial)
         gain, c, value, p = better - value, trial, better, found
         if gain < TOLERANCE:
             break
     return Found(c, np.asarray(linalg.inv(info)), value)
+
+
+def _moved(c: Components, step: F1) -> Components:
+    """The components after a step, with the noise kept above `LEAST_ETA`."""
+    return Components(c.psi + step[: c.psi.size], np.maximum(c.eta + step[c.psi.size :], LEAST_ETA))
 
 
 def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeModel, Found]:

@@ -17,6 +17,7 @@ from models.solvers.priors import Priors, term_prior_sd
 from simulators.scenario import MachineConfig
 from simulators.truth.machine import Geometry
 from simulators.truth.machine import Machine as TrueMachine
+from simulators.truth.play import Play
 
 STROKE = np.array([[0.0, 600.0], [-50.0, 450.0], [20.0, 470.0]])
 TERMS = smooth_terms(4)
@@ -161,18 +162,30 @@ def truth_of(machine: Machine, theta: np.ndarray, tool_mm: np.ndarray | None) ->
 
 
 @pytest.mark.parametrize("chain", ["w-b-X-Y-Z-t", "w-X-Y-b-Z-t", "w-Z-b-X-Y-t", "w-Y-X-Z-b-t", "w-X-b-Y-Z-t"])
-def test_the_independent_simulator_reads_the_same(chain):
-    """Positions from `simulators.truth` (its own transforms), instruments written out here from math.md 4.2 and 5.4."""
+@pytest.mark.parametrize("lost_motion", [False, True])
+def test_the_independent_simulator_reads_the_same(chain, lost_motion):
+    """Positions from `simulators.truth` (its own transforms and play), instruments written out here from math.md 4.2 and 5.4.
+
+    With lost motion the simulator's errors are those of the place where the axis stands, the model's of the commanded one: 1e-3 of 25 um.
+    Where a drive has not yet taken up its play after a turn, the model has the axis at its end: such readings are left out here.
+    """
     rng = np.random.default_rng(8)
     machine, runs = machine_of(chain, 4), every_test(rng)
     setup = setup_unknowns(runs, Priors())
     theta = draw(rng, machine, setup, 2.0)
     n = len(TERMS)
-    theta[n : n + 3] = 0.0  # lost motion has its own test
+    lost = np.array([12e-3, 25e-3, 8e-3]) if lost_motion else np.zeros(3)
+    theta[n : n + 3] = lost
+    settled = []
     by_name = dict(zip(setup.names, theta[n + 3 :], strict=True))
     for run in runs:
         truth, values = truth_of(machine, theta, run.tool_mm), predict(machine, TERMS, run, setup, theta)
-        at = truth.tool_position(run.axes_mm)
+        approach = run.axes_mm[:1] - 5.0 * run.sign[:1]
+        play = np.where(run.sign.any(axis=0), lost, 0.0)  # an axis that rests has no side
+        stands = Play(play, approach[0]).run(np.concatenate([approach, run.axes_mm]))[1:]
+        clear = (np.abs(stands - (run.axes_mm - 0.5 * run.sign * play)) < 1e-12).all(axis=1)
+        settled.append(clear)
+        at = truth.tool_position(stands)
         if run.kind == "bar":
             offset, drift = (np.array([by_name.get(f"{kind}_{run.setup}_{a}", 0.0) for a in "xyz"]) for kind in ("cup", "bar_drift"))
             cup = truth.tool_position(run.centre_mm[None])[0] + offset
@@ -185,7 +198,9 @@ def test_the_independent_simulator_reads_the_same(chain):
             seen = (at - at[0]) @ mirror * (1 + by_name[f"cosine_{run.setup}"]) * (1 + by_name["laser_scale"])
             want = seen - (run.axes_mm - run.axes_mm[0]) @ run.beam
             want += by_name[f"zero_{run.label}"] + by_name[f"drift_{run.label}"] * (run.t_s - run.t_s[0])
-        assert values == pytest.approx(want, abs=1e-11)
+        assert values[clear] == pytest.approx(want[clear], abs=2e-5 if lost_motion else 1e-11)
+    kinds = {run.kind for run, clear in zip(runs, settled, strict=True) if clear.mean() > 0.8}
+    assert kinds == {"bar", "laser"}  # both instruments are really compared
 
 
 def test_a_misaligned_beam_is_one_number():
