@@ -38,6 +38,15 @@ class Slice:
     values: Array
 
 
+@dataclass(frozen=True, slots=True)
+class MotionShare:
+    """One error motion: share of what is known of it that comes from the readings, 0 to 1, and its status in words."""
+
+    name: str
+    share: float
+    status: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Correlations:
     """Correlation matrix of some parameters, shape (n, n)."""
@@ -59,7 +68,8 @@ class BudgetRow:
 class SolutionPage:
     """All that the page says.
 
-    ``verdict``: sign ("ok", "open", "bad"), word and text; ``facts`` and ``provenance``: name and value; the other texts are lines.
+    ``gains``: noise gain in µm per µm, as slices; ``verdict``: sign ("ok", "open", "bad"), word and text; ``facts`` and ``provenance``:
+    name and value; the other texts are lines.
     """
 
     title: str
@@ -71,6 +81,8 @@ class SolutionPage:
     motions: Sequence[MotionCurve]
     contributions: Sequence[Contribution]
     slices: Sequence[Slice]
+    shares: Sequence[MotionShare]
+    gains: Sequence[Slice]
     worst: str
     budget: Sequence[BudgetRow]
     correlations: Correlations

@@ -14,6 +14,7 @@ from service.report.palette import style_rules
 from service.report.plots.bands import motion_bands
 from service.report.plots.bars import contribution_bars, uncertainty_bars
 from service.report.plots.cells import common_step, correlation_plot, slice_plot
+from service.report.plots.observability import gain_map, share_plot
 from service.report.plots.residuals import common_range, residual_plot
 from service.report.plots.signed import signed_rules
 from service.report.solution_model import SolutionPage
@@ -67,6 +68,8 @@ def _pictures(page: SolutionPage) -> dict[str, list[Markup]]:
         "ranking": _trusted([contribution_bars(page.contributions)] if page.contributions else []),
         "motions": _trusted(motion_bands([c for c in page.motions if c.unit == u], key=f"motions-{i}") for i, u in enumerate(units)),
         "slices": _trusted(slices),
+        "shares": _trusted([share_plot(page.shares)] if page.shares else []),
+        "gains": _trusted(gain_map(s, key=f"gain-{i}") for i, s in enumerate(page.gains)),
         "correlations": _trusted([correlation_plot(page.correlations)] if len(page.correlations.names) > 1 else []),
         "residuals": _trusted(residuals),
     }

@@ -11,7 +11,7 @@ from models.machine import AXES
 from models.solvers.joint import JointSolution
 from models.solvers.observability_volume import Number
 from service.report.model import SETUP_NOTE, ResidualSeries, RunRow
-from service.report.solution_model import BudgetRow, Correlations, MotionCurve, Slice, SolutionPage
+from service.report.solution_model import BudgetRow, Correlations, MotionCurve, MotionShare, Slice, SolutionPage
 from service.site import Site
 from service.workflows.demo_report import contributions, parameter_rows
 from service.workflows.solve_report import Account, noise_lines, outlier_lines, residual_lines, worst_line
@@ -47,6 +47,8 @@ def solution_page(told: Account, doc: dict[str, Any], site: Site, made: str) -> 
         motions=motion_curves(told),
         contributions=contributions(joint),
         slices=[_slice(told, plane) for plane in PLANES],
+        shares=[MotionShare(m.name, m.share, m.status) for m in told.observability.motions],
+        gains=[_gain(told, fixed) for _, _, fixed in PLANES],
         worst=worst_line(told),
         budget=[BudgetRow(line.words, line.u_mm * 1e3, line.share) for line in told.budget.lines],
         correlations=_correlations(told),
@@ -94,6 +96,14 @@ def _slice(told: Account, plane: tuple[int, int, int]) -> Slice:
     points[:, fixed] = stroke[fixed].mean()
     values = told.predict(points).expanded_vector_mm.reshape(SLICE_NODES, SLICE_NODES) * 1e3
     return Slice(AXES[across], AXES[up], f"{AXES[fixed]} = {stroke[fixed].mean():.0f} mm", x, y, values)
+
+
+def _gain(told: Account, fixed: int) -> Slice:
+    """Noise gain over the plane in the middle of one axis."""
+    plane = told.observability.plane(fixed, SLICE_NODES)
+    values = plane.volume.gain.reshape(SLICE_NODES, SLICE_NODES)
+    at = f"{AXES[fixed]} = {plane.fixed_mm:.0f} mm"
+    return Slice(AXES[plane.first], AXES[plane.second], at, plane.first_mm, plane.second_mm, values)
 
 
 def _correlations(told: Account) -> Correlations:

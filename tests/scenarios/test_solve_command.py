@@ -57,7 +57,15 @@ def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(abbe, folder, t
         assert words in text
     assert "units, axes, copies, machine" in err
     page = (tmp_path / "page.html").read_text()
-    for words in ("Error motions", "Uncertainty in the volume", "What these runs cannot tell", "sensor noise of the laser", "SHA-256"):
+    pictures = ("may stand in a table of their own", "Noise gain, Z = ", "µm per µm")
+    for words in (
+        "Error motions",
+        "Uncertainty in the volume",
+        "What these runs cannot tell",
+        "sensor noise of the laser",
+        "SHA-256",
+        *pictures,
+    ):
         assert words in page
     assert page.count("<svg") > 10
     assert not re.search(r"<script|https?://|@import|url\(", page)

@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from service.report.axes import Panel
 from service.report.numbers import plain
 from service.report.plots.contours import contour_plot
 from service.report.plots.facets import Surface
 from service.report.plots.signed import SignedScale
-from service.report.solution_model import Slice
+from service.report.solution_model import MotionShare, Slice
 from service.report.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM = 500.0, 20.0, 54.0, 50.0
 LABELS, WORDS = 64.0, 118.0
 STYLES = {"observed": "f-c1", "weak": "f-c3"}
-
-
-@dataclass(frozen=True, slots=True)
-class MotionShare:
-    """One error motion: share of what is known of it that comes from the readings, 0 to 1, and its status in words."""
-
-    name: str
-    share: float
-    status: str
 
 
 def share_plot(rows: Sequence[MotionShare], *, key: str = "shares", heading: str = "What the readings tell of each error motion") -> str:
