@@ -24,6 +24,7 @@ from models.compensation.one_axis import positioning_only, squareness_tables
 from models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
 from models.compensation.tables import NineTables, nine_tables, quantise
 from models.solvers.joint import JointSolution
+from models.uncertainty.sources import ErrorSources, error_sources
 
 ONE_AXIS_COUNTS = (25, 25, 25)
 GRID_NODES = (5, 9, 13, 17)
@@ -58,6 +59,7 @@ def achievable(
     grid_nodes: tuple[int, ...] = GRID_NODES,
     lsb_mm: float = 0.0,
     observable: frozenset[str] | None = None,
+    sources: ErrorSources | None = None,
 ) -> tuple[Achievable, ...]:
     """Every kind of table on this machine, from none to the finest grid.
 
@@ -71,63 +73,80 @@ def achievable(
         The controller's unit; 0: no rounding. Tables of single motions and squareness parameters are not rounded.
     observable : set of str, optional
         Motions that are observable by themselves; default: `observable_alone`.
+    sources : ErrorSources, optional
+        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
     """
-    pairs = random_pairs(inner_box_mm(solution.machine))
-    nine = nine_tables(solution, counts)
-    square = squareness_tables(solution, counts)
-    alone = positioning_only(nine)
-    rows = [_row(solution, pairs, "no table", 0)]
-    rows.append(_one_axis(solution, pairs, "positioning tables", alone, lsb_mm, outputs=1))
-    stored = _stored(alone, lsb_mm)
-    both = _row(
-        solution,
-        pairs,
-        "positioning tables and squareness",
-        sum(counts) + 3,
-        lambda p: stored.correction_at(p) + square.squareness_at(p),
-        lambda p: alone.correction_at(p) + square.squareness_at(p),
-    )
-    rows += [both, _one_axis(solution, pairs, "nine tables", nine, lsb_mm, outputs=3)]
-    seen = observable_alone(solution) if observable is None else observable
-    for kind, motions, any_tool in (
-        ("tables of the motions that are observable by themselves", seen, True),
-        ("tables of single motions, right for this tool only", enough_for_the_field(solution), False),
-    ):
-        if motions:
-            tables = motion_tables(solution, counts, motions, any_tool=any_tool)
-            rows.append(_row(solution, pairs, kind, sum(v.size for v in tables.motions.values()) + 3, tables.correction_at))
-    rows += [grid_row(solution, n, lsb_mm=lsb_mm, pairs=pairs) for n in grid_nodes]
-    return tuple(rows)
+    judge = _Judge(solution, random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
+    rows = [judge.row("no table", 0), *judge.one_axis(counts), *judge.single_motions(counts, observable)]
+    return (*rows, *(judge.grid(n, None) for n in grid_nodes))
 
 
 def grid_row(
-    solution: JointSolution, nodes: int, *, lsb_mm: float = 0.0, compensable: Mask | None = None, pairs: Pairs | None = None
-) -> Achievable:
-    """What a 3-D grid of so many nodes per axis leaves."""
-    table = grid_table(solution, (nodes,) * 3, compensable=compensable)
-    stored = quantise_grid(table, lsb_mm) if lsb_mm > 0 else table
-    pairs = pairs or random_pairs(inner_box_mm(solution.machine))
-    return _row(solution, pairs, f"grid {nodes} x {nodes} x {nodes}", 3 * nodes**3, stored.correction_at, table.correction_at)
-
-
-def _one_axis(solution: JointSolution, pairs: Pairs, kind: str, tables: NineTables, lsb_mm: float, *, outputs: int) -> Achievable:
-    entries = outputs * sum(p.size for p in tables.position_mm)
-    return _row(solution, pairs, kind, entries, _stored(tables, lsb_mm).correction_at, tables.correction_at)
-
-
-def _stored(tables: NineTables, lsb_mm: float) -> NineTables:
-    return quantise(tables, lsb_mm) if lsb_mm > 0 else tables
-
-
-def _row(
     solution: JointSolution,
-    pairs: Pairs,
-    kind: str,
-    entries: int,
-    stored: Correction | None = None,
-    exact: Correction | None = None,
+    nodes: int,
+    *,
+    lsb_mm: float = 0.0,
+    compensable: Mask | None = None,
+    pairs: Pairs | None = None,
+    sources: ErrorSources | None = None,
 ) -> Achievable:
-    rounding = 0.0
-    if stored is not None and exact is not None:
-        rounding = float(np.sqrt(np.mean((correction_error_mm(stored, pairs) - correction_error_mm(exact, pairs)) ** 2)))
-    return Achievable(kind, entries, predict_distances(solution, stored, pairs=pairs), rounding)
+    """What a 3-D grid of so many nodes per axis leaves; other parameters as `achievable`."""
+    judge = _Judge(solution, pairs or random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
+    return judge.grid(nodes, compensable)
+
+
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """What all kinds of table are judged with: the same pairs, the same sources of uncertainty, the same rounding."""
+
+    solution: JointSolution
+    pairs: Pairs
+    sources: ErrorSources
+    lsb_mm: float
+
+    def row(self, kind: str, entries: int, stored: Correction | None = None, exact: Correction | None = None) -> Achievable:
+        """A kind of table by what the controller adds, and what it would add without rounding."""
+        rounding = 0.0
+        if stored is not None and exact is not None:
+            added = correction_error_mm(stored, self.pairs) - correction_error_mm(exact, self.pairs)
+            rounding = float(np.sqrt(np.mean(added**2)))
+        return Achievable(kind, entries, predict_distances(self.solution, stored, pairs=self.pairs, sources=self.sources), rounding)
+
+    def one_axis(self, counts: tuple[int, int, int]) -> list[Achievable]:
+        """Positioning alone, with squareness, and all nine."""
+        nine = nine_tables(self.solution, counts, sources=self.sources)
+        square = squareness_tables(self.solution, counts, sources=self.sources)
+        alone = positioning_only(nine)
+        stored = self._stored(alone)
+        return [
+            self.row("positioning tables", sum(counts), stored.correction_at, alone.correction_at),
+            self.row(
+                "positioning tables and squareness",
+                sum(counts) + 3,
+                lambda p: stored.correction_at(p) + square.squareness_at(p),
+                lambda p: alone.correction_at(p) + square.squareness_at(p),
+            ),
+            self.row("nine tables", 3 * sum(counts), self._stored(nine).correction_at, nine.correction_at),
+        ]
+
+    def single_motions(self, counts: tuple[int, int, int], observable: frozenset[str] | None) -> list[Achievable]:
+        """Tables of motions under their own names."""
+        seen = observable_alone(self.solution) if observable is None else observable
+        out = []
+        for kind, motions, any_tool in (
+            ("tables of the motions that are observable by themselves", seen, True),
+            ("tables of single motions, right for this tool only", enough_for_the_field(self.solution), False),
+        ):
+            if motions:
+                tables = motion_tables(self.solution, counts, motions, any_tool=any_tool, sources=self.sources)
+                out.append(self.row(kind, sum(v.size for v in tables.motions.values()) + 3, tables.correction_at))
+        return out
+
+    def grid(self, nodes: int, compensable: Mask | None) -> Achievable:
+        """A grid of so many nodes per axis."""
+        table = grid_table(self.solution, (nodes,) * 3, compensable=compensable, sources=self.sources)
+        stored = quantise_grid(table, self.lsb_mm) if self.lsb_mm > 0 else table
+        return self.row(f"grid {nodes} x {nodes} x {nodes}", 3 * nodes**3, stored.correction_at, table.correction_at)
+
+    def _stored(self, tables: NineTables) -> NineTables:
+        return quantise(tables, self.lsb_mm) if self.lsb_mm > 0 else tables

@@ -12,8 +12,9 @@ from collections.abc import Callable
 import numpy as np
 
 from models.arrays import F1, F2, F3
-from models.geometry.bases import legendre_values
+from models.geometry.bases import Term, legendre_values
 from models.geometry.chain import design
+from models.machine import Machine
 from models.paths.lines import DIAGONALS, diagonal_ends
 from models.solvers.joint import JointSolution
 from models.volumetric import volume_grid
@@ -26,10 +27,16 @@ Field = Callable[[F2], F3]
 """Values at positions, shape (n, 3) -> (n, 3 outputs, m): a design, or one field with m = 1."""
 
 
-def additive_design(solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int) -> tuple[F3, F3, F3]:
-    """Design of the best additive field of a solution: per axis shape (len(grid), 3, terms), mm per unit of every coefficient."""
+def additive_design(
+    solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int, terms: tuple[Term, ...] | None = None
+) -> tuple[F3, F3, F3]:
+    """Design of the best additive field of a solution: per axis shape (len(grid), 3, terms), mm per unit of every coefficient.
+
+    ``terms``: the solution's own, or with orders above them (`models.uncertainty.sources`); the fit is the same.
+    """
     order = max(t.order for t in solution.terms) + 1  # an angle times a travel is of one order more along a diagonal than the angle
-    return additive(_design_of(solution), solution.machine.stroke_mm, grids_mm, nodes=nodes, order=order)
+    field = _design_of(solution.machine, terms or solution.terms)
+    return additive(field, solution.machine.stroke_mm, grids_mm, nodes=nodes, order=order)
 
 
 def additive(field: Field, stroke_mm: F2, grids_mm: tuple[F1, F1, F1], *, nodes: int, order: int) -> tuple[F3, F3, F3]:
@@ -60,13 +67,13 @@ def additive(field: Field, stroke_mm: F2, grids_mm: tuple[F1, F1, F1], *, nodes:
     return out[0], out[1], out[2]
 
 
-def main_effect(solution: JointSolution, axis: int, positions_mm: F1, nodes: int) -> F3:
+def main_effect(machine: Machine, terms: tuple[Term, ...], axis: int, positions_mm: F1, nodes: int) -> F3:
     """Design of the mean deviation over the other two axes, shape (len(positions), 3, terms)."""
-    return _mean_over_others(_design_of(solution), solution.machine.stroke_mm, axis, positions_mm, nodes)
+    return _mean_over_others(_design_of(machine, terms), machine.stroke_mm, axis, positions_mm, nodes)
 
 
-def _design_of(solution: JointSolution) -> Field:
-    return lambda points: design(solution.machine, solution.terms, points)
+def _design_of(machine: Machine, terms: tuple[Term, ...]) -> Field:
+    return lambda points: design(machine, terms, points)
 
 
 def _mean_over_others(field: Field, stroke_mm: F2, axis: int, positions_mm: F1, nodes: int) -> F3:

@@ -1,6 +1,6 @@
 """What a user of the machine sees of its errors: errors of distances between two points of a part. No rigid motion is in them.
 
-A table is judged by them: before and after, with the identified field known only as well as its covariance says.
+A table is judged by them: before and after, with the field known only as well as all its sources of uncertainty say.
 """
 
 from __future__ import annotations
@@ -11,9 +11,12 @@ import numpy as np
 
 from models.arrays import F1, F2
 from models.compensation.correction import Correction
+from models.geometry.bases import Term
 from models.geometry.chain import design
 from models.machine import Machine
 from models.solvers.joint import JointSolution
+from models.uncertainty.combined import approach_variance_mm2, joint_factor
+from models.uncertainty.sources import ErrorSources, error_sources
 
 INNER_SHARE = 0.8
 """Share of each stroke, about its middle, over which distances are judged."""
@@ -75,8 +78,10 @@ def figures(error_mm: F1) -> DistanceFigures:
 class PredictedDistances:
     """Distance errors to be expected of the machine, over the inner volume, each with its standard uncertainty, mm.
 
-    Means over draws of the field from its covariance, corrected as stated; the uncertainty is the scatter of the draws. ``known_mm``: rms
-    of the part that is known and that the table leaves; ``unknown_mm``: of the part that no table can take out, because nobody knows it.
+    Means over draws of the field from all sources of its uncertainty (noise, set-ups, typical sizes, orders above the chosen one,
+    wavelength, temperatures; `models.uncertainty.sources`), corrected as stated; the uncertainty is the scatter of the draws.
+    ``known_mm``: rms of the part that is known and that the table leaves; ``unknown_mm``: of the part that no table can take out, because
+    nobody knows it.
     """
 
     rms_mm: float
@@ -89,9 +94,9 @@ class PredictedDistances:
     unknown_mm: float
 
 
-def pair_design(solution: JointSolution, pairs: Pairs) -> F2:
+def pair_design(machine: Machine, terms: tuple[Term, ...], pairs: Pairs) -> F2:
     """Error of each distance per unit of every smooth term's coefficient, shape (n, terms)."""
-    both = [np.einsum("ni,nik->nk", pairs.unit, design(solution.machine, solution.terms, p)) for p in (pairs.first_mm, pairs.second_mm)]
+    both = [np.einsum("ni,nik->nk", pairs.unit, design(machine, terms, p)) for p in (pairs.first_mm, pairs.second_mm)]
     return np.asarray(both[1] - both[0])
 
 
@@ -101,7 +106,12 @@ def correction_error_mm(correction: Correction, pairs: Pairs) -> F1:
 
 
 def predict_distances(
-    solution: JointSolution, correction: Correction | None = None, *, pairs: Pairs | None = None, draws: int = 200
+    solution: JointSolution,
+    correction: Correction | None = None,
+    *,
+    pairs: Pairs | None = None,
+    sources: ErrorSources | None = None,
+    draws: int = 200,
 ) -> PredictedDistances:
     """Distance errors that the identified machine will have, without or with a correction.
 
@@ -114,17 +124,27 @@ def predict_distances(
         Commanded positions (n, 3) to what is added to them (n, 3), mm; none: the machine as it is.
     pairs : Pairs, optional
         Default: `PAIRS` random ones in the inner 80 % of every stroke, always the same.
+    sources : ErrorSources, optional
+        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
     draws : int
-        Draws of the field from its covariance, by a fixed generator.
+        Draws of the field, by a fixed generator.
     """
     pairs = pairs or random_pairs(inner_box_mm(solution.machine))
-    a = pair_design(solution, pairs)
-    known = a @ solution.coefficients
+    sources = sources or error_sources(solution)
+    a = pair_design(solution.machine, sources.terms, pairs)
+    known = a @ sources.coefficients
     if correction is not None:
         known = known + correction_error_mm(correction, pairs)
-    values, vectors = np.linalg.eigh(solution.term_covariance)
-    root = a @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    drawn = root @ np.random.default_rng(SEED).standard_normal((values.size, draws))
+    root, rng = joint_factor(sources, a), np.random.default_rng(SEED)
+    drawn = root @ rng.standard_normal((root.shape[1], draws))
+    approach = 2.0 * approach_variance_mm2(sources)  # both ends of a distance
+    if approach:
+        drawn += np.sqrt(approach) * rng.standard_normal(drawn.shape)
+    return _summed(known, drawn, float(np.sqrt(np.mean(np.sum(root**2, axis=1)) + approach)))
+
+
+def _summed(known: F1, drawn: F2, unknown_mm: float) -> PredictedDistances:
+    """Figures of the known error (n,) with each of the draws (n, draws) of the unknown one on top."""
     size = np.abs(known[:, None] + drawn)
     rms, q95, largest = np.sqrt(np.mean(size**2, axis=0)), np.quantile(size, 0.95, axis=0), size.max(axis=0)
     return PredictedDistances(
@@ -135,5 +155,5 @@ def predict_distances(
         max_mm=float(largest.mean()),
         u_max_mm=float(largest.std()),
         known_mm=float(np.sqrt(np.mean(known**2))),
-        unknown_mm=float(np.sqrt(np.mean(np.sum(root**2, axis=1)))),
+        unknown_mm=unknown_mm,
     )

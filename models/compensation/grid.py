@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from models.arrays import F1, F2, F3, F4
 from models.compensation.interpolation import fit_operator, fit_positions, trilinear
 from models.compensation.masking import blend
-from models.compensation.tables import grid_positions
+from models.compensation.tables import check_unit, grid_positions
 from models.geometry.chain import design
 from models.machine import AXES
 from models.solvers.joint import JointSolution
@@ -22,8 +22,7 @@ from models.uncertainty.frame import RigidFree
 from models.uncertainty.inputs import Inputs
 from models.uncertainty.mask import compensable_mask
 from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import error_sources
-from models.volumetric import rigid_design
+from models.uncertainty.sources import ErrorSources, error_sources
 
 Mask = NDArray[np.bool_]
 
@@ -39,7 +38,8 @@ class GridTable:
     correction_mm : array, shape (nx, ny, nz, 3)
         Zero at the reference node.
     u_mm : array, shape (nx, ny, nz, 3)
-        Standard uncertainty of the deviation at each node, in the frame in which the deviation has no rigid motion over the grid.
+        Standard uncertainty of the deviation at each node from all sources (`models.uncertainty.prediction`), in the frame in which the
+        deviation has no rigid motion over the grid: the same figures that `compensable_nodes` judges by.
     compensated : array of bool, shape (nx, ny, nz)
         False: the deviation there is not known well enough; all these nodes hold one and the same correction, so that no distance between
         two of them is changed (`models.compensation.masking`).
@@ -97,6 +97,7 @@ def grid_table(
     compensable: Mask | None = None,
     reference: tuple[int, int, int] = (0, 0, 0),
     fitted: bool = True,
+    sources: ErrorSources | None = None,
 ) -> GridTable:
     """Best 3-D grid for the machine as identified.
 
@@ -109,7 +110,9 @@ def grid_table(
     reference : (int, int, int)
         Node that the corrections do not move.
     fitted : bool
-        Fit the interpolant instead of sampling the field at the nodes: leaves about 0.4 of the rms between the nodes.
+        Fit the interpolant instead of sampling the field at the nodes: leaves about 0.6 of the rms between the nodes.
+    sources : ErrorSources, optional
+        Sources of uncertainty for ``u_mm``, with the stated inputs they rest on; default: ``error_sources(solution)``.
 
     Raises
     ------
@@ -125,17 +128,8 @@ def grid_table(
     error = (node_design(solution, position, fitted=fitted) @ solution.coefficients).reshape(*counts, 3)
     correction, done = blend(position, error, keep)
     points = nodes_mm(position)
-    u = node_uncertainty_mm(design(solution.machine, solution.terms, points), points, solution.term_covariance).reshape(*counts, 3)
+    u = predict_deviation(sources or error_sources(solution), points, frame=RigidFree(points)).u_mm.reshape(*counts, 3)
     return GridTable(position, correction - correction[reference], u, done, reference)
-
-
-def node_uncertainty_mm(full: F3, points_mm: F2, covariance: F2) -> F2:
-    """Standard uncertainty of the field at each point with the best-fit rigid motion over all points taken out, shape (n, 3)."""
-    values, vectors = np.linalg.eigh(covariance)
-    root = full.reshape(-1, covariance.shape[0]) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    rigid, _ = np.linalg.qr(rigid_design(points_mm).reshape(-1, 6))
-    free = root - rigid @ (rigid.T @ root)
-    return np.asarray(np.sqrt(np.sum(free**2, axis=1)).reshape(-1, 3))
 
 
 def compensable_nodes(
@@ -151,7 +145,14 @@ def compensable_nodes(
 
 
 def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:
-    """The grid as the controller will store it: every correction rounded to its unit; the reference stays zero."""
+    """The grid as the controller will store it: every correction rounded to its unit; the reference stays zero.
+
+    Raises
+    ------
+    ValueError
+        The unit is no positive number.
+    """
+    check_unit(lsb_mm)
     return replace(table, correction_mm=np.round(table.correction_mm / lsb_mm) * lsb_mm)
 
 
@@ -161,8 +162,10 @@ def check_steps(table: GridTable, limit_mm: float) -> None:
     Raises
     ------
     ValueError
-        Names the axis of the step, its node and its size.
+        Names the axis of the step, its node and its size; or the limit is no number of 0 or more.
     """
+    if not limit_mm >= 0:
+        raise ValueError(f"grid table: the largest allowed step is {limit_mm} mm, must be a number of 0 or more")
     for a in range(3):
         step = np.abs(np.diff(table.correction_mm, axis=a)).max(axis=3)
         worst = np.unravel_index(int(step.argmax()), step.shape)

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.arrays import F1, F2, F3
-from models.compensation.summary import SQUARENESS, MeanParameter, mean_linear
-from models.compensation.tables import NineTables, grid_positions, nine_tables, table_design
+from models.compensation.summary import SQUARENESS, MeanParameter, mean_parameter
+from models.compensation.tables import NineTables, entry_u, grid_positions, nine_tables, table_design
 from models.solvers.joint import JointSolution
+from models.uncertainty.sources import ErrorSources, error_sources
 
 
 def positioning_only(tables: NineTables) -> NineTables:
@@ -30,6 +31,9 @@ def cross_only(tables: NineTables) -> NineTables:
 @dataclass(frozen=True, eq=False)
 class SquarenessTables:
     """Squareness as three parameters (C0Y, B0Z, A0Z, rad, with u), and tables that hold none of it.
+
+    The parameters are the squareness of these tables, which count the body diagonals as much as the volume: not the mean squareness over
+    the volume (`models.compensation.summary.mean_linear`), from which it can differ by more than its uncertainty.
 
     ``tables``: own-axis tables as before; cross tables without slope, so straightness alone. What their slopes held beyond squareness was a
     rotation of the frame: it is left out. ``start_mm``: position of each axis at which the parameters correct nothing.
@@ -51,27 +55,28 @@ class SquarenessTables:
         return self.squareness_at(axes_mm) + self.tables.correction_at(axes_mm)
 
 
-def squareness_tables(solution: JointSolution, counts: tuple[int, int, int], *, nodes: int = 9) -> SquarenessTables:
+def squareness_tables(
+    solution: JointSolution, counts: tuple[int, int, int], *, nodes: int = 9, sources: ErrorSources | None = None
+) -> SquarenessTables:
     """Nine tables with squareness taken out of them; parameters as `nine_tables`.
 
-    The parameters are least-squares slopes of the tables themselves; their uncertainty is that of the mean squareness over the volume.
+    The squareness parameters are least-squares slopes of the tables themselves, and their uncertainty that of the same slopes.
     """
-    nine = nine_tables(solution, counts, nodes=nodes)
+    sources = sources or error_sources(solution)
+    nine = nine_tables(solution, counts, nodes=nodes, sources=sources)
     grids = grid_positions(solution.machine, counts)
     corrections: list[F2] = []
     uncertainties: list[F2] = []
-    slopes = np.zeros((3, 3))
-    for a, design in enumerate(table_design(solution, grids, nodes)):
+    slopes: list[F2] = []  # of outputs over axis a, per unit of every coefficient, (3, terms)
+    for a, design in enumerate(table_design(solution, grids, nodes, sources.terms)):
         cross = np.arange(3) != a
         travel = grids[a] - grids[a][0]
         weight = (travel - travel.mean()) / np.sum((travel - travel.mean()) ** 2)
-        straight: F3 = design - travel[:, None, None] * np.einsum("n,nik->ik", weight, design)
-        variance = np.einsum("nik,kl,nil->ni", straight, solution.term_covariance, straight)
-        slopes[a] = np.einsum("n,nik->ik", weight, design) @ solution.coefficients
-        corrections.append(np.where(cross, -(straight @ solution.coefficients), nine.correction_mm[a]))
-        uncertainties.append(np.where(cross, np.sqrt(np.maximum(variance, 0.0)), nine.u_mm[a]))
-    u = {p.name: p.u for p in mean_linear(solution, nodes=nodes)}
-    found = tuple(MeanParameter(name, float(sign * (slopes[a, b] + slopes[b, a])), u[name]) for name, a, b, sign in SQUARENESS)
+        slopes.append(np.einsum("n,nik->ik", weight, design))
+        straight: F3 = design - travel[:, None, None] * slopes[a]
+        corrections.append(np.where(cross, -(straight @ sources.coefficients), nine.correction_mm[a]))
+        uncertainties.append(np.where(cross, entry_u(sources, straight), nine.u_mm[a]))
+    found = tuple(mean_parameter(sources, name, sign * (slopes[a][b] + slopes[b][a])) for name, a, b, sign in SQUARENESS)
     tables = NineTables(grids, (corrections[0], corrections[1], corrections[2]), (uncertainties[0], uncertainties[1], uncertainties[2]))
     return SquarenessTables(found, tables, np.array([g[0] for g in grids]))
 

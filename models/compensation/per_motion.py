@@ -3,8 +3,8 @@
 One campaign with one tool does not see every motion by itself: turning and shifting a carriage look alike at one tool length (math.md 4.6).
 A motion that the data do not tell apart is not written under its name. Two ways are left, and the caller chooses by naming the motions:
 
-- only motions that are observable by themselves (`observable_alone`): true for every tool, but what is only known together with a hidden
-  motion, or is mostly an assumption, stays uncorrected;
+- only motions that are observable by themselves (`observable_alone`, the default): true for every tool, but what is only known together
+  with a hidden motion, or is mostly an assumption, stays uncorrected;
 - `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Right at this tool length only, and so labelled.
 
 In the first case every motion has its own estimate; in the second those that are written take over what the others did at this tool.
@@ -27,6 +27,8 @@ from models.machine import Machine
 from models.solvers.joint import JointSolution
 from models.solvers.observability import motions_of
 from models.solvers.observability_parameters import observable_motions
+from models.uncertainty.combined import variances
+from models.uncertainty.sources import ErrorSources, error_sources
 from models.volumetric import rigid_design, volume_grid
 
 NODES = 7
@@ -49,7 +51,7 @@ class MotionTables:
     squareness_rad, u_squareness_rad : dict
         ``"C0Y"`` ..; travel counts from the start of the stroke.
     left_out : tuple of str
-        Motions that are not written.
+        Motions that are not written: hidden, weak, or not named by the caller.
     any_tool : bool
         Whether every motion in the tables is observable by itself, so that they hold for any tool.
     """
@@ -75,36 +77,46 @@ class MotionTables:
 
 
 def motion_tables(
-    solution: JointSolution, counts: tuple[int, int, int], motions: frozenset[str] | set[str], *, any_tool: bool = True
+    solution: JointSolution,
+    counts: tuple[int, int, int],
+    motions: frozenset[str] | set[str] | None = None,
+    *,
+    any_tool: bool = True,
+    sources: ErrorSources | None = None,
 ) -> MotionTables:
-    """Tables of the named motions only.
+    """Tables of the named motions only; what is not written stands in ``left_out``.
 
     Parameters
     ----------
     counts : (int, int, int)
         Grid points of X, Y, Z.
-    motions : set of str
-        What may be written: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``.
+    motions : set of str, optional
+        What may be written: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``. Default: all that are observable by themselves.
     any_tool : bool
-        Whether these motions are observable by themselves: then each has its own estimate. False, for `enough_for_the_field`: values that
-        reproduce the identified deviation with the machine's own tool best, all others being zero.
+        True: each motion has its own estimate, and only what is observable by itself may be written. False, for `enough_for_the_field`:
+        values that reproduce the identified deviation with the machine's own tool best, all others being zero.
+    sources : ErrorSources, optional
+        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
 
     Raises
     ------
     ValueError
-        A name that is no motion of the solution, or none at all.
+        A name that is no motion of the solution, none at all, or (``any_tool``) one that the data do not tell apart from others.
     """
     known = {t.motion for t in solution.terms}
-    if not motions or not motions <= known:
-        raise ValueError(f"motion tables: {', '.join(sorted(set(motions) - known)) or 'no motion'} cannot be written")
-    machine, keep = solution.machine, [i for i, t in enumerate(solution.terms) if t.motion in motions]
-    grids = grid_positions(machine, counts)
-    operator = np.eye(len(solution.terms))[keep] if any_tool else _refit(solution, keep)
-    entries = {name: _entries(solution, name, grids, keep, operator) for name in sorted(motions)}
+    motions = _writable(solution, known, motions, any_tool)
+    sources = sources or error_sources(solution)
+    grids = grid_positions(solution.machine, counts)
+    keep = [i for i, t in enumerate(sources.terms) if t.motion in motions]  # the solution's own, then orders above it, that have no value
+    operator = np.eye(len(sources.terms))[keep]
+    if not any_tool:
+        n, own = len(solution.terms), [i for i in keep if i < len(solution.terms)]
+        operator[: len(own), :n] = _refit(solution, own)
+    entries = {name: _entries(sources, name, grids, keep, operator) for name in sorted(motions)}
     functions = {n: e for n, e in entries.items() if n not in SQUARENESS}
     square = {n: e for n, e in entries.items() if n in SQUARENESS}
     return MotionTables(
-        machine,
+        solution.machine,
         grids,
         {n: e[0] for n, e in functions.items()},
         {n: e[1] for n, e in functions.items()},
@@ -115,18 +127,31 @@ def motion_tables(
     )
 
 
-def _entries(solution: JointSolution, name: str, grids: tuple[F1, F1, F1], keep: list[int], operator: F2) -> tuple[F1, F1]:
+def _writable(solution: JointSolution, known: set[str], motions: frozenset[str] | set[str] | None, any_tool: bool) -> frozenset[str]:
+    """The motions to be written, if they may be."""
+    seen = observable_alone(solution) if motions is None or any_tool else frozenset(known)
+    wanted = seen if motions is None else frozenset(motions)
+    if not wanted or not wanted <= known:
+        raise ValueError(f"motion tables: {', '.join(sorted(wanted - known)) or 'no motion'} cannot be written")
+    if not wanted <= seen:
+        raise ValueError(
+            f"motion tables: {', '.join(sorted(wanted - seen))} cannot be written under their own names: the readings do not "
+            "tell them apart from other motions. Measure with a second tool length, or make tables for this tool only (any_tool=False)"
+        )
+    return wanted
+
+
+def _entries(sources: ErrorSources, name: str, grids: tuple[F1, F1, F1], keep: list[int], operator: F2) -> tuple[F1, F1]:
     """Values and standard uncertainties of one motion on the grid of its axis; of a squareness one value (rad)."""
-    machine = solution.machine
-    mine = [k for k, i in enumerate(keep) if solution.terms[i].motion == name]
-    terms = tuple(solution.terms[keep[k]] for k in mine)
+    machine = sources.solution.machine
+    mine = [k for k, i in enumerate(keep) if sources.terms[i].motion == name]
+    terms = tuple(sources.terms[keep[k]] for k in mine)
     axis = terms[0].axis
     points = np.tile(machine.centre_mm, (grids[axis].size, 1))
     points[:, axis] = grids[axis]
     rows = np.ones((1, 1)) if name in SQUARENESS else term_values(terms, points, machine.stroke_mm)
     gradient = rows @ operator[mine]
-    variance = np.einsum("nk,kl,nl->n", gradient, solution.term_covariance, gradient)
-    return gradient @ solution.coefficients, np.sqrt(np.maximum(variance, 0.0))
+    return gradient @ sources.coefficients, np.sqrt(variances(sources, gradient))
 
 
 def observable_alone(solution: JointSolution, *, weak: bool = False) -> frozenset[str]:

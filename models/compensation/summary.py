@@ -6,7 +6,7 @@ effect over the volume - most of what one-axis tables correct - is known far bet
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from models.compensation.additive import main_effect
 from models.machine import AXES
 from models.solvers.joint import JointSolution
 from models.solvers.priors import U_WAVELENGTH
+from models.uncertainty.combined import variances
+from models.uncertainty.inputs import Inputs
+from models.uncertainty.sources import ErrorSources, error_sources
 
 SCALE_NOTE = "at the machine's temperature while it was measured"
 """What every printed scale has to say: no material temperature correction is made."""
@@ -36,22 +39,24 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
     """Mean scale error of X, Y, Z (slope of EXX, EYY, EZZ) and mean squareness C0Y, B0Z, A0Z over the volume.
 
     Scales hold at the temperature the machine had while it was measured: nothing is reduced to 20 degree C, and 1 K of a steel machine is
-    about 11 um/m. Least-squares slopes over equidistant positions. The laser's wavelength is an unknown of every solution with a laser
-    (`laser_scale`) and so within its covariance; without one, scales carry its uncertainty all the same: none is known better.
+    about 11 um/m; so the uncertainty of the scales' temperature is not in. All other sources are (`models.uncertainty.sources`), orders
+    above the chosen one included. Least-squares slopes over equidistant positions. The laser's wavelength is an unknown of every solution
+    with a laser (`laser_scale`) and so within its sources; without one, scales carry its uncertainty all the same: none is known better.
     """
+    sources = error_sources(solution, replace(Inputs().as_measured(), u_wavelength=0.0))  # the wavelength is in ``common``
     slopes = {}
     for a in range(3):
         first, last = (float(v) for v in solution.machine.stroke_mm[a])
         p = np.linspace(first, last, positions)
         weight = (p - p.mean()) / np.sum((p - p.mean()) ** 2)
-        slopes[a] = np.einsum("p,pik->ik", weight, main_effect(solution, a, p, nodes))
+        slopes[a] = np.einsum("p,pik->ik", weight, main_effect(solution.machine, sources.terms, a, p, nodes))
     common = 0.0 if "laser_scale" in solution.setup.names else U_WAVELENGTH
-    found = [_parameter(solution, f"E{AXES[a]}{AXES[a]}", slopes[a][a], common) for a in range(3)]
-    found += [_parameter(solution, name, sign * (slopes[a][b] + slopes[b][a])) for name, a, b, sign in SQUARENESS]
+    found = [mean_parameter(sources, f"E{AXES[a]}{AXES[a]}", slopes[a][a], common) for a in range(3)]
+    found += [mean_parameter(sources, name, sign * (slopes[a][b] + slopes[b][a])) for name, a, b, sign in SQUARENESS]
     return tuple(found)
 
 
-def _parameter(solution: JointSolution, name: str, gradient: F1, u_common: float = 0.0) -> MeanParameter:
-    value = float(gradient @ solution.coefficients)
-    u = float(np.sqrt(gradient @ solution.term_covariance @ gradient))
-    return MeanParameter(name, value, float(np.hypot(u, u_common)))
+def mean_parameter(sources: ErrorSources, name: str, gradient: F1, u_common: float = 0.0) -> MeanParameter:
+    """Parameter that is ``gradient @ coefficients``, with its uncertainty from all sources and ``u_common`` on top."""
+    u = float(np.sqrt(variances(sources, gradient[None])[0]))
+    return MeanParameter(name, float(gradient @ sources.coefficients), float(np.hypot(u, u_common)))

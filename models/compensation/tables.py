@@ -12,9 +12,15 @@ import numpy as np
 
 from models.arrays import F1, F2, F3
 from models.compensation.additive import additive_design
+from models.geometry.bases import Term
 from models.geometry.chain import design
 from models.machine import AXES, Machine
 from models.solvers.joint import JointSolution
+from models.uncertainty.budget import budget_over
+from models.uncertainty.combined import variances
+from models.uncertainty.frame import RigidFree
+from models.uncertainty.prediction import predict_deviation
+from models.uncertainty.sources import ErrorSources, error_sources
 from models.volumetric import remove_rigid, rigid_design, volume_grid
 
 
@@ -22,10 +28,11 @@ from models.volumetric import remove_rigid, rigid_design, volume_grid
 class NineTables:
     """Correction added to the command: ``correction_mm[a][:, i]`` for output i at ``position_mm[a]`` of input axis a.
 
-    ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the first position, in the frame in which the
-    deviation field has no rigid motion over the volume (docs/conventions.md, "Frame"). The slope of a cross table (Y and Z over X, ...) is
-    partly a rotation of the whole frame, which no measurement of this kind sees, which moves no distance between two points of a part, and
-    which the corrections leave as the model happens to place it: compare tables only after taking the best-fit rotation out.
+    ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the first position, from all sources (noise,
+    priors, orders above the chosen one, stated inputs; `models.uncertainty.sources`), in the frame in which the deviation field has no
+    rigid motion over the volume (docs/conventions.md, "Frame"). The slope of a cross table (Y and Z over X, ...) is partly a rotation of
+    the whole frame, which no measurement of this kind sees, which moves no distance between two points of a part, and which the
+    corrections leave as the model happens to place it: compare tables only after taking the best-fit rotation out.
     """
 
     position_mm: tuple[F1, F1, F1]
@@ -52,7 +59,9 @@ def grid_positions(machine: Machine, counts: tuple[int, int, int]) -> tuple[F1, 
     return grids[0], grids[1], grids[2]
 
 
-def nine_tables(solution: JointSolution, counts: tuple[int, int, int], *, nodes: int = 9) -> NineTables:
+def nine_tables(
+    solution: JointSolution, counts: tuple[int, int, int], *, nodes: int = 9, sources: ErrorSources | None = None
+) -> NineTables:
     """Best nine tables for the machine as identified, zero at the first grid position of each axis.
 
     Parameters
@@ -61,50 +70,80 @@ def nine_tables(solution: JointSolution, counts: tuple[int, int, int], *, nodes:
         Grid points of X, Y, Z.
     nodes : int
         Nodes per axis of the volume over which the tables are fitted.
+    sources : ErrorSources, optional
+        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
     """
-    machine = solution.machine
+    machine, sources = solution.machine, sources or error_sources(solution)
     grids = grid_positions(machine, counts)
     corrections, uncertainties = [], []
-    rotation = frame_rotation(machine, solution, nodes)
-    for a, relative in enumerate(table_design(solution, grids, nodes)):
-        corrections.append(-(relative @ solution.coefficients))
+    rotation = frame_rotation(machine, sources.terms, nodes)
+    for a, relative in enumerate(table_design(solution, grids, nodes, sources.terms)):
+        corrections.append(-(relative @ sources.coefficients))
         turned = np.cross(rotation.T, np.eye(3)[a]).T  # slope over axis a that a rotation of the frame gives every output
         fixed = relative - (grids[a] - grids[a][0])[:, None, None] * turned
-        variance = np.einsum("nik,kl,nil->ni", fixed, solution.term_covariance, fixed)
-        uncertainties.append(np.sqrt(np.maximum(variance, 0.0)))
+        uncertainties.append(entry_u(sources, fixed))
     return NineTables(grids, (corrections[0], corrections[1], corrections[2]), (uncertainties[0], uncertainties[1], uncertainties[2]))
 
 
-def table_design(solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int) -> tuple[F3, F3, F3]:
-    """Best nine tables of the deviation per unit of every coefficient, first entries zero: per axis shape (len(grid), 3, terms)."""
-    x, y, z = (effect - effect[0] for effect in additive_design(solution, grids_mm, nodes))
+def entry_u(sources: ErrorSources, per_unit: F3) -> F2:
+    """Standard uncertainty of table entries from all sources, (n, 3), for their design (n, 3, len(sources.terms))."""
+    return np.asarray(np.sqrt(variances(sources, per_unit.reshape(-1, per_unit.shape[2]))).reshape(per_unit.shape[:2]))
+
+
+def table_design(
+    solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int, terms: tuple[Term, ...] | None = None
+) -> tuple[F3, F3, F3]:
+    """Best nine tables of the deviation per unit of every coefficient, first entries zero: per axis shape (len(grid), 3, terms).
+
+    ``terms``: the solution's own, or with orders above them, which have uncertainty but no value.
+    """
+    x, y, z = (effect - effect[0] for effect in additive_design(solution, grids_mm, nodes, terms))
     return x, y, z
 
 
-def frame_rotation(machine: Machine, solution: JointSolution, nodes: int) -> F2:
+def frame_rotation(machine: Machine, terms: tuple[Term, ...], nodes: int) -> F2:
     """Best-fit rotation of the deviation field over the volume per unit of every coefficient, shape (3, terms), rad."""
     grid = volume_grid(machine.stroke_mm, nodes)
-    full = design(machine, solution.terms, grid).reshape(-1, len(solution.terms))
+    full = design(machine, terms, grid).reshape(-1, len(terms))
     return np.asarray(np.linalg.lstsq(rigid_design(grid).reshape(-1, 6), full, rcond=None)[0][3:])
 
 
 def quantise(tables: NineTables, lsb_mm: float) -> NineTables:
-    """The tables as the controller will store them: every entry rounded to its unit."""
+    """The tables as the controller will store them: every entry rounded to its unit.
+
+    Raises
+    ------
+    ValueError
+        The unit is no positive number.
+    """
+    check_unit(lsb_mm)
     rounded = tuple(np.round(c / lsb_mm) * lsb_mm for c in tables.correction_mm)
     return NineTables(tables.position_mm, (rounded[0], rounded[1], rounded[2]), tables.u_mm)
 
 
+def check_unit(lsb_mm: float) -> None:
+    """Refuse a controller's unit that is no positive number: rounding to it would make tables of nothing.
+
+    Raises
+    ------
+    ValueError
+        Names the unit.
+    """
+    if not (np.isfinite(lsb_mm) and lsb_mm > 0):
+        raise ValueError(f"tables: the controller's unit is {lsb_mm} mm, must be a positive number")
+
+
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """Volumetric rms (rigid motion removed) by the identified model, mm; ``u_model_mm``: rms error of the model itself."""
+    """Volumetric rms (rigid motion removed) by the identified model, mm; ``u_model_mm``: rms error of the model itself, all sources."""
 
     before_mm: float
     after_mm: float
     u_model_mm: float
 
 
-def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int = 9) -> Predicted:
-    """What the identified model says the machine will do without and with these tables, and how well it knows."""
+def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int = 9, sources: ErrorSources | None = None) -> Predicted:
+    """What the identified model says the machine will do without and with these tables, and how well it knows (`model_uncertainty_mm`)."""
     machine = solution.machine
     grid = volume_grid(machine.stroke_mm, nodes)
     field = solution.deviation_mm(grid)
@@ -113,20 +152,14 @@ def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int 
     def rms(v: F2) -> float:
         return float(np.sqrt(np.mean(np.sum(remove_rigid(grid, v) ** 2, axis=1))))
 
-    return Predicted(rms(field), rms(corrected), model_uncertainty_mm(solution, nodes=nodes))
+    return Predicted(rms(field), rms(corrected), model_uncertainty_mm(solution, nodes=nodes, sources=sources))
 
 
-def model_uncertainty_mm(solution: JointSolution, *, nodes: int = 9, draws: int = 64) -> float:
-    """Rms over volume and posterior draws of the error of the identified field, rigid motion removed, mm.
+def model_uncertainty_mm(solution: JointSolution, *, nodes: int = 9, sources: ErrorSources | None = None) -> float:
+    """Rms over the volume of the standard uncertainty of the identified deviation vector, rigid motion removed, mm.
 
-    Draws use a fixed generator: the same solution always gives the same figure.
+    All sources count: noise, set-ups, typical sizes, orders above the chosen one, wavelength, temperatures. ``sources``: with other stated
+    inputs than the documented ones.
     """
     grid = volume_grid(solution.machine.stroke_mm, nodes)
-    full = design(solution.machine, solution.terms, grid)
-    values, vectors = np.linalg.eigh(solution.term_covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    rng = np.random.default_rng(230)
-    total = 0.0
-    for _ in range(draws):
-        total += float(np.mean(np.sum(remove_rigid(grid, full @ (root @ rng.standard_normal(values.size))) ** 2, axis=1)))
-    return float(np.sqrt(total / draws))
+    return budget_over(predict_deviation(sources or error_sources(solution), grid, frame=RigidFree(grid))).u_mm

@@ -13,7 +13,7 @@ from models.uncertainty.sources import WORDS
 
 @dataclass(frozen=True, slots=True)
 class BudgetLine:
-    """One source: its standard uncertainty of the deviation vector, mm, and its share of the total variance (all shares: 1)."""
+    """One source: the rms length of the error vector it makes, mm, and its share of the total variance (all shares: 1)."""
 
     name: str
     words: str
@@ -25,7 +25,7 @@ class BudgetLine:
 class Budget:
     """Lines, largest first, and the total: root of the sum of their squares.
 
-    ``u_mm`` is the standard deviation of the length of the error of the predicted vector: root of the sum of the three variances.
+    ``u_mm`` is the rms length of the error of the predicted vector: root of the sum of the three variances.
     ``expanded_mm``: largest expanded uncertainty of a component at these points, with its coverage factor.
     """
 

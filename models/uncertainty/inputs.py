@@ -31,7 +31,8 @@ class Inputs:
         The same of the ball-bar against the temperature of its calibration; one thermometer for all bar runs.
     repeatability_mm : float
         Standard deviation of the machine from one approach of a point to the next, per component (`models.uncertainty.repeatability`
-        estimates it). It is part of the scatter of the readings: the budget takes its share out of theirs. Default 0: not told apart.
+        estimates it). It is part of the scatter of the readings: the budget takes its share out of theirs, at most all of it. Default 0:
+        not told apart.
     repeatability_dof : float
         Degrees of freedom of that figure; inf when it is stated.
     single_approach : bool
@@ -66,6 +67,10 @@ class Inputs:
                 raise ValueError(f"uncertainty inputs: {name} is {value}, must be a number of 0 or more")
         if self.orders_above < 0 or not self.repeatability_dof > 0:
             raise ValueError("uncertainty inputs: orders_above must be 0 or more, repeatability_dof above 0")
+
+    def as_measured(self) -> Inputs:
+        """The same for a machine whose scales are as warm as while it was measured: without the temperature of the scales."""
+        return replace(self, u_scale_temperature_k=0.0)
 
     def of_the_data_alone(self) -> Inputs:
         """The same without everything that is only stated: what is left is the covariance of the solution itself."""

@@ -48,7 +48,7 @@ class Prediction:
 
     @property
     def u_vector_mm(self) -> F1:
-        """Root of the sum of the three variances, shape (m,): standard deviation of the length of the error vector of the prediction."""
+        """Root of the sum of the three variances, shape (m,): rms length of the error vector of the prediction."""
         return np.asarray(np.sqrt(np.einsum("mii->m", self.covariance_mm2)))
 
     @property

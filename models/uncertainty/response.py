@@ -32,7 +32,7 @@ class Response:
     widening : array, shape (p, p)
         What the solution's covariance holds on top because the sizes were estimated too. Not positive in every direction.
     dof : float
-        Degrees of freedom of the residuals, from which the noise was estimated.
+        Degrees of freedom of all residuals together.
     """
 
     design: F2
@@ -55,6 +55,16 @@ class Response:
         size = np.sqrt(self.weight) if variance_mm2 is None else np.sqrt(variance_mm2) * self.weight
         r = linalg.qr(self.design[seen] * size[seen, None], mode="r")[0][: self.design.shape[1]]
         return np.asarray(self.covariance @ r.T)
+
+    def dof_of(self, kind: str) -> float:
+        """Degrees of freedom of the residuals of one instrument, from which its noise was estimated: its part of `dof`, at least 1.
+
+        A reading keeps what it does not take to determine itself: one minus its leverage.
+        """
+        leverage = self.weight * np.einsum("np,pq,nq->n", self.design, self.covariance, self.design, optimize=True)
+        left = np.where(self.weight > 0, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)
+        total = float(left.sum())
+        return max(1.0, self.dof * float(left[self.kind == kind].sum()) / total) if total > 0 else 1.0
 
     @property
     def gain(self) -> F2:

@@ -115,9 +115,8 @@ def error_sources(solution: JointSolution, inputs: Inputs | None = None) -> Erro
     above = len(terms) - n
     parts = [replace(s, factor=_padded(s.factor[:n], above)) for s in found]
     parts.append(Source("model_order", extra))
-    wider = _widening(r, n)
-    assert wider.less is not None
-    wider = replace(wider, factor=_padded(wider.factor, above), less=_padded(wider.less, above))
+    plus, less = _widening(r, n)
+    wider = Source("estimated_sizes", _padded(plus, above), less=_padded(less, above))
     coefficients = np.concatenate([solution.coefficients, np.zeros(above)])
     return ErrorSources(solution, inputs, terms, coefficients, (*_merged(parts), wider))
 
@@ -154,24 +153,27 @@ def _noise(r: Response, inputs: Inputs) -> list[Source]:
     out = []
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
-    share = np.full(r.weight.size, inputs.repeatability_mm**2)
+    share = np.minimum(inputs.repeatability_mm**2, variance)  # never more than the readings scatter: that would count it twice
     for kind in ("bar", "laser"):
         seen = r.kind == kind
         if seen.any():
-            left = None if inputs.repeatability_mm == 0 else np.maximum(variance - share, 0.0)
-            out.append(Source(f"{kind}_noise", r.noise_factor(left, seen), r.dof))
+            left = None if inputs.repeatability_mm == 0 else variance - share
+            out.append(Source(f"{kind}_noise", r.noise_factor(left, seen), r.dof_of(kind)))
     if inputs.repeatability_mm > 0:
         out.append(Source("repeatability", r.noise_factor(share, everywhere), inputs.repeatability_dof))
     return out
 
 
-def _widening(r: Response, n: int) -> Source:
-    """That sizes were estimated at all: the covariance on top of what holds for the estimated ones, as plus and minus."""
+def _widening(r: Response, n: int) -> tuple[F2, F2]:
+    """That sizes were estimated at all: the covariance on top of what holds for the estimated ones, as plus and minus.
+
+    It is the allowance for their few degrees of freedom itself, so it has none of its own: they would count twice.
+    """
     whole = r.widening[:n, :n]
     scale = np.sqrt(np.diag(r.covariance)[:n])
     value, vector = linalg.eigh(whole / np.outer(scale, scale))
     roots = scale[:, None] * vector * np.sqrt(np.abs(value))
-    return Source("estimated_sizes", roots[:, value > 0], r.dof, less=roots[:, value < 0])
+    return roots[:, value > 0], roots[:, value < 0]
 
 
 def _priors(solution: JointSolution, r: Response) -> list[Source]:

@@ -5,13 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from models.compensation.additive import additive
 from models.compensation.distances import correction_error_mm, figures, inner_box_mm, pair_design, predict_distances, random_pairs
 from models.compensation.grid import check_steps, grid_table, node_design, nodes_mm, quantisation_mm, quantise_grid
 from models.compensation.interpolation import cells, fit_positions, trilinear
-from models.compensation.tables import grid_positions
+from models.compensation.tables import grid_positions, model_uncertainty_mm, nine_tables
 from models.geometry.chain import design
 from models.solvers.joint import solve_joint
-from models.volumetric import remove_rigid, volume_grid
+from models.solvers.observations import block_average
+from models.uncertainty.frame import RigidFree
+from models.uncertainty.inputs import Inputs
+from models.uncertainty.mask import compensable_mask
+from models.uncertainty.prediction import predict_deviation
+from models.uncertainty.sources import error_sources
+from models.volumetric import remove_rigid, rigid_design, volume_grid
 from tests.physics.truth import MACHINE, Truth
 
 PAIRS = random_pairs(inner_box_mm(MACHINE), 3000, seed=5)
@@ -94,19 +101,78 @@ def test_the_grid_takes_what_nine_tables_cannot(solved):
 
 def test_the_predicted_distances_hold_on_the_true_machine(solved):
     truth, s = solved
+    sources = error_sources(s, Inputs().as_measured())  # this truth is as warm in use as in the campaign
     for nodes in (5, 9, 13):
         table = grid_table(s, (nodes,) * 3)
-        stated, seen = predict_distances(s, table.correction_at, pairs=PAIRS), true_distances(truth, table.correction_at)
+        stated, seen = predict_distances(s, table.correction_at, pairs=PAIRS, sources=sources), true_distances(truth, table.correction_at)
         assert seen.rms_mm < stated.rms_mm + 3 * stated.u_rms_mm
         assert seen.rms_mm > 0.4 * stated.rms_mm  # not so wide that it says nothing
         assert stated.rms_mm == pytest.approx(np.hypot(stated.known_mm, stated.unknown_mm), rel=0.1)
-    before = predict_distances(s, pairs=PAIRS)
+    before = predict_distances(s, pairs=PAIRS, sources=sources)
     assert true_distances(truth).rms_mm == pytest.approx(before.rms_mm, abs=3 * before.u_rms_mm + 0.01 * before.rms_mm)
+
+
+@pytest.fixture(scope="module", params=[{"order": 1}, {"model": "rigid6"}], ids=["order 1", "rigid6"])
+def too_simple(request):
+    truth = Truth(5)
+    runs = tuple(block_average(r, 100) if r.kind == "bar" else r for r in truth.campaign())
+    return truth, solve_joint(MACHINE, runs, **request.param)
+
+
+def test_a_model_that_is_too_simple_says_so_in_all_its_figures(too_simple):
+    """The noise alone would state 0.6 um of distances where 3.4 um are left, and intervals of the nodes that hold a third of them."""
+    truth, s = too_simple
+    table = grid_table(s, (9, 9, 9))
+    stated, seen = predict_distances(s, table.correction_at, pairs=PAIRS), true_distances(truth, table.correction_at)
+    assert abs(stated.rms_mm - seen.rms_mm) < 2 * stated.u_rms_mm
+    assert 0.5 * seen.rms_mm < stated.rms_mm < 2 * seen.rms_mm
+    nine = nine_tables(s, (25, 21, 19))
+    stated, seen = predict_distances(s, nine.correction_at, pairs=PAIRS), true_distances(truth, nine.correction_at)
+    assert abs(stated.rms_mm - seen.rms_mm) < 2 * stated.u_rms_mm
+    p = nodes_mm(table.position_mm)
+    missed = remove_rigid(p, truth.deviation(p) - s.deviation_mm(p))
+    assert np.mean(np.abs(missed) < 1.96 * table.u_mm.reshape(-1, 3)) > 0.93
+    assert model_uncertainty_mm(s) > 0.8 * np.sqrt(np.mean(np.sum(missed**2, axis=1)))
+
+
+def test_uncertainties_of_one_axis_entries_hold_the_truth_of_a_model_that_is_too_simple(too_simple):
+    truth, s = too_simple
+    nine = nine_tables(s, (13, 11, 10))
+    best = additive(lambda p: truth.deviation(p)[:, :, None], MACHINE.stroke_mm, nine.position_mm, nodes=9, order=2)
+    grid = volume_grid(MACHINE.stroke_mm, 9)
+    gap = truth.deviation(grid) - s.deviation_mm(grid)
+    rotation = np.linalg.lstsq(rigid_design(grid).reshape(-1, 6), gap.ravel(), rcond=None)[0][3:]
+    held = []
+    for a, p in enumerate(nine.position_mm):
+        error = (best[a] - best[a][0])[:, :, 0] + nine.correction_mm[a] - np.outer(p - p[0], np.cross(rotation, np.eye(3)[a]))
+        held.append((np.abs(error[1:]) < 1.96 * nine.u_mm[a][1:]).ravel())
+    assert np.mean(np.concatenate(held)) > 0.9
+
+
+def test_table_and_mask_judge_by_the_same_uncertainty(too_simple):
+    _, s = too_simple
+    table, p = grid_table(s, (5, 5, 5)), nodes_mm(grid_positions(MACHINE, (5, 5, 5)))
+    deviation = remove_rigid(p, s.deviation_mm(p))
+    by_table = np.abs(deviation) > 1.96 * table.u_mm.reshape(-1, 3)
+    prediction = predict_deviation(error_sources(s), p, frame=RigidFree(p))
+    assert (by_table == compensable_mask(prediction, k=1.96).components).all()
+
+
+def test_stated_inputs_are_in_the_uncertainties_of_tables_and_can_be_given(solved):
+    _, s = solved
+    warm, sure = (error_sources(s, Inputs(u_scale_temperature_k=u)) for u in (2.0, 0.0))
+    for of in (
+        lambda x: grid_table(s, (3, 3, 3), sources=x).u_mm.max(),
+        lambda x: nine_tables(s, (5, 5, 5), sources=x).u_mm[0][:, 0].max(),
+        lambda x: predict_distances(s, sources=x).unknown_mm,
+        lambda x: model_uncertainty_mm(s, sources=x),
+    ):
+        assert of(warm) > 5 * of(sure)
 
 
 def test_uncertainties_of_the_nodes_are_those_of_the_field_without_rigid_motion(solved):
     _, s = solved
-    table = grid_table(s, (4, 4, 4))
+    table = grid_table(s, (4, 4, 4), sources=error_sources(s, Inputs().of_the_data_alone()))
     p = nodes_mm(table.position_mm)
     root = np.linalg.cholesky(s.term_covariance + 1e-30 * np.eye(len(s.terms)))
     drawn = design(MACHINE, s.terms, p) @ root @ np.random.default_rng(1).standard_normal((len(s.terms), 2000))
@@ -147,6 +213,9 @@ def test_the_largest_step_is_that_of_neighbouring_nodes(solved):
     check_steps(table, table.largest_step_mm)
     with pytest.raises(ValueError, match=r"from the node at X .* to the next on [XYZ] the correction changes by .* um"):
         check_steps(table, 0.99 * table.largest_step_mm)
+    for limit in (float("nan"), -1.0):
+        with pytest.raises(ValueError, match="largest allowed step"):
+            check_steps(table, limit)
     finer = grid_table(s, (11, 9, 7))
     assert finer.largest_step_mm < table.largest_step_mm
 
@@ -169,7 +238,7 @@ def test_distances_of_pairs_are_exact_and_feel_no_rigid_motion(solved):
     assert PAIRS.error_mm(first, second) == pytest.approx(want, abs=1e-11)
     turned = [np.cross(p, [1e-4, -2e-4, 3e-4]) + 0.5 for p in (PAIRS.first_mm, PAIRS.second_mm)]
     assert np.abs(np.einsum("ni,ni->n", PAIRS.unit, turned[1] - turned[0])).max() < 1e-12
-    linear = pair_design(s, PAIRS) @ s.coefficients
+    linear = pair_design(MACHINE, s.terms, PAIRS) @ s.coefficients
     assert linear == pytest.approx(PAIRS.error_mm(s.deviation_mm(PAIRS.first_mm), s.deviation_mm(PAIRS.second_mm)), abs=1e-4)
 
 
@@ -184,5 +253,8 @@ def test_a_grid_that_cannot_be_is_refused(solved):
         grid_table(s, (1, 3, 3))
     with pytest.raises(ValueError, match="mask of shape"):
         grid_table(s, (3, 3, 3), compensable=np.ones((3, 3), dtype=bool))
+    for unit in (0.0, -1e-4, float("nan")):
+        with pytest.raises(ValueError, match="controller's unit"):
+            quantise_grid(grid_table(s, (3, 3, 3)), unit)
     with pytest.raises(ValueError, match="outside the grid"):
         grid_table(s, (3, 3, 3), reference=(0, 0, 3))

@@ -51,7 +51,8 @@ def test_sources_of_the_data_add_up_to_the_covariance_of_the_solution(solution):
     d = design(MACHINE, solution.terms, GRID[1:])
     stated = np.sqrt(np.einsum("mik,kl,mil->mi", d, solution.term_covariance, d))
     assert (p.u_mm / stated).min() > 1.0 - 1e-6
-    assert (p.u_mm / stated).max() < 1.03
+    assert (p.u_mm / stated).max() < 1.1  # what makes no prediction better is wider in some direction of a point
+    assert np.median(p.u_mm / stated) < 1.01
     np.testing.assert_allclose(p.variance_mm2.sum(axis=0), p.u_mm**2, rtol=1e-12)
 
 
@@ -132,10 +133,12 @@ def test_bar_temperature_acts_as_a_longer_bar(solution):
     inputs = replace(Inputs().of_the_data_alone(), u_bar_temperature_k=2.0)
     source = error_sources(solution, inputs).source("bar_temperature")
     longer = np.concatenate([np.full(run.deviation_mm.size, 2.0 * STEEL_PER_K * (run.radius_mm or 0.0)) for run in solution.data])
-    np.testing.assert_allclose(
-        source.factor[:, 0], r.of_readings(longer)[: len(solution.terms)], rtol=1e-5, atol=1e-9 * np.abs(source.factor).max()
-    )
-    assert np.abs(source.factor).max() > 0
+    root, n = solution.prior_root, len(solution.terms)
+    sigma = 1.0 / np.sqrt(r.weight)
+    moved = root @ solve_map(solution.estimate.names, r.design @ root, longer, sigma, np.ones(len(root))).theta  # another solver
+    u = np.sqrt(np.diag(r.covariance)[:n])
+    assert np.abs((source.factor[:, 0] - moved[:n]) / u).max() < 1e-6
+    assert np.abs(moved[:n] / u).max() > 1e-3
 
 
 def test_repeatability_takes_its_share_out_of_the_readings_and_adds_to_a_single_approach(solution):
@@ -154,7 +157,12 @@ def test_every_source_has_words_and_degrees_of_freedom(solution):
     assert {s.name for s in sources.sources} == set(WORDS)
     assert sources.source("repeatability").dof == 9.0
     assert sources.source("scale_temperature").dof == np.inf
+    assert sources.source("estimated_sizes").dof == np.inf  # it is the allowance for few degrees of freedom itself
     assert np.isfinite(sources.source("laser_noise").dof)
+    r = response(solution)
+    parts = [sources.source(f"{kind}_noise").dof for kind in ("bar", "laser")]
+    assert sum(parts) == pytest.approx(r.dof)
+    assert all(p < n for p, n in zip(parts, [(r.kind == k).sum() for k in ("bar", "laser")], strict=True))
     with pytest.raises(KeyError):
         sources.source("moon")
     k = predict_deviation(sources, GRID).coverage_factor
