@@ -10,6 +10,7 @@ from models.solvers.joint import solve_joint
 from models.solvers.observe import setup_unknowns
 from models.solvers.priors import Priors
 from models.volumetric import remove_rigid, volume_grid
+from service.errors import MeasurementFault
 from service.runs.observations import run_data
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
@@ -85,5 +86,5 @@ def test_the_stored_set_up_is_carried_and_its_absence_too():
 
 @pytest.mark.parametrize("setup", [{"tool_mm": [1, 2]}, {"tool_mm": [0, 0, float("nan")]}, {"u_length_mm": -1e-3}])
 def test_a_set_up_that_is_none_names_its_run(setup):
-    with pytest.raises(ValueError, match=r"run r1: (tool_mm|u_length_mm)"):
+    with pytest.raises(MeasurementFault, match=r"run r1: (tool_mm|u_length_mm)"):
         run_data(stored_run(**setup))
