@@ -7,14 +7,14 @@ unknowns (Kackar and Harville 1984). Deterministic: no random numbers, a fixed n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
 
 from models.arrays import F1, F2
 from models.solvers.information import Sums
-from models.solvers.priors import LENGTHS, SizeModel, with_length
+from models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
 
 NOISE_SD = 2.0
 """Hyperprior of an instrument's log noise variance about what its repeats say: a factor of e in the standard deviation, weak."""
@@ -175,15 +175,29 @@ def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeMod
     return models[at], found[at]
 
 
-def cautious(model: SizeModel, found: Found) -> Components:
-    """The components with every motion as rough as one standard deviation of what is known of its roughness allows.
+def cautious(model: SizeModel, found: Found) -> tuple[SizeModel, Components]:
+    """Prior of the error motions as it may well be, where the most probable one would promise too much.
 
-    A motion looks as rough as it is where it was measured; beyond, near the ends of the stroke, it may be rougher, and what was measured
-    does not speak against it. Where readings are plenty this changes nothing.
+    Three remedies; where readings are plenty none of them changes anything.
+
+    - Every motion is as rough as one standard deviation of what is known of its roughness allows: it looks as rough as it is where it was
+      measured; beyond, near the ends of the stroke, it may be rougher, and what was measured does not speak against it.
+    - The variance of a motion is the mean of what it may be (of a log-normal: exp(psi + v/2)), not its most probable value. Two motions
+      that the readings hardly tell apart take from each other, and the most probable size of both is then too small.
+    - No shape is held closer to zero than `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("roughness ") for name in model.names])
+    bent = np.array([name in ("fade", "cut") for name in model.names])
     sd = np.sqrt(found.spread.diagonal()[: rough.size])
-    return Components(found.components.psi + np.where(rough, sd, 0.0), found.components.eta)
+    c = Components(found.components.psi + np.where(rough, sd, 0.0), found.components.eta)
+    sizes = model.design * ~(rough | bent)
+    unsure = np.einsum("ij,jk,ik->i", sizes, found.spread[: rough.size, : rough.size], sizes)
+    factor = np.ones(model.typical.size)
+    for at in model.blocks:
+        scale = np.exp(0.25 * unsure[at])
+        held = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
+        factor[at] = scale * np.hypot(held, SMALLEST_BEND) / held
+    return replace(model, root=model.root * factor), c
 
 
 def widened(model: SizeModel, p: Posterior, spread: F2) -> F2:
@@ -191,10 +205,14 @@ def widened(model: SizeModel, p: Posterior, spread: F2) -> F2:
 
     Second order in the log variances psi with covariance V: mean of the conditional covariance plus covariance of the conditional mean.
     With Q = X V X^T (X the design of the sizes) both together are S + S [(S + x x^T) o Q - diag(Q)/2] S. A class of which the data say
-    little has a size that is known badly, and its unknowns become more uncertain by that.
+    little has a size that is known badly, and its unknowns become more uncertain by that. In no direction less: there the second order
+    is not enough, and may even leave less than nothing.
     """
     h = model.design.shape[1]
     q = model.design @ spread[:h, :h] @ model.design.T
     inner = (p.cov + np.outer(p.x, p.x)) * q
     np.fill_diagonal(inner, inner.diagonal() - 0.5 * q.diagonal())
-    return np.asarray(p.cov + p.cov @ inner @ p.cov)
+    low = linalg.cholesky(p.cov, lower=True)
+    more, axes = linalg.eigh(low.T @ inner @ low)
+    wide = low @ axes
+    return np.asarray((wide * (1.0 + np.maximum(more, 0.0))) @ wide.T)

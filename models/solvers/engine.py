@@ -171,7 +171,7 @@ def _finish(problem: Problem, x: F1, weight: F1, c: Components, gram: Grams) -> 
     whole = total(parts)
     sizes = problem.sizes
     found = estimate(whole.turned(sizes.root, sizes.blocks), sizes, c)
-    c = cautious(sizes, found)
+    sizes, c = cautious(sizes, found)
     p = posterior(whole.turned(sizes.root, sizes.blocks), c, sizes)
     root = typical[:, None] * sizes.root * c.half(sizes)
     cov = root @ widened(sizes, p, found.spread) @ root.T

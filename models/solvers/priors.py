@@ -108,6 +108,8 @@ LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4
 FIRST_LENGTH = LENGTHS[7]
 LENGTH_SPREAD = 0.4
 """How much the lengths of the motions of one machine differ, standard deviation of the logarithm: a factor of 1.5."""
+SMALLEST_BEND = 0.003
+"""Smallest prior standard deviation of any shape of an error motion over the documented size: 15 nm, 0.045 urad."""
 SMALLEST_SHARE = 1e-7
 """Variance that every shape keeps of the largest one's, so that none is ruled out."""
 
@@ -177,10 +179,11 @@ class SizeModel:
 def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...], rest_sd: F1, priors: Priors) -> SizeModel:
     """Classes of the smooth ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
 
-    Positioning errors of order 2 and more share one size, all straightness errors, all angles, all slopes of angles, all lost motions,
-    cups and so on: what the data show of some tells how large the others may be; each error motion may differ from its class. How sizes
-    fade with the number of a shape is the same for all motions. Scales and squareness errors keep their documented size: there are only
-    three of each, and what is common to them (temperature) cannot be learned from how they differ.
+    Positioning errors of order 2 and more share one size, all straightness errors, all angles, all lost motions, cups and so on: what the
+    data show of some tells how large the others may be; each error motion may differ from its class. How sizes fade with the number of a
+    shape is the same for all motions. Scales, squareness errors and slopes of angles keep their documented size: there are three of each
+    scale and squareness, and what is common to them (temperature) cannot be learned from how they differ; and that most guideways of a
+    machine are straight says nothing of the one whose twist no reading shows.
     """
     kinds = [_class(t) for t in terms] + [_setup_class(n) for n in rest]
     motions = [t.motion if t.order >= 2 else "" for t in terms] + [""] * len(rest)
@@ -232,7 +235,7 @@ def _class(term: Term) -> str:
     if term.order == 0:
         return ""
     if term.component >= 3:
-        return "angle slope" if term.order == 1 else "angle"
+        return "" if term.order == 1 else "angle"
     if term.component == term.axis:
         return "" if term.order == 1 else "positioning"
     return "straightness"
