@@ -131,7 +131,7 @@ def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
     info = np.diag(weight)
     for _ in range(STEPS):
         gradient, info = slope(sums, c, model, p)
-        info = info + np.diag(weight)
+        info = _positive(info + np.diag(weight), float(weight.min()))
         step = linalg.solve(info, gradient - weight * np.concatenate([c.psi, c.eta]), assume_a="pos")
         step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
         trial = _moved(c, step)
@@ -146,6 +146,12 @@ def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
         if gain < TOLERANCE:
             break
     return Found(c, np.asarray(linalg.inv(info)), value)
+
+
+def _positive(info: F2, least: float) -> F2:
+    """The same with no eigenvalue under ``least``: information plus hyperprior never has one but by rounding (readings without noise)."""
+    values, vectors = linalg.eigh(info)
+    return info if values[0] >= least else np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
 
 
 def _moved(c: Components, step: F1) -> Components:
