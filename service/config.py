@@ -94,8 +94,8 @@ def load_machine(path: Path | str) -> Loaded:
     return Loaded(path, machine, origins)
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a machine file.
+def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
+    """Content of a machine file, or of another that ``what`` names in errors.
 
     Raises
     ------
@@ -105,11 +105,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(f"machine file {path} does not exist", "give the path of a machine file, e.g. deploy/machine.toml") from None
+        raise ConfigError(f"{what} {path} does not exist", "give the path of a machine file, e.g. deploy/machine.toml") from None
     except OSError as err:
-        raise ConfigError(f"machine file {path} cannot be read: {err.strerror}", "give a readable TOML file") from None
+        raise ConfigError(f"{what} {path} cannot be read: {err.strerror}", "give a readable TOML file") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"machine file {path} is not UTF-8 text", "save it as UTF-8") from None
+        raise ConfigError(f"{what} {path} is not UTF-8 text", "save it as UTF-8") from None
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not valid TOML: {err}", "correct this line") from None
     except RecursionError:

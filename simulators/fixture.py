@@ -45,6 +45,7 @@ class Fixture:
         self._ops: dict[str, Callable[[Answer], Awaitable[Answer]]] = {
             "identify": self._identify,
             "mount_ballbar": self._mount_ballbar,
+            "take_out_ballbar": self._take_out_ballbar,
             "change_ballbar": self._change_ballbar,
             "mount_laser": self._mount_laser,
             "unmount": self._unmount,
@@ -108,6 +109,12 @@ class Fixture:
         if not 0.0 < radius_mm <= MAX_RADIUS_MM:
             raise FixtureError("radius_mm is out of range")
         self._world.ballbar.mount(radius_mm, self._standing())
+        return {}
+
+    async def _take_out_ballbar(self, request: Answer) -> Answer:
+        self._standing()
+        if not self._world.ballbar.take_out():
+            raise FixtureError("no cup stands here")
         return {}
 
     async def _change_ballbar(self, request: Answer) -> Answer:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from models.arrays import F2
-from models.planning.information import LASER_SCALE
+from models.planning.information import BAR_SCALE, LASER_SCALE, scale_temperature_mm2, uncertainty_mm
 from models.planning.search import Chosen, Search
 
 COVERAGE = 2.0
@@ -32,7 +31,8 @@ class Goal:
     minutes_needed : float or None
         Minutes after which it is reached; None: not within `LONGEST_MIN`.
     limit_mm : float
-        U that every measurement the planner knows, repeated without end, would leave: no plan comes below it.
+        U that every measurement the planner knows, repeated without end, and the temperature of the scales would leave: no plan comes
+        below it.
     limit_by : str
         What makes the limit, in words.
     """
@@ -44,24 +44,22 @@ class Goal:
     limit_by: str
 
 
-def worst_u_mm(information: F2, rows: F2) -> float:
-    """Standard uncertainty of the deviation vector at the worst node, mm."""
-    half = linalg.solve_triangular(linalg.cholesky(information, lower=True), rows.T, lower=True)
-    return float(np.sqrt((half**2).sum(axis=0).reshape(-1, 3).sum(axis=1).max()))
-
-
 def limit(search: Search, rows: F2) -> tuple[float, str]:
-    """Expanded uncertainty (mm) that endless repetition of everything would leave at the worst node, and what makes it."""
-    total = np.zeros((search.what.size, search.what.size))
+    """Expanded uncertainty (mm) that endless repetition of everything would leave at the worst node, and what makes most of it."""
+    what, total = search.what, np.zeros((search.what.size, search.what.size))
     for test in search.candidates:
         total += search.mounting((test,))
-    information = np.eye(search.what.size) + _FOREVER * total
-    whole = COVERAGE * worst_u_mm(information, rows)
-    known = np.array([n.startswith("bar_length_") or n == LASER_SCALE for n in search.what.names])
-    free = COVERAGE * worst_u_mm(information + np.diag(np.where(known, _KNOWN, 0.0)), rows)
-    if free < 0.5 * whole:
-        return whole, "the calibration of the bars and the laser's wavelength: without a better scale no measurement comes below it"
-    return whole, "combinations of error motions that none of these measurements sees"
+    information, stated = np.eye(what.size) + _FOREVER * total, scale_temperature_mm2(what, rows)
+    scales = np.array([n.startswith("bar_length_") or n in (LASER_SCALE, BAR_SCALE) for n in what.names])
+    whole = uncertainty_mm(information, rows, stated)[0]
+    readings = uncertainty_mm(information, rows)[0]
+    unseen = uncertainty_mm(information + np.diag(np.where(scales, _KNOWN, 0.0)), rows)[0]
+    shares = {
+        "the temperature of the machine's scales, which no measurement tells for another day": whole**2 - readings**2,
+        "the calibration of the bars, their temperature and the laser's wavelength": readings**2 - unseen**2,
+        "combinations of error motions that none of these measurements sees": unseen**2,
+    }
+    return COVERAGE * whole, max(shares, key=lambda name: shares[name])
 
 
 def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, passes: int) -> tuple[Chosen, bool]:
@@ -96,4 +94,4 @@ def minutes_needed(search: Search, rows: F2, wanted_mm: float, start: Chosen, lo
 
 
 def _enough(search: Search, rows: F2, chosen: Chosen, wanted_mm: float) -> bool:
-    return COVERAGE * worst_u_mm(search.information(chosen), rows) <= wanted_mm
+    return COVERAGE * uncertainty_mm(search.information(chosen), rows, scale_temperature_mm2(search.what, rows))[0] <= wanted_mm

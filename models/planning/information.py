@@ -1,8 +1,8 @@
 """What one mounting tells about the machine: an information matrix over the unknowns that all mountings share.
 
-Shared are the smooth terms, the lost motion, the length of every bar and the laser's wavelength; cup, mirror tilts, zero and drift belong
-to one mounting and are marginalised (Schur complement with their priors). Every shared unknown counts in units of its prior standard
-deviation, so that the prior is the unit matrix.
+Shared are the smooth terms, the lost motion, the length of every bar, their temperature and the laser's wavelength; cup, mirror tilts, zero
+and drift belong to one mounting and are marginalised (Schur complement with their priors). Every shared unknown counts in units of its
+prior standard deviation, so that the prior is the unit matrix.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy import linalg
 from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from models.geometry.chain import design
-from models.machine import Machine
+from models.machine import AXES, Machine
 from models.planning.instruments import Instruments
 from models.planning.measurements import BAR_VALUES, HelixTest, Measurement, expected_run
 from models.solvers.observations import RunData
@@ -25,6 +25,7 @@ from models.solvers.priors import Priors, term_prior_sd
 from models.volumetric import rigid_design, volume_grid
 
 LASER_SCALE = "laser_scale"
+BAR_SCALE = "bar_temperature"
 PAUSE_S = 60.0
 """Between two runs of one mounting: drifts go on."""
 SEARCH_VALUES = 120
@@ -52,8 +53,9 @@ def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | N
     """Set up what a plan is about; ``order``: highest Legendre order of the error motions."""
     priors, terms = priors or Priors(), smooth_terms(order)
     bars = [bar_length_name(r) for r in sorted(tools.bar_lengths_mm)]
-    names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *bars, LASER_SCALE)
+    names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *bars, LASER_SCALE, BAR_SCALE)
     rest = [priors.backlash_mm] * 3 + [tools.u_bar_length_mm] * len(bars) + [tools.u_wavelength]
+    rest.append(tools.inputs.u_bar_temperature_k * tools.inputs.bar_expansion_per_k)
     return Problem(machine, tools, priors, terms, names, np.concatenate([term_prior_sd(machine, terms, priors), rest]))
 
 
@@ -99,6 +101,8 @@ def _shared_columns(what: Problem, run: RunData, full: F2, setup_names: tuple[st
     for i, name in enumerate(setup_names):
         if name in what.names:
             out[:, what.names.index(name)] = full[:, first + i]
+    if run.radius_mm is not None:  # a bar that is warmer than thought is longer in proportion
+        out[:, what.names.index(BAR_SCALE)] = full[:, first + setup_names.index(bar_length_name(run.radius_mm))] * run.radius_mm
     return np.asarray(out * what.prior_sd)
 
 
@@ -117,3 +121,27 @@ def field_rows(what: Problem, share: float, nodes: int) -> F2:
     out = np.zeros((g.shape[0], what.size))
     out[:, : len(what.terms)] = g - rigid @ (rigid.T @ g)
     return np.asarray(out * what.prior_sd)
+
+
+def scale_temperature_mm2(what: Problem, rows: F2) -> F1:
+    """Variance that scales of unknown temperature leave at each node of ``rows`` (`field_rows`), rigid motion free, shape (nodes,), mm^2.
+
+    As in the budget of a solution (`models.uncertainty.sources`): each axis by itself too long by expansion times temperature. No reading
+    tells, because it is about the days after the campaign.
+    """
+    slope = what.tools.inputs.u_scale_temperature_k * what.tools.inputs.scale_expansion_per_k
+    out = np.zeros(rows.shape[0])
+    for a, axis in enumerate(AXES):
+        i = what.names.index(f"E{axis}{axis}.1")
+        out += (rows[:, i] / what.prior_sd[i] * slope * what.machine.length_mm[a] / 2.0) ** 2
+    return np.asarray(out.reshape(-1, 3).sum(axis=1))
+
+
+def uncertainty_mm(information: F2, rows: F2, stated_mm2: F1 | float = 0.0) -> tuple[float, float]:
+    """Standard uncertainty of the deviation vector at the worst node and as root mean square over the nodes, mm.
+
+    ``stated_mm2``: variance on top of what readings and priors leave, at each node (`scale_temperature_mm2`).
+    """
+    half = linalg.solve_triangular(linalg.cholesky(information, lower=True), rows.T, lower=True)
+    v = (half**2).sum(axis=0).reshape(-1, 3).sum(axis=1) + stated_mm2
+    return float(np.sqrt(v.max())), float(np.sqrt(v.mean()))

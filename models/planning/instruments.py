@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from models.solvers.priors import U_WAVELENGTH
+from models.uncertainty.inputs import Inputs
 
 BAR_LENGTHS_MM = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 """Bars that exist as a bar with extensions."""
@@ -53,6 +54,10 @@ class Instruments:
         Relative standard uncertainty of the laser's wavelength, common to all laser runs.
     setup : SetupMinutes
         How long set-ups take.
+    max_feed_mm_min : float
+        Fastest feed of any measurement on the machine.
+    inputs : Inputs
+        How well temperatures of bars and scales are known; default: as in the budget of a solution.
     """
 
     bar_lengths_mm: tuple[float, ...] = BAR_LENGTHS_MM
@@ -63,11 +68,14 @@ class Instruments:
     u_bar_length_mm: float = 2e-3
     u_wavelength: float = U_WAVELENGTH
     setup: SetupMinutes = field(default_factory=SetupMinutes)
+    max_feed_mm_min: float = 6000.0
+    inputs: Inputs = field(default_factory=Inputs)
 
     def __post_init__(self) -> None:
         """Refuse what no instrument has, in one line."""
-        sizes = (*self.bar_lengths_mm, self.bar_noise_mm, self.laser_noise_mm, self.u_bar_length_mm, self.u_wavelength)
+        noise = (self.bar_noise_mm, self.laser_noise_mm)
+        sizes = (*self.bar_lengths_mm, *noise, self.u_bar_length_mm, self.u_wavelength, self.max_feed_mm_min)
         if not all(0 < v < float("inf") for v in sizes) or not 0 <= self.floor_mm < float("inf"):
-            raise ValueError("instruments: lengths, noise and uncertainties must be positive numbers")
+            raise ValueError("instruments: lengths, noise, uncertainties and feed must be positive numbers")
         if not self.bar_lengths_mm and not self.laser:
             raise ValueError("instruments: neither a ball-bar nor a laser")

@@ -32,13 +32,17 @@ _FINE = 8
 
 @dataclass(frozen=True, slots=True)
 class HelixTest:
-    """Ball-bar on a hemispherical helix about one cup, pole to equator or (direction -1) back. ``axis``: the vertical one."""
+    """Ball-bar on a hemispherical helix about one cup, pole to equator or (direction -1) back.
+
+    ``axis``, ``opens``: the pole stands on this axis, on its positive (1) or negative (-1) side of the cup: where the spindle is.
+    """
 
     centre_mm: Point
     radius_mm: float
     direction: int = 1
     turns: float = 5.0
     axis: int = 2
+    opens: int = 1
 
     @property
     def mounting(self) -> str:
@@ -107,19 +111,28 @@ def laser_path(machine: Machine, test: DiagonalTest | LineTest) -> tuple[F2, F1]
     return path, np.asarray((end - start) / np.linalg.norm(end - start))
 
 
-def _helix_path(test: HelixTest, n: int) -> F2:
+def helix_path(test: HelixTest, n: int) -> F2:
+    """Positions of a ball-bar test in the order of measuring, shape (n, 3), mm."""
     points = helix_points(np.array(test.centre_mm), test.radius_mm, turns=test.turns, n=n, law="area", axis=test.axis)
+    if test.opens < 0:  # seen in a mirror across the equator
+        points[:, test.axis] = 2.0 * test.centre_mm[test.axis] - points[:, test.axis]
     return points if test.direction > 0 else points[::-1]
 
 
-def machine_seconds(machine: Machine, test: Measurement) -> float:
+def feed_mm_min(tools: Instruments, test: Measurement) -> float:
+    """Feed along a test's path: the usual one, or the machine's fastest where that is less."""
+    return min(BAR_FEED_MM_MIN if isinstance(test, HelixTest) else RAPID_MM_MIN, tools.max_feed_mm_min)
+
+
+def machine_seconds(machine: Machine, test: Measurement, tools: Instruments) -> float:
     """Time the machine moves and reads for one test: out to the path, along it, reading; without any set-up."""
+    feed = feed_mm_min(tools, test)
     if isinstance(test, HelixTest):
-        length = np.linalg.norm(np.diff(_helix_path(test, 2000), axis=0), axis=1).sum()
-        return float(length / BAR_FEED_MM_MIN + test.radius_mm / RAPID_MM_MIN) * 60.0
+        length = np.linalg.norm(np.diff(helix_path(test, 2000), axis=0), axis=1).sum()
+        return float(length / feed + test.radius_mm / min(RAPID_MM_MIN, tools.max_feed_mm_min)) * 60.0
     path, _ = laser_path(machine, test)
     travel = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-    return float(travel / RAPID_MM_MIN * 60.0 + READING_S * len(path))
+    return float(travel / feed * 60.0 + READING_S * len(path))
 
 
 def expected_run(machine: Machine, test: Measurement, tools: Instruments, *, values: int = BAR_VALUES, start_s: float = 0.0) -> RunData:
@@ -128,22 +141,22 @@ def expected_run(machine: Machine, test: Measurement, tools: Instruments, *, val
     A ball-bar run comes as ``values`` block means on the sphere, each of ``weight_n`` readings; a laser run has one reading a position.
     """
     if isinstance(test, HelixTest):
-        return _expected_helix(machine, test, tools, values, start_s)
+        return _expected_helix(test, tools, values, start_s)
     path, beam = laser_path(machine, test)
     n = len(path)
     kind: Test = "diagonal" if isinstance(test, DiagonalTest) else "linear"
     moved = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1)])
-    t_s = start_s + np.cumsum(moved / RAPID_MM_MIN * 60.0 + READING_S)
+    t_s = start_s + np.cumsum(moved / feed_mm_min(tools, test) * 60.0 + READING_S)
     return RunData(test.label, test.mounting, "laser", path, np.zeros(n), travel_sign(path), t_s, np.ones(n), beam=beam, test=kind)
 
 
-def _expected_helix(machine: Machine, test: HelixTest, tools: Instruments, values: int, start_s: float) -> RunData:
-    fine = _helix_path(test, _FINE * values)
+def _expected_helix(test: HelixTest, tools: Instruments, values: int, start_s: float) -> RunData:
+    fine = helix_path(test, _FINE * values)
     sign = travel_sign(fine)[_FINE // 2 :: _FINE]
     points = fine[_FINE // 2 :: _FINE]
-    seconds = machine_seconds(machine, test) - test.radius_mm / RAPID_MM_MIN * 60.0
+    feed = feed_mm_min(tools, test)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])[_FINE // 2 :: _FINE]
-    weight = np.full(values, max(1.0, seconds * BAR_RATE_HZ / values))
+    weight = np.full(values, max(1.0, float(along[-1]) / feed * 60.0 * BAR_RATE_HZ / values))
     return RunData(
         test.label,
         test.mounting,
@@ -151,7 +164,7 @@ def _expected_helix(machine: Machine, test: HelixTest, tools: Instruments, value
         points,
         np.zeros(values),
         sign,
-        start_s + along / BAR_FEED_MM_MIN * 60.0,
+        start_s + along / feed * 60.0,
         weight,
         np.array(test.centre_mm),
         test.radius_mm,

@@ -1,7 +1,8 @@
 """Plan a campaign: which set-ups, in which order, what each of them buys in micrometres, and what the whole leaves open.
 
-The uncertainties stated here are the posterior (Bayesian Cramer-Rao) bound of the planned readings: what an estimator that knows noise,
-priors and set-up unknowns exactly could reach, and the joint solution does reach when the machine is as smooth as the priors say.
+The uncertainties stated here are the posterior (Bayesian Cramer-Rao) bound of the planned readings, the bars' temperature included, and on
+top of it the temperature of the scales, both as in the solution's own budget (`models.uncertainty.inputs`). Not in them: error motions
+above the planner's order, and that noise and typical sizes will be estimated from the readings.
 """
 
 from __future__ import annotations
@@ -10,19 +11,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
 
-from models.arrays import F2
 from models.machine import AXES, Machine
-from models.planning.candidates import candidates
-from models.planning.goal import Goal, limit, minutes_needed, shortest
-from models.planning.information import field_rows, problem
+from models.planning.candidates import candidates, opening
+from models.planning.goal import COVERAGE, Goal, limit, minutes_needed, shortest
+from models.planning.information import field_rows, problem, scale_temperature_mm2, uncertainty_mm
 from models.planning.instruments import Instruments
 from models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
 from models.planning.open_questions import not_observable
 from models.planning.search import Chosen, Search
 from models.solvers.observations import RunData
 from models.solvers.priors import Priors
+
+__all__ = ["Plan", "Step", "laid_out", "plan_campaign", "uncertainty_mm"]
 
 PLAN_ORDER = 8
 """Legendre order of the error motions a plan is judged with; orders above 6 fade in the prior."""
@@ -70,10 +71,14 @@ class Plan:
         What a perfect machine would record, deviations zero: positions, directions, times, weights of the block means.
     u_before_mm : (worst, mean)
         From the priors alone.
+    u_temperature_mm : float
+        What the temperature of the scales does at its worst node: part of every figure above, and nothing measured takes it away.
     open_questions : tuple of str
         What stays not observable, in words.
     goal : Goal or None
         What became of the wanted uncertainty, if one was given.
+    doubts : tuple of str
+        What the operator has to look at before anything moves.
     """
 
     machine: Machine
@@ -81,8 +86,10 @@ class Plan:
     steps: tuple[Step, ...]
     runs: tuple[RunData, ...]
     u_before_mm: tuple[float, float]
+    u_temperature_mm: float = 0.0
     open_questions: tuple[str, ...] = ()
     goal: Goal | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def recipes(self) -> tuple[Measurement, ...]:
@@ -117,9 +124,9 @@ def plan_campaign(
     minutes : float
         Set-up and machine time together.
     goal_mm : float, optional
-        Wanted expanded uncertainty U = 2 u (mm) at the worst node: a plan that reaches it is cut to the minutes that this takes.
+        Wanted expanded uncertainty U = 2 u (mm) at the worst node: a plan that reaches it ends with the step that does.
     vertical : int
-        Index of the vertical axis.
+        Index of the vertical axis: hemispheres open along it where the tool does not say where the spindle is.
     progress : callable
         Called with the share that is done, 0 to 1.
 
@@ -130,7 +137,8 @@ def plan_campaign(
     """
     if not 0 < minutes < np.inf or (goal_mm is not None and not 0 < goal_mm < np.inf):
         raise ValueError("planner: minutes and goal must be positive numbers")
-    search = searcher(machine, tools or Instruments(), priors, vertical, progress)
+    what = problem(machine, tools or Instruments(), PLAN_ORDER, priors)
+    search = Search(what, candidates(machine, what.tools, vertical), INNER_SHARE, progress)
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     if goal_mm is None:
         chosen, reached = search.exchange(search.best_fill(minutes), minutes, PASSES), False
@@ -138,7 +146,9 @@ def plan_campaign(
         chosen, reached = shortest(search, rows, goal_mm, minutes, PASSES)
     if not chosen:
         raise ValueError(f"planner: no measurement fits into {minutes:g} minutes")
-    plan = laid_out(search, chosen)
+    doubt = opening(machine, vertical).doubt
+    helices = any(isinstance(t, HelixTest) for tests in chosen.values() for t in tests)
+    plan = replace(laid_out(search, chosen, goal_mm if reached else None), doubts=(doubt,) if doubt and helices else ())
     if goal_mm is None:
         return plan
     floor_mm, limit_by = limit(search, rows)
@@ -149,22 +159,26 @@ def plan_campaign(
     return replace(plan, goal=Goal(goal_mm, reached, needed, floor_mm, limit_by))
 
 
-def searcher(
-    machine: Machine,
-    tools: Instruments,
-    priors: Priors | None = None,
-    vertical: int = 2,
-    progress: Callable[[float], None] = lambda _: None,
-) -> Search:
-    """The search that `plan_campaign` uses: all candidates, judged with the planner's order over the inner volume."""
-    return Search(problem(machine, tools, PLAN_ORDER, priors), candidates(machine, tools, vertical), INNER_SHARE, progress)
-
-
-def laid_out(search: Search, chosen: Chosen) -> Plan:
-    """A choice of measurements as a plan: ordered by gain per minute, named, with what each buys."""
+def laid_out(search: Search, chosen: Chosen, goal_mm: float | None = None) -> Plan:
+    """A choice of measurements as a plan: ordered by gain per minute, named, with what each buys; it ends where a goal is reached."""
+    machine, tools = search.what.machine, search.what.tools
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
+    stated = scale_temperature_mm2(search.what, rows)
+    steps = _steps(search, chosen)
+    enough = [k for k, s in enumerate(steps, start=1) if goal_mm is not None and COVERAGE * s.u_worst_mm <= goal_mm]
+    steps = steps[: enough[0]] if enough else steps
+    runs = tuple(
+        replace(expected_run(machine, s.test, tools, start_s=(s.until_min - s.minutes) * 60.0), label=s.label, setup=s.setup_id)
+        for s in steps
+    )
+    before = uncertainty_mm(np.eye(search.what.size), rows, stated)
+    return Plan(machine, tools, steps, runs, before, float(np.sqrt(stated.max())), not_observable(search.what, runs))
+
+
+def _steps(search: Search, chosen: Chosen) -> tuple[Step, ...]:
+    rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
+    stated = scale_temperature_mm2(search.what, rows)
     total = np.eye(search.what.size)
-    before = uncertainty_mm(total, rows)
     steps: list[Step] = []
     until = 0.0
     for number, name in enumerate(_in_order(search, chosen), start=1):
@@ -172,23 +186,10 @@ def laid_out(search: Search, chosen: Chosen) -> Plan:
         for k, test in enumerate(tests):
             minutes = search.cost_min(test, tests[:k])
             until += minutes
-            worst, mean = uncertainty_mm(total + search.mounting(tests[: k + 1]), rows)
+            worst, mean = uncertainty_mm(total + search.mounting(tests[: k + 1]), rows, stated)
             steps.append(Step(_label(test, number, k), f"S{number}", test, minutes, until, worst, mean))
         total += search.mounting(tests)
-    machine, tools = search.what.machine, search.what.tools
-    starts = [(s.until_min - s.minutes) * 60.0 for s in steps]
-    runs = tuple(
-        replace(expected_run(machine, s.test, tools, start_s=t), label=s.label, setup=s.setup_id)
-        for s, t in zip(steps, starts, strict=True)
-    )
-    return Plan(machine, tools, tuple(steps), runs, before, not_observable(search, chosen))
-
-
-def uncertainty_mm(information: F2, rows: F2) -> tuple[float, float]:
-    """Standard uncertainty of the deviation vector at the worst node and as root mean square over the nodes, mm."""
-    half = linalg.solve_triangular(linalg.cholesky(information, lower=True), rows.T, lower=True)
-    v = (half**2).sum(axis=0).reshape(-1, 3).sum(axis=1)
-    return float(np.sqrt(v.max())), float(np.sqrt(v.mean()))
+    return tuple(steps)
 
 
 def _in_order(search: Search, chosen: Chosen) -> list[str]:

@@ -1,7 +1,8 @@
 """Which measurements, in the minutes there are: greedy by gain per minute, then exchange passes.
 
 The criterion is I-optimal: the variance of the predicted, rigid-motion-free deviation over the inner volume, as a power mean over the
-nodes that leans on the worst node (power 1 would be the plain mean, an infinite power the worst node alone).
+nodes that leans on the worst node (power 1 would be the plain mean, an infinite power the worst node alone). What no choice of
+measurements changes (temperature of the scales) is left out of it.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class Search:
     def cost_min(self, test: Measurement, before: tuple[Measurement, ...]) -> float:
         """Minutes that a test takes after the others on its mounting."""
         if test not in self._machine_min:
-            self._machine_min[test] = machine_seconds(self.what.machine, test) / 60.0
+            self._machine_min[test] = machine_seconds(self.what.machine, test, self.what.tools) / 60.0
         return extra_minutes(self.what.tools.setup, self._machine_min[test], test, before)
 
     def total_min(self, chosen: Chosen) -> float:
@@ -133,7 +134,7 @@ class Search:
         for tests in chosen.values():
             last = tests[-1]
             if isinstance(last, HelixTest):
-                others = bars_that_fit(self.what.machine, self.what.tools, last.centre_mm, last.axis)
+                others = bars_that_fit(self.what.machine, self.what.tools, last)
                 found += [replace(last, radius_mm=r, direction=1) for r in others if r != last.radius_mm]
                 found.append(replace(last, direction=-last.direction))
         return [t for t in found if t not in self._known]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,7 +27,7 @@ def measure(
     machine: MachineArgument,
     recipe: Annotated[str, typer.Option(help=f"One of: {RECIPES}; or a recipe FILE.toml (`abbe plan` writes one).")] = "quick-check",
     helix: Annotated[str, typer.Option(help="Instead of a recipe: one ball-bar helix, X,Y,Z,RADIUS in mm.")] = "",
-    name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: recipe and time.")] = "",
+    name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
     rate_hz: Annotated[int, typer.Option(help="Ball-bar samples per second; must divide 1000.")] = 100,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would move and how long it takes; move nothing.")] = False,
     path: Annotated[bool, typer.Option("--path", help="With --dry-run: every commanded position, as CSV.")] = False,
@@ -35,15 +36,15 @@ def measure(
     from service.cli.running import run_job
     from service.clock import SystemClock
     from service.config import load_machine
-    from service.sequences.check import dry_run_campaign
+    from service.sequences.check import dry_run_campaign, paced
     from service.site import site_of
     from service.storage.store import Store
     from service.workflows import measure as workflow
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
-    what = "helix" if helix else Path(recipe).stem
-    plan = _plan(site.machine, recipe, helix, rate_hz, name or f"{what} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
+    plan = _plan(site.machine, recipe, helix, rate_hz)
+    plan = replace(paced(plan, site.max_feed_mm_min), name=name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     if dry_run:
         print_path(plan) if path else print_dry_run(plan.name, runs)
@@ -113,7 +114,8 @@ async def ready_session(store: Store, site: Site) -> AsyncIterator[Session]:
         yield session
 
 
-def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int, name: str) -> CampaignPlan:
+def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int) -> CampaignPlan:
+    """The campaign, named after its recipe."""
     from service.errors import ConfigError
     from service.sequences.campaigns import identification, quick_check, verification
     from service.sequences.recipes import Helix
@@ -126,15 +128,16 @@ def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int, name: str) ->
             x, y, z, radius = (float(v) for v in helix.split(","))
         except ValueError:
             raise ConfigError(f"--helix {helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
-        return CampaignPlan(name, (Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz).plan(machine),))
+        return CampaignPlan("helix", (Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz).plan(machine),))
     plans = {"identification": identification, "verification": verification, "quick-check": quick_check}
     if recipe.endswith(".toml"):
         from service.sequences.recipe_file import read_recipe
 
-        return CampaignPlan(name, tuple(r.plan(machine) for r in read_recipe(Path(recipe))[1]))
+        name, recipes = read_recipe(Path(recipe))
+        return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
     if recipe not in plans:
         raise ConfigError(f"there is no recipe {recipe!r}", f"use one of: {RECIPES}, or a FILE.toml")
-    return plans[recipe](machine, rate_hz=rate_hz, name=name)
+    return plans[recipe](machine, rate_hz=rate_hz, name=recipe)
 
 
 def print_path(plan: CampaignPlan) -> None:

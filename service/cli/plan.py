@@ -36,29 +36,50 @@ def plan(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from service.cli.progress import display
     from service.config import load_machine
+    from service.report.page_file import write_page
     from service.site import site_of
-    from service.workflows.plan import plan_doc, plan_for, plan_page, write_text
+    from service.workflows.plan import plan_doc, plan_for, plan_page
     from service.workflows.plan_instruments import read_instruments
 
     site = site_of(load_machine(machine).machine)
     tools = read_instruments(instruments)
+    _check_targets((out, picture), (machine, instruments))
     with display() as sink:
         planned = plan_for(site, minutes=minutes, goal_um=goal_um, tools=tools, progress=sink)
     if out is not None:
-        write_text(out, planned.text)
+        write_page(planned.text, out)
     if picture is not None:
-        write_text(picture, plan_page(site, planned))
+        write_page(plan_page(site, planned), picture)
     if as_json:
         print_json(plan_doc(planned))
         return
     _print(planned, out, picture)
 
 
+def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:
+    """Before half a minute of planning: no folder, nothing that is read here, no file twice."""
+    from service.errors import ConfigError
+
+    taken = [p.resolve() for p in sources if p is not None]
+    for target in targets:
+        if target is None:
+            continue
+        if target.is_dir() or not target.parent.is_dir():
+            wrong = "is a folder" if target.is_dir() else f"cannot be written: {target.parent} is no folder"
+            raise ConfigError(f"{target}: {wrong}", "give the name of a file in a folder that exists")
+        if target.resolve() in taken:
+            raise ConfigError(f"{target}: would overwrite a file that this command reads or writes", "give another name")
+        taken.append(target.resolve())
+
+
 def _print(planned: Planned, out: Path | None, picture: Path | None) -> None:
-    from service.workflows.plan import BOUND_NOTE, goal_words, step_rows
+    from service.workflows.plan import BOUND_NOTE, goal_words, step_rows, temperature_words
 
     print_table(HEADINGS, step_rows(planned.plan), f"{planned.plan.minutes:.0f} minutes, set-ups included")
     typer.echo(BOUND_NOTE)
+    typer.echo(temperature_words(planned.plan))
+    for line in planned.notes:
+        typer.echo(f"note: {line}")
     for line in goal_words(planned.plan):
         typer.echo(line)
     typer.echo("this campaign cannot tell:")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from models.machine import AXES, Machine
@@ -20,6 +20,7 @@ from service.sequences.steps import (
     ReadLaser,
     RecordPath,
     Step,
+    TakeBarOut,
     TestPlan,
     Unmount,
     ZeroLaser,
@@ -61,7 +62,7 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
             return length / feed * 60.0, points[-1]
         case ReadLaser(_, settle):
             return settle + 0.1, here
-        case MountBar() | ChangeBar() | MountLaser() | Unmount() | ZeroLaser():
+        case MountBar() | TakeBarOut() | ChangeBar() | MountLaser() | Unmount() | ZeroLaser():
             return MOUNT_S, here
 
 
@@ -91,6 +92,18 @@ def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
                 )
             lo[a], hi[a] = min(lo[a], p[a]), max(hi[a], p[a])
     return (lo[0], lo[1], lo[2]), (hi[0], hi[1], hi[2])
+
+
+def paced(plan: CampaignPlan, max_feed_mm_min: float) -> CampaignPlan:
+    """The same campaign, moving between readings no faster than the machine file allows.
+
+    Positions are read at standstill: a slower way there changes no reading. A path that is recorded keeps the feed of its recipe.
+    """
+
+    def slowed(step: Step) -> Step:
+        return replace(step, feed_mm_min=min(step.feed_mm_min, max_feed_mm_min)) if isinstance(step, MoveTo) else step
+
+    return replace(plan, tests=tuple(replace(t, steps=tuple(slowed(s) for s in t.steps)) for t in plan.tests))
 
 
 def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> DryRun:

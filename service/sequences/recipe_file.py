@@ -44,9 +44,12 @@ class HelixTable(_Table):
     turns: Annotated[float, Field(ge=3.0, le=50.0)] = 5.0
     law: Literal["area", "angle"] = "area"
     axis: Literal["X", "Y", "Z"] = "Z"
+    opens: Literal[1, -1] = 1
     direction: Literal[1, -1] = 1
     feed_mm_min: Feed = 2000.0
     rate_hz: Annotated[int, Field(ge=1, le=1000)] = 100
+    length_calibrated: bool = True
+    u_length_mm: Annotated[float, Field(ge=0.0, le=1.0)] = 0.002
 
     @field_validator("rate_hz")
     @classmethod
@@ -69,6 +72,9 @@ class HelixTable(_Table):
             feed_mm_min=self.feed_mm_min,
             direction=self.direction,
             rate_hz=self.rate_hz,
+            opens=self.opens,
+            length_calibrated=self.length_calibrated,
+            u_length_mm=self.u_length_mm,
         )
 
 
@@ -179,6 +185,8 @@ def _config_error(source: str, errors: list[ErrorDetails]) -> ConfigError:
     if first["type"] == "extra_forbidden":
         valid = KINDS[str(first["loc"][2])] if len(first["loc"]) > 3 else RecipeFile
         return ConfigError(f"{source}: unknown key {where(place)!r}{tail}", nearest(str(place[-1]), list(valid.model_fields)))
+    if first["type"] == "union_tag_not_found":
+        return ConfigError(f"{source}: key {where((*place, 'kind'))!r} is missing{tail}", f"add kind = {' or '.join(map(repr, KINDS))}")
     if first["type"] == "missing":
         return ConfigError(f"{source}: key {where(place)!r} is missing{tail}", f"add {place[-1]} = ...")
     return ConfigError(f"{source}: {where(place)}: {expected(first)}{tail}", "correct it; docs/how-to/plan.md describes every key")
@@ -207,6 +215,7 @@ def _table(recipe: Recipe) -> dict[str, Any]:
     if isinstance(recipe, Helix):
         own = {"centre_mm": list(recipe.centre_mm), "radius_mm": recipe.radius_mm, "turns": recipe.turns, "law": recipe.law}
         own |= {"axis": AXES[recipe.axis], "direction": recipe.direction, "feed_mm_min": recipe.feed_mm_min, "rate_hz": recipe.rate_hz}
+        own |= {"opens": recipe.opens, "length_calibrated": recipe.length_calibrated, "u_length_mm": recipe.u_length_mm}
         return {"kind": "helix", **common, **own}
     laser = {"feed_mm_min": recipe.feed_mm_min, "settle_s": recipe.settle_s}
     if isinstance(recipe, Diagonal):

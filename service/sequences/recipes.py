@@ -26,6 +26,7 @@ from service.sequences.steps import (
     ReadLaser,
     RecordPath,
     Step,
+    TakeBarOut,
     TestPlan,
     Unmount,
     ZeroLaser,
@@ -56,7 +57,9 @@ class Helix:
     polyline then runs chord^2 / (8 radius) inside the sphere, and by the area law radius / (4 n) beside the pole: with 750 mm, 1.3 and
     23 um. That costs no accuracy: columns and solvers take the commanded position on the polyline, not on the sphere.
     ``mount`` and ``unmount`` are false where two helices in a row share one set-up: the second does not mount, the first leaves the bar.
-    ``change_bar``: the second has another radius; the cup stays, the bar is changed.
+    ``change_bar``: the second has another radius; the cup stays, the bar is taken out before the machine moves and the other one is hung in
+    where its path starts. ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
+    ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: nobody measured it.
     """
 
     label: str
@@ -74,6 +77,9 @@ class Helix:
     mount: bool = True
     unmount: bool = True
     change_bar: bool = False
+    opens: Literal[1, -1] = 1
+    length_calibrated: bool = True
+    u_length_mm: float = 0.002
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: to the centre, mount, out to the path's start, record the path, clear away.
@@ -91,13 +97,19 @@ class Helix:
         length = 2 * np.pi * self.radius_mm * self.turns
         n = min(max(64, int(length / self.chord_mm)), MAX_PATH_POINTS)
         points = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=n, law=self.law, axis=self.axis)
+        if self.opens < 0:  # seen in a mirror across the equator
+            points[:, self.axis] = 2.0 * self.centre_mm[self.axis] - points[:, self.axis]
+        pole = as_point(points[0])
         path = tuple(as_point(p) for p in (points if self.direction > 0 else points[::-1]))
+        start = MoveTo(_before(path, machine), RAPID_MM_MIN)
         steps: list[Step] = []
         if self.mount:
-            steps += [MoveTo(self.centre_mm, RAPID_MM_MIN), MountBar(self.radius_mm)]
-        elif self.change_bar:
-            steps.append(ChangeBar(self.radius_mm))
-        steps += [MoveTo(_before(path, machine), RAPID_MM_MIN), MoveTo(path[0], self.feed_mm_min)]
+            steps += [MoveTo(self.centre_mm, RAPID_MM_MIN), MountBar(self.radius_mm), start]
+        elif self.change_bar:  # by way of the pole: straight from equator to equator leads through the cup
+            steps += [TakeBarOut(), MoveTo(pole, RAPID_MM_MIN), start, ChangeBar(self.radius_mm)]
+        else:
+            steps.append(start)
+        steps.append(MoveTo(path[0], self.feed_mm_min))
         steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction))
         if self.unmount:
             steps.append(Unmount())
@@ -106,8 +118,8 @@ class Helix:
             "centre_mm": list(self.centre_mm),
             "radius_mm": self.radius_mm,
             "turns": self.turns,
-            "length_calibrated": True,
-            "u_length_mm": 0.002,
+            "length_calibrated": self.length_calibrated,
+            "u_length_mm": self.u_length_mm,
             "tool_mm": [float(v) for v in machine.tool_mm],
         }
         return TestPlan(self.label, "ballbar_helix", self.role, setup, tuple(steps))

@@ -12,7 +12,19 @@ from service.errors import MeasurementFault, UnsafeToMove
 from service.runs.recorder import Recorder
 from service.sequences.check import step_seconds
 from service.sequences.guard import motion_guard
-from service.sequences.steps import ChangeBar, MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, Step, TestPlan, Unmount, ZeroLaser
+from service.sequences.steps import (
+    ChangeBar,
+    MountBar,
+    MountLaser,
+    MoveTo,
+    ReadLaser,
+    RecordPath,
+    Step,
+    TakeBarOut,
+    TestPlan,
+    Unmount,
+    ZeroLaser,
+)
 
 ESTOP, DOOR, ALARM, REMOTE, REFERENCED, DRIVES, HOLD, PATH, PROGRAM = 0, 1, 2, 3, 4, 5, 8, 9, 11
 FORBIDDEN = (
@@ -28,7 +40,7 @@ BAD_IN_A_ROW = 25
 SYNC, BAD_BITS = 0b1000, 0b10101
 COMPENSATED = 3
 
-BY_HAND = MountBar | ChangeBar | MountLaser | Unmount
+BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
 Tick = Callable[[float, float], None]
 """Called after each step: planned machine seconds done so far in the test, and wall seconds that this step waited for a person."""
 
@@ -84,6 +96,8 @@ class Runner:
                 await self._move(target, feed, here)
             case MountBar(radius):
                 await self._s.need_fixture().mount_ballbar(radius)
+            case TakeBarOut():
+                await self._s.need_fixture().take_out_ballbar()
             case ChangeBar(radius):
                 await self._s.need_fixture().change_ballbar(radius)
             case MountLaser(beam):

@@ -42,7 +42,7 @@ def shared_setups(recipes: tuple[Recipe, ...], source: str) -> tuple[Recipe, ...
 def _check_shared(before: Recipe, after: Recipe, source: str) -> None:
     trouble = ""
     if isinstance(before, Helix) and isinstance(after, Helix):
-        if before.centre_mm != after.centre_mm or before.axis != after.axis:
+        if before.centre_mm != after.centre_mm or (before.axis, before.opens) != (after.axis, after.opens):
             trouble = "another centre or axis needs another cup"
         elif before.radius_mm == after.radius_mm and before.direction == after.direction:
             trouble = "with the same bar the second helix must run back (direction): the bar cannot follow a move through its sphere"

@@ -26,8 +26,13 @@ class MountBar:
 
 
 @dataclass(frozen=True, slots=True)
+class TakeBarOut:
+    """The bar is taken out, before the machine moves off its sphere; the cup stays where it stands."""
+
+
+@dataclass(frozen=True, slots=True)
 class ChangeBar:
-    """The cup stays where it stands; the bar is taken out and another one hung in."""
+    """Another bar is hung in at the cup that stands; the machine stands at the start of its path."""
 
     radius_mm: float
 
@@ -67,7 +72,7 @@ class RecordPath:
     direction: int
 
 
-Step = MoveTo | MountBar | ChangeBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath
+Step = MoveTo | MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,34 +11,40 @@ from models.arrays import F1, F2
 from models.machine import AXES
 from models.planning.goal import COVERAGE
 from models.planning.instruments import Instruments
-from models.planning.measurements import DiagonalTest, HelixTest, Measurement
+from models.planning.measurements import DiagonalTest, HelixTest, Measurement, feed_mm_min
 from models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, Step, plan_campaign
-from service.errors import ConfigError, FileFormatError
+from service.errors import ConfigError
 from service.events import Progress, ProgressSink, ignore_progress
 from service.report.plan_page import PlanPage, render_plan
 from service.report.plots.setups import SetupPath, setups_picture
-from service.sequences.check import DryRun, dry_run_campaign
+from service.sequences.check import DryRun, dry_run_campaign, paced
 from service.sequences.recipe_file import recipe_text
 from service.sequences.recipes import Diagonal, Helix, Linear, Recipe
 from service.sequences.setups import shared_setups
 from service.sequences.steps import CampaignPlan
 from service.site import Site
+from service.workflows.plan_instruments import at_this_machine
 
 BOUND_NOTE = (
-    "u is the posterior (Bayesian Cramer-Rao) bound of these readings over the inner 80 % of the volume, rigid motion taken out: "
-    "no estimator can state less from them with these priors"
+    "U is the posterior (Bayesian Cramer-Rao) bound of these readings over the inner 80 % of the volume, rigid motion taken out, and the "
+    "temperature of the scales; left out are error motions above the plan's order and that noise and typical sizes are estimated: "
+    "`abbe solve` states both, so its U may be larger; on a machine better than the priors it is smaller"
 )
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan with what the sequencer makes of it: recipes, campaign, dry run of every test, and the recipe file's text."""
+    """A plan with what the sequencer makes of it: recipes, campaign, dry run of every test, and the recipe file's text.
+
+    ``notes``: what a person has to know before it runs.
+    """
 
     plan: Plan
     recipes: tuple[Recipe, ...]
     campaign: CampaignPlan
     dry: tuple[DryRun, ...]
     text: str
+    notes: tuple[str, ...]
 
 
 def plan_for(
@@ -57,7 +62,7 @@ def plan_for(
     ConfigError
         Nothing can be planned: minutes too few, strokes too small, numbers impossible.
     StrokeError
-        The dry run refuses what was planned, e.g. because the machine file allows less feed.
+        The dry run refuses what was planned.
     """
 
     def tick(share: float) -> None:
@@ -65,21 +70,25 @@ def plan_for(
 
     vertical = AXES.index(str(site.doc.get("vertical_axis", "Z")))
     goal_mm = None if goal_um is None else goal_um * 1e-3
+    tools, said = at_this_machine(tools or Instruments(), site)
     try:
         plan = plan_campaign(site.machine, minutes=minutes, goal_mm=goal_mm, tools=tools, vertical=vertical, progress=tick)
     except ValueError as error:
-        raise ConfigError(str(error), "give more --minutes, shorter --bars, or check stroke_mm in the machine file") from None
+        raise ConfigError(
+            str(error), "give more --minutes, shorter bar_lengths_mm (--instruments), or check stroke_mm in the machine file"
+        ) from None
     name = f"plan {plan.minutes:.0f} min"
-    recipes = shared_setups(tuple(recipe_of(s) for s in plan.steps), name)
-    campaign = CampaignPlan(name, tuple(r.plan(site.machine) for r in recipes))
+    recipes = shared_setups(tuple(recipe_of(s, tools) for s in plan.steps), name)
+    campaign = paced(CampaignPlan(name, tuple(r.plan(site.machine) for r in recipes)), site.max_feed_mm_min)
     dry = dry_run_campaign(site.machine, campaign, site.max_feed_mm_min)
     note = f"for {site.name}, {plan.minutes:.0f} minutes with set-ups; expected worst U {_um(COVERAGE * plan.u_worst_mm)} um"
-    return Planned(plan, recipes, campaign, dry, recipe_text(name, recipes, note))
+    return Planned(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*said, *plan.doubts))
 
 
-def recipe_of(step: Step) -> Recipe:
-    """The sequencer's recipe for a planned measurement."""
+def recipe_of(step: Step, tools: Instruments) -> Recipe:
+    """The sequencer's recipe for a planned measurement with these instruments."""
     test: Measurement = step.test
+    feed = feed_mm_min(tools, test)
     if isinstance(test, HelixTest):
         return Helix(
             step.label,
@@ -89,11 +98,14 @@ def recipe_of(step: Step) -> Recipe:
             test.radius_mm,
             turns=test.turns,
             axis=test.axis,
+            feed_mm_min=feed,
             direction=1 if test.direction > 0 else -1,
+            opens=1 if test.opens > 0 else -1,
+            u_length_mm=tools.u_bar_length_mm,
         )
     if isinstance(test, DiagonalTest):
-        return Diagonal(step.label, step.setup_id, "identify", test.diagonal, test.steps, test.order)
-    return Linear(step.label, step.setup_id, "identify", test.axis, n=test.n, at=test.at)
+        return Diagonal(step.label, step.setup_id, "identify", test.diagonal, test.steps, test.order, feed_mm_min=feed)
+    return Linear(step.label, step.setup_id, "identify", test.axis, n=test.n, at=test.at, feed_mm_min=feed)
 
 
 def words(test: Measurement) -> str:
@@ -106,6 +118,15 @@ def words(test: Measurement) -> str:
     others = [a for a in range(3) if a != test.axis]
     at = ", ".join(f"{AXES[a]} at {100 * s:.0f} %" for a, s in zip(others, test.at, strict=True))
     return f"laser along {AXES[test.axis]}, {at} of the stroke"
+
+
+def temperature_words(plan: Plan) -> str:
+    """What part of U no measurement takes away."""
+    inputs = plan.tools.inputs
+    return (
+        f"in every U: scales known to {inputs.u_scale_temperature_k:g} K ({inputs.scale_expansion_per_k * 1e6:g} µm/m/K), "
+        f"which alone make U = {_um(COVERAGE * plan.u_temperature_mm)} µm"
+    )
 
 
 def goal_words(plan: Plan) -> list[str]:
@@ -142,11 +163,13 @@ def plan_page(site: Site, planned: Planned) -> str:
         SetupPath(int(s.setup_id.removeprefix("S")), _kind(s.test), words(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
         for s, run in zip(plan.steps, plan.runs, strict=True)
     ]
-    lead = (f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_words(plan))
+    lead = (f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_words(plan), *planned.notes)
     headings = ("No", "Label", "Measurement", "min", "until min", "worst U µm", "mean U µm")
     picture = setups_picture(site.machine.stroke_mm, paths)
     rows = tuple(step_rows(plan))
-    return render_plan(PlanPage("Planned measurements", lead, headings, rows, BOUND_NOTE, plan.open_questions, picture))
+    return render_plan(
+        PlanPage("Planned measurements", lead, headings, rows, f"{BOUND_NOTE}. {temperature_words(plan)}", plan.open_questions, picture)
+    )
 
 
 def _kind(test: Measurement) -> str:
@@ -155,23 +178,6 @@ def _kind(test: Measurement) -> str:
 
 def _mount_mm(test: Measurement, path_mm: F2) -> F1:
     return np.array(test.centre_mm) if isinstance(test, HelixTest) else path_mm[0]
-
-
-def write_text(target: Path, text: str) -> None:
-    """Write a file beside its place and move it there: a reader sees the old file or the whole new one.
-
-    Raises
-    ------
-    FileFormatError
-        The file cannot be written.
-    """
-    aside = target.with_name(f".{target.name}.part")
-    try:
-        aside.write_text(text, encoding="utf-8")
-        aside.replace(target)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a folder that may be written") from None
 
 
 def plan_doc(planned: Planned) -> dict[str, Any]:
@@ -195,6 +201,8 @@ def plan_doc(planned: Planned) -> dict[str, Any]:
         "model": f"rigid21/legendre{PLAN_ORDER}",
         "inner_share": INNER_SHARE,
         "bound": BOUND_NOTE,
+        "u_scale_temperature_um": plan.u_temperature_mm * 1e3,
+        "notes": list(planned.notes),
         "before": {"u_worst_um": plan.u_before_mm[0] * 1e3, "u_mean_um": plan.u_before_mm[1] * 1e3},
         "steps": steps,
         "u_worst_um": plan.u_worst_mm * 1e3,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from models.planning.instruments import BAR_LENGTHS_MM, Instruments, SetupMinute
 from service.config import read_toml
 from service.errors import ConfigError
 from service.explain import expected, nearest, where
+from service.site import Site
 
 USUAL = SetupMinutes()
 Micrometres = Annotated[float, Field(gt=0.0, le=1000.0)]
@@ -55,7 +57,7 @@ def read_instruments(path: Path | None) -> Instruments:
         return Instruments()
     if not path.exists():
         raise ConfigError(f"instruments file {path} does not exist", "docs/how-to/plan.md shows one")
-    content = read_toml(path)
+    content = read_toml(path, "instruments file")
     try:
         found = InstrumentsFile.model_validate_json(json.dumps(content, default=str), strict=True)
         times = SetupMinutes(found.setup.cup_min, found.setup.bar_min, found.setup.line_min, found.setup.diagonal_min)
@@ -76,3 +78,29 @@ def read_instruments(path: Path | None) -> Instruments:
         raise ConfigError(f"{path}: {where(place)}: {expected(first)}", "correct it; docs/how-to/plan.md shows a file") from None
     except ValueError as error:
         raise ConfigError(f"{path}: {error}", "give bar_lengths_mm or laser = true") from None
+
+
+def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[str, ...]]:
+    """What of the instruments a machine can use, and what is left out, in words.
+
+    A machine file that names a ball-bar or a laser under ``[devices]`` has no other; one that names neither is planned with all.
+
+    Raises
+    ------
+    ConfigError
+        Nothing is left.
+    """
+    tools = replace(tools, max_feed_mm_min=site.max_feed_mm_min)
+    has_bar, has_laser = site.urls.ballbar is not None, site.urls.laser is not None
+    if not has_bar and not has_laser:
+        return tools, ()
+    said = []
+    if tools.laser and not has_laser:
+        said.append("planned without laser: the machine file names none under [devices]")
+    if tools.bar_lengths_mm and not has_bar:
+        said.append("planned without ball-bar: the machine file names none under [devices]")
+    try:
+        return replace(tools, laser=tools.laser and has_laser, bar_lengths_mm=tools.bar_lengths_mm if has_bar else ()), tuple(said)
+    except ValueError:
+        remedy = "correct the instruments file, or name under [devices] what it lists"
+        raise ConfigError(f"nothing to measure with: {'; '.join(said)}", remedy) from None

@@ -48,6 +48,7 @@ class BallbarDevice:
         self._next = 0
         self._cup_mm: F | None = None
         self._radius_mm = 0.0
+        self._bar_in = False
         self._mounts = 0
         self._noise = generator(draws.seed, STREAM_BAR_NOISE)
         self._taken: list[_Taken] = []
@@ -63,20 +64,26 @@ class BallbarDevice:
         direction = rng.normal(size=3)
         offset_mm = rng.uniform(*self._sizes.cup_offset_um) * 1e-3
         self._cup_mm = tool_mm + direction / np.linalg.norm(direction) * offset_mm
-        self._radius_mm = radius_mm
+        self._radius_mm, self._bar_in = radius_mm, True
+
+    def take_out(self) -> bool:
+        """Take the bar out; the cup stays. False: no cup stands."""
+        self.settle()
+        self._bar_in = False
+        return self._cup_mm is not None
 
     def change(self, radius_mm: float) -> bool:
         """Hang the bar of another nominal length in; the cup stays. False: no cup stands."""
         self.settle()
         if self._cup_mm is None:
             return False
-        self._radius_mm = radius_mm
+        self._radius_mm, self._bar_in = radius_mm, True
         return True
 
     def unmount(self) -> None:
         """Take the bar away."""
         self.settle()
-        self._cup_mm = None
+        self._cup_mm, self._bar_in = None, False
 
     # ---- commands ------------------------------------------------------------------------------------------------
 
@@ -135,7 +142,7 @@ class BallbarDevice:
         noise = self._noise.normal(size=len(seq)) * self._draws.bar_noise_mm
         status = np.where(sync, SYNC, 0)
         reading_mm = np.zeros(len(seq))
-        if self._cup_mm is None:
+        if self._cup_mm is None or not self._bar_in:
             status |= NO_BAR
         else:
             distance = np.linalg.norm(self._locate(time_us * 1e-6, axes_mm) - self._cup_mm, axis=1)

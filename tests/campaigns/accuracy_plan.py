@@ -6,8 +6,7 @@ import numpy as np
 
 from models.geometry.chain import travel_sign
 from models.machine import Machine
-from models.paths.helix import helix_points
-from models.planning.measurements import HelixTest
+from models.planning.measurements import HelixTest, helix_path
 from models.planning.plan import Plan, Step, plan_campaign
 from models.solvers.observations import RunData, block_average
 from simulators.campaign.sampler import Conditions, Rig
@@ -35,8 +34,7 @@ def _run(rig: Rig, step: Step, expected: RunData, cups: dict[str, np.ndarray], m
         return replace(expected, deviation_mm=_laser(rig, expected, mounts))
     test = step.test
     n = int(expected.weight_n.sum())
-    path = helix_points(np.array(test.centre_mm), test.radius_mm, turns=test.turns, n=n, law="area", axis=test.axis)
-    path = path if test.direction > 0 else path[::-1]
+    path = helix_path(test, n)
     if expected.setup not in cups:
         cups[expected.setup] = rig.cup(np.array(test.centre_mm))
     t_s = np.linspace(expected.t_s[0], expected.t_s[-1], n)

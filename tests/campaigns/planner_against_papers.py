@@ -1,8 +1,9 @@
 """The planner's campaign against the papers' fixed ones, for the same minutes: `python -m tests.campaigns.planner_against_papers`.
 
 Yang: one helix; helices about five origins with two radii each. Wang: four step diagonals. Both together. Everything is judged alike: the
-same noise, priors, time model (shared cups included), Legendre order and nodes. The papers' bars are as long as fits, up to the planner's
-longest. Where too little time leaves the planner no choice, the best of all mountings that fit into it is tried out: no plan can do better.
+same noise, priors, time model (shared cups included), Legendre order and nodes; temperatures, which add the same to both, are left out.
+The papers' bars are as long as fits, up to the planner's longest. Where too little time leaves the planner no choice, the best of all
+mountings that fit into it is tried out: no plan can do better.
 """
 
 from __future__ import annotations
@@ -16,18 +17,20 @@ import numpy as np
 from models.geometry.chain import all_chains
 from models.machine import Machine
 from models.paths.lines import DIAGONALS
-from models.planning.candidates import BAR_CLEARANCE_MM
+from models.planning.candidates import BAR_CLEARANCE_MM, candidates
 from models.planning.information import field_rows, problem
 from models.planning.instruments import Instruments
 from models.planning.measurements import DiagonalTest, HelixTest
-from models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, searcher, uncertainty_mm
+from models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, uncertainty_mm
 from models.planning.search import Chosen, Search
+from models.uncertainty.inputs import Inputs
 
 STROKES = ((600.0, 500.0, 450.0), (812.8, 495.0, 508.0), (1000.0, 600.0, 500.0), (400.0, 400.0, 300.0), (1500.0, 800.0, 700.0))
 TRAVEL_MM = np.array([812.8, 495.0, 508.0])
 OFFSETS_MM = ((0.0, 0.0), (-200.0, -75.0), (-200.0, 75.0), (200.0, -75.0), (200.0, 75.0))
 """Yang's origins across the hemisphere's axis, on his machine (math.md 4.3: the centre and four about it), scaled to other strokes."""
 RADII_MM = (175.0, 100.0)
+TOOLS = Instruments(inputs=Inputs().of_the_data_alone())
 CAMPAIGNS = ("one helix", "5 origins x 2 radii", "4 step diagonals", "both")
 
 
@@ -87,11 +90,11 @@ def paper_campaign(machine: Machine, name: str) -> Chosen:
 
 def compare(machine: Machine, name: str) -> Comparison:
     """One paper's campaign against the planner's on one machine."""
-    paper = Search(problem(machine, Instruments(bar_lengths_mm=paper_bars(machine)), PLAN_ORDER), (), INNER_SHARE)
+    paper = Search(problem(machine, replace(TOOLS, bar_lengths_mm=paper_bars(machine)), PLAN_ORDER), (), INNER_SHARE)
     chosen = paper_campaign(machine, name)
     minutes = paper.total_min(chosen)
     theirs = uncertainty_mm(paper.information(chosen), field_rows(paper.what, INNER_SHARE, REPORT_NODES))[0]
-    ours = plan_campaign(machine, minutes=minutes)
+    ours = plan_campaign(machine, minutes=minutes, tools=TOOLS)
     assert ours.minutes <= minutes + 1e-9
     best = best_mounting(machine, minutes) if name == "one helix" else None
     return Comparison(name, minutes, theirs * 1e3, ours.u_worst_mm * 1e3, best)
@@ -99,7 +102,7 @@ def compare(machine: Machine, name: str) -> Comparison:
 
 def best_mounting(machine: Machine, minutes: float) -> float:
     """Smallest worst-point uncertainty of all mountings that fit into the minutes, with up to three tests each, um: tried one by one."""
-    search = searcher(machine, Instruments())
+    search = Search(problem(machine, TOOLS, PLAN_ORDER), candidates(machine, TOOLS), INNER_SHARE)
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     layer: list[Chosen] = [{t.mounting: (t,)} for t in search.candidates if search.cost_min(t, ()) <= minutes]
     found = []

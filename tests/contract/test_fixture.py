@@ -57,16 +57,18 @@ async def fixture(peer) -> AsyncIterator[RemoteFixture]:
 
 async def test_all_operations(peer, fixture):
     await fixture.mount_ballbar(150.0)
+    await fixture.take_out_ballbar()
     await fixture.change_ballbar(100.0)
     await fixture.mount_laser((0.6, 0.0, 0.8))
     await fixture.unmount()
     assert await fixture.identify() == "peer"
     assert peer.asked == [
         {"id": 1, "op": "mount_ballbar", "radius_mm": 150.0},
-        {"id": 2, "op": "change_ballbar", "radius_mm": 100.0},
-        {"id": 3, "op": "mount_laser", "beam": [0.6, 0.0, 0.8]},
-        {"id": 4, "op": "unmount"},
-        {"id": 5, "op": "identify"},
+        {"id": 2, "op": "take_out_ballbar"},
+        {"id": 3, "op": "change_ballbar", "radius_mm": 100.0},
+        {"id": 4, "op": "mount_laser", "beam": [0.6, 0.0, 0.8]},
+        {"id": 5, "op": "unmount"},
+        {"id": 6, "op": "identify"},
     ]
 
 

@@ -1,5 +1,7 @@
 """Recipe files: what is written is read back the same; what cannot run is refused in one line; the plan is what the sequencer moves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,14 +14,15 @@ from models.planning.instruments import Instruments
 from models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
 from models.planning.plan import Step
 from service.cli.app import app
+from service.devices.session import DeviceUrls
 from service.errors import AbbeError, ConfigError
 from service.sequences.check import dry_run, dry_run_campaign
 from service.sequences.recipe_file import parse_recipe, read_recipe, recipe_text
 from service.sequences.recipes import Diagonal, Helix, Linear
 from service.sequences.setups import shared_setups
-from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, Unmount
+from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
 from service.site import Site, machine_doc
-from service.workflows.plan import plan_for, recipe_of, words
+from service.workflows.plan import plan_for, plan_page, recipe_of, words
 from service.workflows.plan_instruments import read_instruments
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
@@ -37,6 +40,9 @@ helices = st.builds(
     law=st.sampled_from(["area", "angle"]),
     axis=st.integers(0, 2),
     direction=st.sampled_from([1, -1]),
+    opens=st.sampled_from([1, -1]),
+    length_calibrated=st.booleans(),
+    u_length_mm=st.floats(0.0, 1.0),
     rate_hz=st.sampled_from([50, 100, 1000]),
 )
 diagonals = st.builds(
@@ -54,7 +60,7 @@ def test_any_campaign_comes_back_from_its_file_as_it_went_in(recipes, name):
 
 
 def site() -> Site:
-    return Site("m", MACHINE, machine_doc("m", MACHINE), None)
+    return Site("m", MACHINE, machine_doc("m", MACHINE), DeviceUrls())
 
 
 @pytest.fixture(scope="module")
@@ -74,18 +80,18 @@ def test_the_sequencer_moves_where_the_planner_thinks_and_takes_as_long(planned)
         path = np.array([p for s in test.steps if isinstance(s, RecordPath) for p in s.points_mm])
         near = np.linalg.norm(path[None] - run.axes_mm[::40, None], axis=2).min(axis=1) if len(path) else np.zeros(1)
         assert near.max() < 1.0  # chords of the path are a millimetre long
-        assert dry.duration_s == pytest.approx(machine_seconds(MACHINE, step.test), rel=0.02, abs=1.5)
+        assert dry.duration_s == pytest.approx(machine_seconds(MACHINE, step.test, Instruments()), rel=0.02, abs=1.5)
 
 
 @pytest.mark.parametrize("test", [DiagonalTest("pnp", "YZX"), DiagonalTest("ppp", ""), LineTest(1, (0.1, 0.9)), LineTest(2, (0.5, 0.5))])
 def test_laser_positions_are_those_of_the_sequencer(test):
-    plan = recipe_of(Step("a", "S1", test, 0.0, 0.0, 0.0, 0.0)).plan(MACHINE)
+    plan = recipe_of(Step("a", "S1", test, 0.0, 0.0, 0.0, 0.0), Instruments()).plan(MACHINE)
     moves = [s.target_mm for s in plan.steps if isinstance(s, MoveTo)][1:]
     path, beam = laser_path(MACHINE, test)
     kept = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > 0]]
     assert moves == pytest.approx(kept, abs=1e-5)
     assert next(s for s in plan.steps if isinstance(s, MountLaser)).beam == pytest.approx(beam)
-    assert dry_run(MACHINE, plan).duration_s == pytest.approx(machine_seconds(MACHINE, test), abs=1.0)
+    assert dry_run(MACHINE, plan).duration_s == pytest.approx(machine_seconds(MACHINE, test, Instruments()), abs=1.0)
 
 
 def test_one_set_up_is_mounted_once_and_its_bar_changed_at_the_standing_cup():
@@ -97,11 +103,69 @@ def test_one_set_up_is_mounted_once_and_its_bar_changed_at_the_standing_cup():
         Diagonal("d", "S2", "identify", "ppp", 6, "XYZ"),
         Diagonal("e", "S2", "identify", "ppp", 6, ""),
     )
-    by_hand = MountBar | ChangeBar | MountLaser | Unmount
+    by_hand = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
     plans = [r.plan(MACHINE) for r in shared_setups(recipes, "f")]
     done = [type(s).__name__ for p in plans for s in p.steps if isinstance(s, by_hand)]
-    assert done == ["MountBar", "ChangeBar", "Unmount", "MountLaser", "Unmount"]
+    assert done == ["MountBar", "TakeBarOut", "ChangeBar", "Unmount", "MountLaser", "Unmount"]
     dry_run_campaign(MACHINE, CampaignPlan("n", tuple(plans)))
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_the_bar_is_out_while_the_machine_moves_and_hung_in_where_its_path_starts(direction):
+    cup = (300.0, 250.0, 50.0)
+    first, second = Helix("a", "S1", "identify", cup, 150.0), Helix("b", "S1", "identify", cup, 60.0, turns=4.5, direction=direction)
+    plans = [r.plan(MACHINE) for r in shared_setups((first, second), "f")]
+    here, radius, hung = np.zeros(3), 0.0, 0
+    for step in (s for p in plans for s in p.steps):
+        if isinstance(step, MoveTo):
+            if radius:  # on the sphere, within the stroke of the bar
+                assert np.linalg.norm(np.array(step.target_mm) - cup) == pytest.approx(radius, abs=1.0)
+            elif hung:  # past the cup, not through it
+                t = np.linspace(0.0, 1.0, 200)[:, None]
+                assert np.linalg.norm(here + t * (np.array(step.target_mm) - here) - cup, axis=1).min() > 30.0
+            here = np.array(step.target_mm)
+        elif isinstance(step, RecordPath):
+            here, radius = np.array(step.points_mm[-1]), np.linalg.norm(np.array(step.points_mm[-1]) - cup)
+        elif isinstance(step, TakeBarOut):
+            radius, hung = 0.0, hung + 1
+        elif isinstance(step, ChangeBar):
+            radius = step.radius_mm
+            assert np.linalg.norm(here - cup) == pytest.approx(radius, abs=1.0)
+    assert hung == 1
+
+
+def test_a_bar_is_as_well_known_as_the_instruments_file_says(tmp_path):
+    (tmp_path / "i.toml").write_text("bar_length_u_um = 0.7\nlaser = false\n")
+    found = plan_for(site(), minutes=5.0, tools=read_instruments(tmp_path / "i.toml"))
+    recipes = parse_recipe(found.text, "f")[1]
+    assert {r.plan(MACHINE).setup["u_length_mm"] for r in recipes} == {0.0007}
+    loose = Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0, length_calibrated=False, u_length_mm=0.05)
+    assert parse_recipe(recipe_text("n", (loose,)), "f")[1][0].plan(MACHINE).setup["length_calibrated"] is False
+    assert Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0).plan(MACHINE).setup["u_length_mm"] == 0.002
+
+
+def test_a_slow_machine_gets_a_plan_that_it_may_run():
+    found = plan_for(replace(site(), max_feed_mm_min=1000.0), minutes=12.0)
+    feeds = {s.feed_mm_min for t in found.campaign.tests for s in t.steps if isinstance(s, MoveTo | RecordPath)}
+    assert feeds == {1000.0}
+    assert {r.feed_mm_min for r in parse_recipe(found.text, "f")[1]} == {1000.0}
+    assert sum(d.duration_s for d in found.dry) / 60.0 < found.plan.minutes
+
+
+@pytest.mark.parametrize(
+    ("named", "kinds", "says"), [("ballbar", {Helix}, "without laser"), ("laser", {Diagonal, Linear}, "without ball-bar")]
+)
+def test_only_what_the_machine_file_names_is_planned(named, kinds, says):
+    found = plan_for(replace(site(), urls=DeviceUrls(**{named: "x"})), minutes=14.0)
+    assert {type(r) for r in found.recipes} <= kinds
+    assert says in found.notes[0]
+    assert len(found.notes) == 1 + (named == "ballbar")  # helices of a machine without tool_mm: where is the spindle?
+    assert says in plan_page(site(), found)
+
+
+def test_instruments_that_the_machine_does_not_have_are_refused():
+    with pytest.raises(ConfigError, match="nothing to measure with"):
+        plan_for(replace(site(), urls=DeviceUrls(laser="x")), minutes=9.0, tools=Instruments(laser=False))
 
 
 GOOD = recipe_text("n", (Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0), Linear("l", "S2", "identify", 1, at=(0.1, 0.9))))
@@ -118,6 +182,9 @@ GOOD = recipe_text("n", (Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.
         ('axis = "Y"', 'axis = "W"', "test[2].axis"),
         ("at_share = [0.1, 0.9]", "at_share = [0.1, 1.9]", "test[2].at_share[2]"),
         ('kind = "line"', 'kind = "lime"', "'line'"),
+        ('kind = "line"\n', "", "key 'test[2].kind' is missing"),
+        ("u_length_mm = 0.002", "u_length_mm = -0.002", "test[1].u_length_mm"),
+        ("opens = 1", "opens = 2", "test[1].opens"),
         ('label = "l"', 'label = "a"', "labelled 'a'"),
         ('label = "l"', 'label = "a/b"', "test[2].label"),
         ('setup = "S2"', 'setup = "S1"', "cannot share set-up 'S1'"),
@@ -171,6 +238,24 @@ def test_the_commands_plan_write_and_dry_run(tmp_path):
     dry = CliRunner().invoke(app, ["measure", str(machine), "--recipe", str(out), "--dry-run"])
     assert dry.exit_code == 0, dry.output
     assert "of machine time" in dry.output
+    assert read_recipe(out)[0] in dry.output  # the campaign is called what the recipe is called
+    assert "scales known to 0.2 K" in found.output
+    assert "note: hemispheres open along +Z" in found.output
+
+
+@pytest.mark.parametrize("out", [".", "", "m.toml/x.toml", "nowhere/x.toml", "m.toml", "./m.toml"])
+@pytest.mark.parametrize("option", ["--out", "--picture"])
+def test_a_file_that_cannot_be_written_is_one_line_before_anything_is_planned(tmp_path, monkeypatch, out, option):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "m.toml").write_text(MACHINE_TOML)
+    found = CliRunner().invoke(app, ["plan", "m.toml", "--minutes", "60", option, out])
+    assert isinstance(found.exception, ConfigError) or found.exit_code == 2
+    assert (tmp_path / "m.toml").read_text() == MACHINE_TOML
+
+
+def test_an_instruments_file_is_not_called_a_machine_file(tmp_path):
+    with pytest.raises(ConfigError, match=f"instruments file {tmp_path} cannot be read"):
+        read_instruments(tmp_path)
 
 
 @pytest.mark.parametrize(
