@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,12 +13,20 @@ import typer
 from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from service.storage.store import Store
     from service.workflows.campaign_folder import Campaign
+    from service.workflows.solve import Solved
     from service.workflows.solve_report import Account
 
 
 STAGES = 10
 """Stages of a solution that the display counts; the last ones share one if the solver needs more rounds."""
+
+
+SIDE_BY_SIDE = 3
+"""Runs next to each other in a table: more do not fit 100 columns."""
 
 
 class ModelName(StrEnum):
@@ -27,7 +37,7 @@ class ModelName(StrEnum):
     auto = "auto"
 
 
-def solve(
+def solve(  # noqa: PLR0913 - every one of them is an option of the command
     campaign: Annotated[
         str, typer.Argument(help="Campaign in the database, or a folder with campaign.json. Runs with the role identify are used.")
     ],
@@ -38,24 +48,31 @@ def solve(
     machine: MachineOption = None,
     as_json: JsonOption = False,
     report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    tables: Annotated[bool, typer.Option("--tables", help="Also say what each kind of table could reach.")] = False,
+    grid: Annotated[
+        Path | None, typer.Option("--grid", metavar="FILE.csv", help="Also write the 3-D grid of corrections.", show_default=False)
+    ] = None,
+    nodes: Annotated[int, typer.Option("--nodes", min=2, max=33, help="Nodes of the grid on each axis.")] = 9,
+    unit_um: Annotated[float, typer.Option("--unit-um", min=1e-6, max=10.0, help="The machine's unit for tables and grid, µm.")] = 0.1,
+    trials: Annotated[bool, typer.Option("--monte-carlo", help="Also check the stated uncertainty by trials.")] = False,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
 ) -> None:
     """Solve a campaign: parameters with uncertainty, and what these runs cannot tell. The result is stored; nothing is pushed.
 
     A folder's result is stored only if --db or --machine names a database. A run that cannot be what it says is refused (exit code 2).
     """
-    from service.workflows.campaign_folder import from_folder, from_store, is_folder, keep
+    from service.workflows.campaign_folder import from_folder, is_folder, keep
 
+    wanted = _Wanted(model, tables, grid, nodes, unit_um * 1e-3, trials)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
-        told, doc = _solved(found.without(without or []), model)
+        told, doc = _solved(found.without(without or []), wanted)
         if db is not None or machine is not None:
             with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: what is refused leaves no database
                 doc |= keep(store, found, doc)
     else:
-        with open_store(database_url(db, machine)) as store:
-            found = from_store(store, campaign)
-            told, doc = _solved(found.without(without or []), model)
+        with _stored(campaign, database_url(db, machine)) as (store, found):
+            told, doc = _solved(found.without(without or []), wanted)
             doc |= keep(store, found, doc)
     if report is not None:
         _write_report(told, doc, found, report)
@@ -63,11 +80,41 @@ def solve(
         print_json(doc)
         return
     _print(told, doc)
-    if report is not None:
-        typer.echo(f"report: {report}")
+    for name, target in (("report", report), ("grid", grid)):
+        if target is not None:
+            typer.echo(f"{name}: {target}")
 
 
-def _solved(campaign: Campaign, model: ModelName) -> tuple[Account, dict[str, Any]]:
+@dataclass(frozen=True)
+class _Wanted:
+    """What was asked for beside the solution itself."""
+
+    model: ModelName
+    tables: bool
+    grid: Path | None
+    nodes: int
+    unit_mm: float
+    trials: bool
+
+
+@contextmanager
+def _stored(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
+    """The store and its campaign of that name; what is neither a folder nor in the store is said in one line."""
+    from service.errors import StoreError
+    from service.workflows.campaign_folder import from_store
+
+    with ExitStack() as stack:
+        try:
+            store = stack.enter_context(open_store(url))
+            found = from_store(store, name)
+        except StoreError as exc:
+            raise StoreError(
+                f"{name} is neither a folder with campaign.json nor a campaign of the database ({exc.detail})", exc.remedy
+            ) from exc
+        yield store, found
+
+
+def _solved(campaign: Campaign, wanted: _Wanted) -> tuple[Account, dict[str, Any]]:
     """The solution and its document, with progress on stderr."""
     from service.cli.progress import display
     from service.events import Progress
@@ -80,11 +127,31 @@ def _solved(campaign: Campaign, model: ModelName) -> tuple[Account, dict[str, An
         def say(text: str) -> None:
             sink(Progress("solve", float(next(stages, STAGES - 1)), float(STAGES), None, text))
 
-        solved = solve_runs(campaign.site, campaign.runs, model=model.value, say=say)
+        solved = solve_runs(campaign.site, campaign.runs, model=wanted.model.value, say=say)
         say("what these runs cannot tell, and how well the volume is known")
         told = account(solved)
+        doc = {"campaign": campaign.name, "machine": campaign.site.doc} | solution_doc(told) | _more(told, wanted, say)
         sink(Progress("solve", float(STAGES), float(STAGES), 0.0, "done"))
-    return told, {"campaign": campaign.name, "machine": campaign.site.doc} | solution_doc(told)
+    return told, doc
+
+
+def _more(told: Account, wanted: _Wanted, say: Callable[[str], None]) -> dict[str, Any]:
+    """What takes longer and is only done on request. The grid is written here: what it refuses, stores nothing."""
+    out: dict[str, Any] = {}
+    if not (wanted.tables or wanted.grid or wanted.trials):
+        return out
+    from service.report.page_file import write_page
+    from service.workflows.solve_tables import grid_text, machine_grid, monte_carlo, table_rows
+
+    if wanted.grid is not None:
+        say(f"grid of {wanted.nodes} x {wanted.nodes} x {wanted.nodes} nodes")
+        write_page(grid_text(machine_grid(told, wanted.nodes, wanted.unit_mm)), wanted.grid)
+    if wanted.tables:
+        say("what each kind of table could reach")
+        out["tables"] = table_rows(told, wanted.unit_mm)
+    if wanted.trials:
+        out["monte_carlo"] = monte_carlo(told, say)
+    return out
 
 
 def _write_report(told: Account, doc: dict[str, Any], campaign: Campaign, target: Path) -> None:
@@ -105,11 +172,13 @@ def _print(told: Account, doc: dict[str, Any]) -> None:
     _parameters(told)
     _comparison(told)
     o = told.observability
-    typer.echo(o.number.text)
+    typer.echo(f"{doc['verdict']['word'].capitalize()}. {doc['verdict']['text']}")
+    typer.echo(doc["verdict"]["layout"])
     typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.seen.effective_rank} of them well.")
     typer.echo(worst_line(told))
+    _tables(doc)
     _lines("noise found:", noise_lines(told.joint))
-    _lines("outliers:", outlier_lines(told.joint))
+    _lines("outliers:", outlier_lines(told.solved))
     _lines("residuals that are not noise:", residual_lines(told.joint))
     _lines("these runs cannot tell:", doc["not_observable"])
     _lines("what would show more:", doc["advice"])
@@ -126,15 +195,18 @@ def _lines(heading: str, lines: list[str]) -> None:
 
 def _parameters(told: Account) -> None:
     from models.compensation.summary import SCALE_NOTE
+    from service.workflows.solve_report import HIDDEN_NOTE
 
     status = {m.name: m.status for m in told.observability.motions}
     rows: list[list[str]] = []
     for p in told.mean:
-        unit, what = ("µm/m", f"mean over the volume, {SCALE_NOTE}") if p.name[0] == "E" else ("µrad", "mean over the volume")
-        rows.append([p.name, f"{p.value * 1e6:.2f}", f"{2 * p.u * 1e6:.2f}", unit, what])
+        unit = "µm/m" if p.name[0] == "E" else "µrad"
+        what = f"mean over the volume; {HIDDEN_NOTE}" if status.get(p.name) == "not observable" else "mean over the volume"
+        rows.append([p.name, _figure(p.value * 1e6), f"{2 * p.u * 1e6:.2f}", unit, what])
     for axis, (v, u) in told.joint.backlash_mm().items():
-        rows.append([f"backlash {axis}", f"{v * 1e3:.2f}", f"{2 * u * 1e3:.2f}", "µm", "lost motion"])
+        rows.append([f"backlash {axis}", _figure(v * 1e3), f"{2 * u * 1e3:.2f}", "µm", "lost motion"])
     print_table(["parameter", "value", "U (k = 2)", "unit", "what"], rows)
+    typer.echo(f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}")
     words = {s: ", ".join(n for n, v in status.items() if v == s) or "none" for s in ("observed", "weak", "not observable")}
     typer.echo("error motions, each for itself: " + "; ".join(f"{s}: {names}" for s, names in words.items()))
 
@@ -143,15 +215,35 @@ def _comparison(told: Account) -> None:
     from service.workflows.solve import HELIX_NOTE, STEP_NOTE
 
     solved = told.solved
-    if solved.helices:
-        names = next(iter(solved.helices.values())).estimate.names
-        headings = ["ten parameters, about this sphere only (± U, k = 2)", *(f"{n} ({_helix_unit(n)[1]})" for n in names)]
-        print_table(headings, [[label, *_helix_row(h.estimate)] for label, h in solved.helices.items()])
+    labels = list(solved.helices)
+    for at in range(0, len(labels), SIDE_BY_SIDE):
+        some = labels[at : at + SIDE_BY_SIDE]
+        columns = [_helix_row(solved.helices[label].estimate) for label in some]
+        print_table(["ten parameters (± U, k = 2)", *some], [list(row) for row in zip(_helix_names(solved, some), *columns, strict=True)])
+    if labels:
         typer.echo(HELIX_NOTE)
     for order, figures in solved.step_totals.items():
         print_table([f"step diagonals {order}", "value", "U (k = 2)", "unit"], _step_rows(figures))
     if solved.step_totals:
         typer.echo(STEP_NOTE)
+
+
+def _helix_names(solved: Solved, labels: list[str]) -> list[str]:
+    return [f"{n} ({_helix_unit(n)[1]})" for n in solved.helices[labels[0]].estimate.names]
+
+
+def _figure(value: float) -> str:
+    return f"{value:.2f}".replace("-0.00", "0.00") if abs(value) < 0.005 else f"{value:.2f}"
+
+
+def _tables(doc: dict[str, Any]) -> None:
+    rows = doc.get("tables") or []
+    if rows:
+        headings = ["left of errors of distances (± U, k = 2)", "numbers", "rms (µm)", "95 % below (µm)", "largest (µm)"]
+        keys = ("rms_um", "q95_um", "max_um")
+        print_table(headings, [[r["kind"], str(r["entries"]), *(f"{r[k]:.2f} ± {2 * r[f'u_{k}']:.2f}" for k in keys)] for r in rows])
+    if doc.get("monte_carlo"):
+        typer.echo(doc["monte_carlo"]["text"])
 
 
 def _helix_unit(name: str) -> tuple[float, str]:

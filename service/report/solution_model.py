@@ -64,12 +64,24 @@ class BudgetRow:
     share: float
 
 
+@dataclass(frozen=True, slots=True)
+class TableLine:
+    """What a kind of table leaves of the errors of distances: value and standard uncertainty, µm."""
+
+    kind: str
+    entries: int
+    rms_um: tuple[float, float]
+    q95_um: tuple[float, float]
+    max_um: tuple[float, float]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SolutionPage:
     """All that the page says.
 
     ``gains``: noise gain in µm per µm, as slices; ``verdict``: sign ("ok", "open", "bad"), word and text; ``facts`` and ``provenance``:
-    name and value; the other texts are lines.
+    name and value; ``left_out``: motions not drawn in the ranking, because these runs do not show them by themselves; the other
+    texts are lines.
     """
 
     title: str
@@ -94,4 +106,8 @@ class SolutionPage:
     not_observable: Sequence[str]
     advice: Sequence[str]
     provenance: Mapping[str, str]
+    layout: str = ""
+    left_out: Sequence[str] = ()
+    tables: Sequence[TableLine] = ()
+    check: str = ""
     lang: str = "en"

@@ -17,7 +17,7 @@ from service.report.plots.cells import common_step, correlation_plot, slice_plot
 from service.report.plots.observability import gain_map, share_plot
 from service.report.plots.residuals import common_range, residual_plot
 from service.report.plots.signed import signed_rules
-from service.report.solution_model import SolutionPage
+from service.report.solution_model import SolutionPage, TableLine
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
 
@@ -43,6 +43,7 @@ def render_solution(page: SolutionPage) -> str:
             setup=[_parameter(r) for r in page.setup],
             runs=[_run(r) for r in page.runs],
             budget=[{"words": b.words, "u": plain(b.u_um, 2), "share": f"{b.share:.0%}"} for b in page.budget],
+            tables=[_table(t) for t in page.tables],
             pictures=_pictures(page),
         )
     )
@@ -83,6 +84,11 @@ def _trusted(pictures: Iterable[str]) -> list[Markup]:
 def _parameter(row: ParameterRow) -> dict[str, str]:
     value, expanded = with_uncertainty(row.value, row.u)
     return {"name": row.name, "value": value, "u": expanded, "unit": row.unit, "note": row.note}
+
+
+def _table(row: TableLine) -> dict[str, str]:
+    figures = {k: "{} ± {}".format(*with_uncertainty(*getattr(row, f"{k}_um"))) for k in ("rms", "q95", "max")}
+    return {"kind": row.kind, "entries": str(row.entries)} | figures
 
 
 def _run(row: RunRow) -> dict[str, str]:

@@ -22,9 +22,10 @@ class Versions(FileObject):
 
 
 class Inputs(FileObject):
-    """SHA-256 of every run's data by its name, and of all of them with the model: the same campaign solved twice has the same."""
+    """SHA-256 of every run's data by its name, of the machine's geometry, and of all of them with the model."""
 
     digest: Digest
+    machine: Digest = ""
     runs: dict[str, Digest]
 
 
@@ -95,10 +96,15 @@ class NoiseFound(FileObject):
 
 
 class OutlierFound(FileObject):
-    """A reading that counts less: index in the run's values, size in standard deviations, weight 0 to 1."""
+    """A reading that counts less: size in standard deviations, weight 0 to 1.
+
+    ``index``: of the value in the solution, from 0; ``rows``: first and last row of the run's columns, from 1, that went into it.
+    """
 
     run: str
     index: int
+    rows: list[int] = Field(default_factory=list)
+    t_s: float | None = None
     size_sigma: float
     weight: float
 
@@ -144,6 +150,62 @@ class Uncertainty(FileObject):
     compensable_share: float
 
 
+class VerdictValue(FileObject):
+    """What may be done with the solution, what holds it down, and what the layout of the campaign would allow."""
+
+    word: Literal["good", "usable with care", "mostly assumption"]
+    text: str
+    reasons: list[str]
+    layout: str
+
+
+class PackedMatrix(FileObject):
+    """A symmetric matrix: ``data`` is base64 of its lower triangle by rows, float64, little endian."""
+
+    encoding: str
+    shape: list[int]
+    data: str
+
+
+class StoredPrediction(FileObject):
+    """Coefficients with all their uncertainty: predictions can be made again from them.
+
+    ``terms``: motion, Legendre order, axis (0 to 2) and component (0 to 2 translation, 3 to 5 rotation) of each; ``coefficients`` in mm or
+    rad; ``scatter_mm``: standard deviation that a single approach of a point adds per component.
+    """
+
+    terms: list[tuple[str, int, int, int]]
+    coefficients: list[float]
+    covariance: PackedMatrix
+    scatter_mm: float
+
+
+class TableRow(FileObject):
+    """What a kind of table leaves of the errors of distances over the inner 80 %, µm, with standard uncertainties."""
+
+    kind: str
+    entries: int
+    rms_um: float
+    u_rms_um: float
+    q95_um: float
+    u_q95_um: float
+    max_um: float
+    u_max_um: float
+    unknown_um: float
+
+
+class MonteCarloCheck(FileObject):
+    """GUM Supplement 1 at the worst point: half-widths of the 95 % intervals per component, µm, as stated and by trials."""
+
+    trials: int
+    at_mm: Point
+    stated_um: Point
+    found_um: Point
+    valid: list[bool]
+    settled: bool
+    text: str
+
+
 class SolutionFile(FileObject):
     """A solved campaign (``abbe-solution/1``). Every ``u`` is a standard uncertainty (k = 1); ``expanded_um`` has 95 % coverage.
 
@@ -173,6 +235,10 @@ class SolutionFile(FileObject):
     residual_tests: list[ResidualTestResult]
     flags: list[str]
     uncertainty: Uncertainty
+    verdict: VerdictValue | None = None
+    prediction: StoredPrediction | None = None
+    tables: list[TableRow] | None = None
+    monte_carlo: MonteCarloCheck | None = None
     ten_parameter_helix: dict[str, dict[str, MeanValue]]
     ten_parameter_helix_note: str
     step_diagonals: dict[str, dict[str, float]]

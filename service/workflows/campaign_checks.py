@@ -7,20 +7,27 @@ First geometry (do the points lie where the set-up says?), then copies, then wha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.machine import Machine
 from models.solvers.observations import RunData
 from models.solvers.plausibility import Suspect, suspects
 from service.errors import CampaignRefused
+from service.workflows.finding import Finding
 from service.workflows.run_geometry import geometry
+from service.workflows.run_times import times
 
 Doc = dict[str, Any]
 LARGEST_MM = 2.0
-"""No ball-bar and no machine worth a laser deviates by more: such numbers are in another unit."""
+"""No ball-bar and no machine worth a laser deviates by more: many such numbers are in another unit, single ones are outliers."""
+NO_READING_MM = 1000.0
+"""Not even a spike: no instrument shows such a deviation."""
+SPIKES = 0.05
+"""Larger a share of a run's readings is no matter of single outliers."""
+HALF = 0.5
 COPIED_SHARE = 0.98
 """Runs share no more readings than this, positions included, unless one is a copy: noise differs every time."""
 FEWEST_BAR = 20
@@ -39,24 +46,6 @@ _READINGS = {
     "swap_yz": "its deviations fit the other runs with the columns y_mm and z_mm exchanged",
     "swap_xz": "its deviations fit the other runs with the columns x_mm and z_mm exchanged",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that is wrong with one run (or with two that contradict each other).
-
-    ``refuse``: nothing may be solved from such a campaign; otherwise it is a flag beside the result.
-    """
-
-    run: str
-    what: str
-    remedy: str
-    refuse: bool
-
-    @property
-    def line(self) -> str:
-        """One line for people."""
-        return f"run {self.run}: {self.what} - {self.remedy}"
 
 
 def refuse(findings: Sequence[Finding]) -> None:
@@ -87,7 +76,23 @@ def check_files(machine: Doc, runs: Sequence[Doc]) -> list[Finding]:
     for run in runs:
         out += _other_machine(machine, run) or geometry_findings(machine, run)
         out += _readings(run)
-    return out + copies(runs)
+    return _nothing_measured(runs) + out + times(runs) + copies(runs)
+
+
+def _nothing_measured(runs: Sequence[Doc]) -> list[Finding]:
+    """Runs whose readings are all the same: refused if they all are, else flagged."""
+    still = [r["run_id"] for r in runs if _constant(r)]
+    if not still:
+        return []
+    if len(still) == len(runs):
+        what = "in this run and all others every reading is the same: nothing was measured"
+        return [Finding(still[0], what, "export the runs again, with their readings", True)]
+    return [Finding(n, "all its readings are the same: nothing was measured", "leave it out (--without)", False) for n in still]
+
+
+def _constant(run: Doc) -> bool:
+    y = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
+    return bool(y.size and (y == y[0]).all())
 
 
 def geometry_findings(machine: Doc, run: Doc) -> list[Finding]:
@@ -139,12 +144,24 @@ def _readings(run: Doc) -> list[Finding]:
     if (np.diff(t) < 0).any():
         row = int(np.argmax(np.diff(t) < 0)) + 2
         return [Finding(label, f"t_s runs back at row {row}", "put the rows in the order in which they were measured", True)]
-    out = []
-    largest = float(np.abs(y[valid]).max(initial=0.0))
-    if largest > LARGEST_MM:
-        unit = " they look like µm" if largest < 1e3 else " no unit makes a machine of it"
-        out.append(Finding(label, f"deviations up to {largest:.3g} mm:{unit}", "write deviation_mm in mm", True))
-    return out + _too_few(run, int(valid.sum()))
+    return _too_large(label, y, valid) + _too_few(run, int(valid.sum()))
+
+
+def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[Finding]:
+    """Deviations that no machine has: most of them, another unit; some, a lost beam or bar; single ones are left to the robust weights."""
+    size = np.where(valid, np.abs(y), 0.0)
+    count, of, largest = int((size > LARGEST_MM).sum()), int(valid.sum()), float(size.max(initial=0.0))
+    if largest > NO_READING_MM:
+        row = int(np.argmax(size)) + 1
+        return [
+            Finding(label, f"{y[row - 1]:.3g} mm in row {row} is no reading", "mark it with valid 0, or write deviation_mm in mm", True)
+        ]
+    if count > HALF * of:
+        return [Finding(label, f"deviations up to {largest:.3g} mm: they look like µm", "write deviation_mm in mm", True)]
+    if count > max(SPIKES * of, 1):
+        what = f"{count} of {of} readings are beyond {LARGEST_MM:g} mm, up to {largest:.3g} mm: µm, or the bar or the beam was lost"
+        return [Finding(label, what, "write deviation_mm in mm, or mark what was lost with valid 0", True)]
+    return []
 
 
 def _too_few(run: Doc, count: int) -> list[Finding]:
@@ -179,7 +196,7 @@ def _row_keys(run: Doc) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
     y = np.asarray(columns["deviation_mm"], dtype=np.float64)
     if y.size == 0 or not np.isfinite(y).all() or float(np.ptp(y)) == 0.0:
         return np.zeros(0, dtype=np.int64)
-    key = np.rint(y * 1e8).astype(np.int64) * 1_000_003
+    key = np.rint(np.clip(y, -NO_READING_MM, NO_READING_MM) * 1e8).astype(np.int64) * 1_000_003
     for c, prime in (("x_mm", 7_368_787), ("y_mm", 15_485_863), ("z_mm", 32_452_843)):
         key = key * 31 + np.rint(np.asarray(columns[c], dtype=np.float64) * 1e5).astype(np.int64) * prime
     return key

@@ -12,6 +12,7 @@ from service.runs.columns import load_run
 from service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
 from service.site import Site, machine_from_doc
 from service.storage.store import Store
+from service.workflows.provenance import machine_digest, run_digest
 
 
 @dataclass(frozen=True)
@@ -93,18 +94,30 @@ def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any
     record = store.campaign(campaign.name)
     ids = {r.label: r.id for r in store.runs(record.id) if r.visible_status == "complete"}
     if campaign.folder is not None:
-        _check_same(store, campaign, ids)
+        _check_same(store, campaign, store.machine(record.machine_id).doc, ids)
     used = [ids[label] for label in doc["inputs"]["runs"]]
     same = [s.id for s in store.solutions(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
     told = {"run_ids": used, "same_as": same}
     return told | {"solution_id": store.add_solution(record.id, "joint", used, doc | told)}
 
 
-def _check_same(store: Store, campaign: Campaign, ids: dict[str, int]) -> None:
+def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: dict[str, int]) -> None:
+    """The stored campaign must be of the same machine and hold the same readings with the same set-ups: solutions refer to its runs."""
+    differs = None
+    if machine_digest(machine_from_doc(machine)) != machine_digest(campaign.site.machine):
+        differs = "the machine (chain, strokes, pivots or tool)"
     for run in campaign.runs:
         found = ids.get(run["run_id"])
-        if run["role"] == "identify" and (found is None or load_run(store, found)["columns"] != run["columns"]):
-            raise CampaignRefused(
-                f"the store has another campaign {campaign.name!r}: run {run['run_id']} differs",
-                "rename the folder's campaign, or use another --db",
-            )
+        if differs is None and run["role"] == "identify":
+            stored = None if found is None else load_run(store, found)
+            if stored is None:
+                differs = f"run {run['run_id']} is missing there"
+            elif stored["columns"] != run["columns"]:
+                differs = f"run {run['run_id']}"
+            elif run_digest(stored) != run_digest(run) or stored["role"] != run["role"]:
+                differs = f"test, role or set-up of run {run['run_id']}"
+    if differs is not None:
+        what = differs if differs.endswith("there") else f"{differs} differs"
+        raise CampaignRefused(
+            f"the store has another campaign {campaign.name!r}: {what}", "rename the folder's campaign, or use another --db"
+        )

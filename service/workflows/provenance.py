@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
+import subprocess
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from models.machine import Machine
 
 SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
 
@@ -23,9 +27,17 @@ def run_digest(run: dict[str, Any]) -> str:
     return out.hexdigest()
 
 
-def campaign_digest(digests: dict[str, str], model: str) -> str:
-    """SHA-256 of all runs, in any order, and the model: the same campaign solved twice has the same."""
-    return hashlib.sha256("\n".join([model, *sorted(digests.values())]).encode()).hexdigest()
+def machine_digest(machine: Machine) -> str:
+    """SHA-256 of the geometry that is solved with: chain, strokes, pivots, tool. Its name does not count."""
+    out = hashlib.sha256(machine.chain.encode())
+    for values in (machine.stroke_mm, machine.pivots_mm, machine.tool_mm):
+        out.update((np.asarray(values, dtype="<f8") + 0.0).tobytes())  # + 0.0: minus zero is zero
+    return out.hexdigest()
+
+
+def campaign_digest(digests: dict[str, str], model: str, machine: str) -> str:
+    """SHA-256 of all runs, in any order, of model and machine (`machine_digest`): the same campaign solved twice has the same."""
+    return hashlib.sha256("\n".join([model, machine, *sorted(digests.values())]).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -36,13 +48,33 @@ def versions() -> dict[str, str]:
 
 
 def revision() -> str | None:
-    """Commit of the sources: as installed from a repository, or of the work tree that they stand in; None for a plain package."""
+    """Commit of the sources: as installed from a repository, or of the work tree that they stand in; None for a plain package.
+
+    A work tree whose program differs from its commit is told by ``+changes`` behind the commit.
+    """
     try:
         text = distribution("abbe").read_text("direct_url.json")
     except PackageNotFoundError:
         text = None
     commit = json.loads(text).get("vcs_info", {}).get("commit_id") if text else None
-    return str(commit) if commit else _of_tree(Path(__file__).resolve().parents[2] / ".git")
+    if commit:
+        return str(commit)
+    tree = Path(__file__).resolve().parents[2]
+    found = _of_tree(tree / ".git")
+    return found + "+changes" if found and _changed(tree) else found
+
+
+def _changed(tree: Path) -> bool:
+    """Whether files of the program differ from the commit; without git nobody knows, and nothing is claimed."""
+    git = shutil.which("git")
+    if git is None:
+        return False
+    words = [git, "--no-optional-locks", "-C", str(tree), "status", "--porcelain", "--", "models", "service"]
+    try:
+        found = subprocess.run(words, capture_output=True, timeout=20, check=False)  # noqa: S603 - fixed words, no shell
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return found.returncode == 0 and bool(found.stdout.strip())
 
 
 def _of_tree(git: Path) -> str | None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.solvers.helix import HelixSolution, fit_run
 from models.solvers.joint import JointSolution, Model, implausible, solve_joint
@@ -17,17 +19,19 @@ from models.solvers.step_diagonal import ORDER, closure_mm, increments, squarene
 from service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from service.runs.observations import bar_noise_mm, run_data
 from service.site import Site
-from service.workflows.campaign_checks import Finding, check_files, check_readings, copies, refuse
+from service.workflows.campaign_checks import check_files, check_readings, copies, refuse
+from service.workflows.finding import Finding
 from service.workflows.provenance import run_digest
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
 """Set-up unknowns that cannot be off by five times their uncertainty: somebody calibrated them, or would have seen it."""
+LASER_REMEDY = "look at beam, mirror and temperature of that set-up"
 UNUSUAL = {
-    "cosine": "the relative length error of its set-up (beam and mirror askew, or its own wavelength)",
-    "bar_drift": "the drift of its ball-bar set-up",
-    "drift": "the drift of its laser",
-    "zero": "the error of its first record",
+    "cosine": ("the relative length error (beam and mirror askew, or its own wavelength)", LASER_REMEDY),
+    "bar_drift": ("the drift of the centre cup", "look at the cup's clamping, the spindle's temperature and t_s"),
+    "drift": ("the drift of the laser", "look at the air, the warming of laser and mirror, and t_s"),
+    "zero": ("the error of the first record", "look at the first record: was the machine standing still?"),
 }
 ALL_READINGS = 10**9
 PER_UNKNOWN = 2
@@ -50,6 +54,7 @@ class Solved:
     """Joint solution plus the papers' own solutions of the same runs, for comparison.
 
     ``flags``: what is odd about single runs without being wrong for certain. ``digests``: a hash of every run's data, by its name.
+    ``rows``: for every value of a run the first and the last row of its file (from 1) that went into it, shape (values, 2).
     """
 
     joint: JointSolution
@@ -58,6 +63,7 @@ class Solved:
     noise_bar_mm: float
     flags: tuple[Finding, ...] = ()
     digests: dict[str, str] = field(default_factory=dict)
+    rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
 
 
 def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid21", say: Say | None = None) -> Solved:
@@ -85,7 +91,27 @@ def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid2
     flags += check_instruments(joint, data)
     spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not tell ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
-    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), {r["run_id"]: run_digest(r) for r in used})
+    return Solved(
+        joint, helices, step_diagonals(used), noise, tuple(flags), {r["run_id"]: run_digest(r) for r in used}, value_rows(used, data)
+    )
+
+
+def value_rows(runs: list[dict[str, Any]], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
+    """Rows of its file, from 1, that each value of a run was made of, (first, last) per value: long runs are averaged in blocks.
+
+    A row belongs to the value whose mean time is nearest; rows marked invalid belong to none.
+    """
+    out = {}
+    for run, values in zip(runs, data, strict=True):
+        t = np.asarray(run["columns"]["t_s"], dtype=np.float64)
+        rows = np.flatnonzero(np.asarray(run["columns"].get("valid", np.ones(t.size))).astype(bool))
+        if rows.size == values.t_s.size:
+            out[run["run_id"]] = np.stack([rows, rows], axis=1) + 1
+            continue
+        edges = np.searchsorted(t[rows], 0.5 * (values.t_s[1:] + values.t_s[:-1]))
+        first, last = np.concatenate([[0], edges]), np.concatenate([edges, [rows.size]]) - 1
+        out[run["run_id"]] = np.stack([rows[np.minimum(first, rows.size - 1)], rows[np.maximum(last, first)]], axis=1) + 1
+    return out
 
 
 def _silent(_: str) -> None:
@@ -152,12 +178,21 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[F
 
 def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> Finding:
     """A set-up error that is larger than a careful hand leaves, without being impossible."""
-    words = next((text for prefix, text in UNUSUAL.items() if name.startswith(prefix)), name.replace("_", " "))
-    run = next((r.label for r in data if name.endswith(f"_{r.label}")), None)
-    run = run or next((r.label for r in data if f"_{r.setup}" in name), name)
-    return Finding(
-        run, f"{words} of its set-up is {times:.0f} times what is usual", "look at beam, mirror and temperature of that set-up", False
+    words, remedy = next(
+        (told for prefix, told in UNUSUAL.items() if name.startswith(prefix)), (name.replace("_", " "), "look at that set-up")
     )
+    run = _whole([r.label for r in data], name)
+    setup = None if run else _whole([r.setup for r in data], name)
+    if run:
+        return Finding(run, f"{words} is {times:.0f} times what is usual", remedy, False)
+    first = next((r.label for r in data if r.setup == setup), name)
+    return Finding(first, f"{words} of set-up {setup} is {times:.0f} times what is usual", remedy, False)
+
+
+def _whole(names: list[str], unknown: str) -> str | None:
+    """The longest of the names that stands in the name of an unknown as a whole word between underscores: B1 is not in cup_B12_x."""
+    found = [n for n in names if re.search(rf"_{re.escape(n)}(_|$)", unknown)]
+    return max(found, key=len) if found else None
 
 
 def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,12 @@ import numpy as np
 from models.geometry.bases import term_values
 from models.machine import AXES
 from models.solvers.joint import JointSolution
-from models.solvers.observability_volume import Number
-from service.report.model import SETUP_NOTE, ResidualSeries, RunRow
-from service.report.solution_model import BudgetRow, Correlations, MotionCurve, MotionShare, Slice, SolutionPage
+from service.report.model import SETUP_NOTE, ParameterRow, ResidualSeries, RunRow
+from service.report.solution_model import BudgetRow, Correlations, MotionCurve, MotionShare, Slice, SolutionPage, TableLine
 from service.site import Site
 from service.workflows.demo_report import contributions, parameter_rows
-from service.workflows.solve_report import Account, noise_lines, outlier_lines, residual_lines, worst_line
+from service.workflows.solve_report import HIDDEN_NOTE, Account, judged, noise_lines, outlier_lines, residual_lines, worst_line
+from service.workflows.solve_verdict import layout_line
 
 CURVE_NODES = 61
 SLICE_NODES = 15
@@ -36,16 +37,21 @@ def solution_page(told: Account, doc: dict[str, Any], site: Site, made: str) -> 
         When, as text.
     """
     joint = told.joint
-    rows = parameter_rows(joint)
+    rows = [_with_status(told, r) for r in parameter_rows(joint)]
+    hidden = frozenset(m.name for m in told.observability.motions if m.status == "not observable")
     return SolutionPage(
         title=f"Campaign {doc['campaign']} - what it says about {site.name}",
         facts={"chain": joint.machine.chain, "model": doc["model"], "runs": str(len(joint.runs)), "made": made},
-        verdict=_verdict(told.observability.number),
+        verdict=_verdict(told),
+        layout=layout_line(told.observability.number),
         flags=doc["flags"],
         parameters=[r for r in rows if r.note != SETUP_NOTE],
         setup=[r for r in rows if r.note == SETUP_NOTE],
         motions=motion_curves(told),
-        contributions=contributions(joint),
+        contributions=[c for c in contributions(joint) if c.name not in hidden],
+        left_out=[c.name for c in contributions(joint) if c.name in hidden],
+        tables=_tables(doc),
+        check=(doc.get("monte_carlo") or {}).get("text", ""),
         slices=[_slice(told, plane) for plane in PLANES],
         shares=[MotionShare(m.name, m.share, m.status) for m in told.observability.motions],
         gains=[_gain(told, fixed) for _, _, fixed in PLANES],
@@ -55,7 +61,7 @@ def solution_page(told: Account, doc: dict[str, Any], site: Site, made: str) -> 
         residuals=[ResidualSeries(r.label, "reading", np.arange(float(r.residual_mm.size)), r.residual_mm * 1e3) for r in joint.runs],
         runs=_runs(joint),
         noise=noise_lines(joint),
-        outliers=outlier_lines(joint),
+        outliers=outlier_lines(told.solved),
         tests=residual_lines(joint),
         not_observable=doc["not_observable"],
         advice=doc["advice"],
@@ -63,9 +69,21 @@ def solution_page(told: Account, doc: dict[str, Any], site: Site, made: str) -> 
     )
 
 
-def _verdict(number: Number) -> tuple[str, str, str]:
-    sign = {"good": "ok", "usable with care": "open"}.get(number.verdict, "bad")
-    return sign, number.verdict[:1].upper() + number.verdict[1:], number.text
+def _verdict(told: Account) -> tuple[str, str, str]:
+    found = judged(told)
+    return found.sign, found.word[:1].upper() + found.word[1:], found.text
+
+
+def _with_status(told: Account, row: ParameterRow) -> ParameterRow:
+    """A row of a motion that the runs do not show by itself says so, and that its value is right for this tool only."""
+    status = next((m.status for m in told.observability.motions if m.name == row.name), "observed")
+    return replace(row, note=f"{row.note}; {HIDDEN_NOTE}") if status == "not observable" else row
+
+
+def _tables(doc: dict[str, Any]) -> list[TableLine]:
+    return [
+        TableLine(t["kind"], t["entries"], *((t[k], t[f"u_{k}"]) for k in ("rms_um", "q95_um", "max_um"))) for t in doc.get("tables") or []
+    ]
 
 
 def motion_curves(told: Account) -> list[MotionCurve]:

@@ -11,16 +11,20 @@ from models.arrays import F2
 from models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
 from models.solvers.joint import JointSolution
 from models.solvers.observability import Observability, observability_of
+from models.solvers.robust import Outlier
 from models.uncertainty.budget import Budget, budget_over, worst_point
 from models.uncertainty.frame import volume_frame
 from models.uncertainty.mask import CompensableMask, compensable_mask
 from models.uncertainty.prediction import Prediction, predict_deviation
 from models.uncertainty.sources import ErrorSources, error_sources
 from models.volumetric import volume_grid
-from service.workflows.provenance import campaign_digest, versions
+from service.workflows.provenance import campaign_digest, machine_digest, versions
 from service.workflows.solve import HELIX_NOTE, STEP_NOTE, Solved
+from service.workflows.solve_verdict import Verdict, layout_line, verdict
+from service.workflows.stored_prediction import prediction_doc
 
 FORMAT = "abbe-solution/1"
+HIDDEN_NOTE = "not observable by itself: for this tool only"
 NODES = 6
 """Nodes per axis of the grid over the strokes on which the uncertainty is stated."""
 LISTED = 20
@@ -87,12 +91,14 @@ def solution_doc(solved: Solved | Account) -> dict[str, Any]:
         "model": key,
         "order": joint.order,
         "versions": versions(),
-        "inputs": {"digest": campaign_digest(found.solved.digests, key.partition("/")[0]), "runs": found.solved.digests},
+        "verdict": _verdict(found),
+        "inputs": _inputs(found, key.partition("/")[0]),
         **_parameters(found),
         **_observability(found),
-        **_residuals(joint),
+        **_residuals(found.solved),
         "flags": [f.line for f in found.solved.flags],
         "uncertainty": _uncertainty(found),
+        "prediction": prediction_doc(found.sources),
         "ten_parameter_helix": {
             label: {n: {"value": h.estimate.value(n), "u": h.estimate.u(n)} for n in h.estimate.names}
             for label, h in found.solved.helices.items()
@@ -100,6 +106,26 @@ def solution_doc(solved: Solved | Account) -> dict[str, Any]:
         "ten_parameter_helix_note": HELIX_NOTE,
         "step_diagonals": found.solved.step_totals,
         "step_diagonals_note": STEP_NOTE,
+    }
+
+
+def judged(found: Account) -> Verdict:
+    """The verdict on a solution (`service.workflows.solve_verdict`)."""
+    flagged = len({t.run for t in found.joint.residual_tests if t.flagged})
+    return verdict(found.observability.number, found.prediction, found.mask.share, flags=len(found.solved.flags), not_noise=flagged)
+
+
+def _verdict(found: Account) -> dict[str, Any]:
+    told = judged(found)
+    return {"word": told.word, "text": told.text, "reasons": list(told.reasons), "layout": layout_line(found.observability.number)}
+
+
+def _inputs(found: Account, model: str) -> dict[str, Any]:
+    machine = machine_digest(found.joint.machine)
+    return {
+        "digest": campaign_digest(found.solved.digests, model, machine),
+        "machine": machine,
+        "runs": found.solved.digests,
     }
 
 
@@ -125,8 +151,8 @@ def _observability(found: Account) -> dict[str, Any]:
     }
 
 
-def _residuals(joint: JointSolution) -> dict[str, Any]:
-    e = joint.estimate
+def _residuals(solved: Solved) -> dict[str, Any]:
+    joint, e = solved.joint, solved.joint.estimate
     counts = {r.label: sum(o.run == r.label for o in joint.outliers) for r in joint.runs}
     return {
         "chi2": e.chi2,
@@ -146,7 +172,10 @@ def _residuals(joint: JointSolution) -> dict[str, Any]:
             for kind, sigma in joint.noise_mm.items()
             for repeats in [joint.noise_repeats_mm.get(kind)]
         },
-        "outliers": [{"run": o.run, "index": o.index, "size_sigma": o.size, "weight": o.weight} for o in joint.outliers],
+        "outliers": [
+            {"run": o.run, "index": o.index, "rows": _rows(solved, o), "t_s": _time(joint, o), "size_sigma": o.size, "weight": o.weight}
+            for o in joint.outliers
+        ],
         "residual_tests": [
             {
                 "run": t.run,
@@ -200,13 +229,32 @@ def noise_lines(joint: JointSolution) -> list[str]:
     return out
 
 
-def outlier_lines(joint: JointSolution) -> list[str]:
-    """Readings that count less, largest first."""
+def _rows(solved: Solved, outlier: Outlier) -> list[int]:
+    """First and last row of the run's columns, from 1, that went into the value."""
+    rows = solved.rows.get(outlier.run)
+    return [] if rows is None or outlier.index >= len(rows) else [int(v) for v in rows[outlier.index]]
+
+
+def _time(joint: JointSolution, outlier: Outlier) -> float:
+    return float(next(r.t_s[outlier.index] for r in joint.data if r.label == outlier.run))
+
+
+def outlier_lines(solved: Solved) -> list[str]:
+    """Readings that count less, largest first, with their rows in the run's file."""
+    joint = solved.joint
     lines = [
-        f"run {o.run}, reading {o.index + 1}: {abs(o.size):.1f} standard deviations, counts {o.weight:.0%}" for o in joint.outliers[:LISTED]
+        f"run {o.run}, {_where(_rows(solved, o))} (t = {_time(joint, o):.1f} s): {abs(o.size):.1f} sigma, counts {o.weight:.0%}"
+        for o in joint.outliers[:LISTED]
     ]
     more = len(joint.outliers) - len(lines)
     return [*lines, f"and {more} more"] if more > 0 else lines
+
+
+def _where(rows: list[int]) -> str:
+    if not rows:
+        return "a value"
+    first, last = rows
+    return f"row {first}" if first == last else f"mean of rows {first} to {last}"
 
 
 def residual_lines(joint: JointSolution) -> list[str]:

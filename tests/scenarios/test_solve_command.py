@@ -4,14 +4,18 @@ import json
 import re
 import tarfile
 
+import numpy as np
 import pytest
 
+from models.uncertainty.frame import field, volume_frame
 from service import cli
 from service.runs.exchange import import_folder
 from service.runs.solution_file import SolutionFile
+from service.site import machine_from_doc
 from service.storage.store import Store
 from service.workflows.campaign_folder import from_folder
 from service.workflows.solve import solve_runs
+from service.workflows.stored_prediction import stored_prediction
 from tests.campaigns.population import draw_case
 from tests.scenarios.campaign_files import measured, write_folder
 
@@ -89,7 +93,13 @@ def test_json_keeps_to_its_schema_and_holds_the_truth(abbe, folder):
     for name in ("backlash_X", "backlash_Y", "backlash_Z"):
         found = doc["parameters"][name]
         assert abs(found["value"] - truth.parameter(name)) < 4 * found["u"]
-    assert doc["uncertainty"]["worst_point"]["expanded_vector_um"] >= max(doc["uncertainty"]["worst_point"]["expanded_um"])
+    worst = doc["uncertainty"]["worst_point"]
+    assert worst["expanded_vector_um"] >= max(worst["expanded_um"])
+    machine = machine_from_doc(doc["machine"])
+    terms, coefficients, covariance = stored_prediction(doc["prediction"])
+    field_at = field(machine, terms, np.array([worst["at_mm"]]), None, volume_frame(machine))[0]
+    assert field_at @ coefficients * 1e3 == pytest.approx(worst["deviation_um"], abs=1e-6)
+    assert np.sqrt(np.diag(field_at @ covariance @ field_at.T)) * 1e3 == pytest.approx(worst["u_um"], rel=0.01)
 
 
 def test_a_stored_campaign_is_solved_twice_and_recognised(abbe, folder, tmp_path):
@@ -147,6 +157,17 @@ def test_a_folder_does_not_pass_for_a_stored_campaign_of_its_name(abbe, folder, 
     code, _, err = abbe("solve", folder, "--db", "sqlite:///d.sqlite3")
     assert code == 2
     assert "another campaign 'c1'" in err
+
+
+def test_another_machine_with_the_same_readings_is_another_campaign(abbe, folder, tmp_path):
+    site, runs = measured(SEED, "one_tool")
+    doc = json.loads(json.dumps(site.doc))
+    doc["pivots_mm"] = {a: [0.0, 0.0, 700.0] for a in "XYZ"}
+    with Store.open("sqlite:///e.sqlite3") as store:
+        import_folder(store, write_folder(tmp_path / "other", doc, runs))
+    code, _, err = abbe("solve", folder, "--model", "rigid6", "--db", "sqlite:///e.sqlite3")
+    assert code == 2
+    assert "the machine (chain, strokes, pivots or tool) differs" in err
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from service.report.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM = 500.0, 22.0, 34.0, 46.0
 LABELS = 150.0
+FIGURES = 130.0
+"""Room for value and uncertainty at the right of a ranking."""
 
 
 def contribution_bars(rows: Sequence[Contribution], *, key: str = "ranking", heading: str = "Rank of error contributions") -> str:
@@ -26,22 +28,36 @@ def contribution_bars(rows: Sequence[Contribution], *, key: str = "ranking", hea
         Words above the picture.
     """
     ranked = sorted(rows, key=lambda r: -abs(r.value_um) if finite(r.value_um) else 1.0)
-    words = "; ".join(f"{r.name} {plain(r.value_um)} µm" for r in ranked)
+    words = "; ".join(f"{r.name} {_rounded(r)} µm" for r in ranked)
     svg = Svg(WIDTH, TOP + ROW * max(len(ranked), 1) + BOTTOM, key, heading, f"{heading}: {words}.")
     svg.text((10.0, 18.0), heading, "t-head")
     ends = [abs(r.value_um) + COVERAGE * (r.u_um if finite(r.u_um) else 0.0) for r in ranked if finite(r.value_um)]
-    panel = Panel(LABELS, TOP, WIDTH - LABELS - 70.0, ROW * max(len(ranked), 1), (0.0, data_range(ends, zero=True)[1]), (0.0, 1.0))
+    panel = Panel(LABELS, TOP, WIDTH - LABELS - FIGURES, ROW * max(len(ranked), 1), (0.0, data_range(ends, zero=True)[1]), (0.0, 1.0))
     panel.draw_x(svg, "contribution in µm", count=4)
     for i, row in enumerate(ranked):
         y = TOP + ROW * (i + 0.5)
         svg.text((LABELS - 8.0, y + 4.0), row.name[:24], anchor="end")
-        svg.text((WIDTH - 64.0, y + 4.0), f"{plain(row.value_um)} µm", "t-soft")
+        svg.text((WIDTH - FIGURES + 14.0, y + 4.0), f"{_rounded(row)} µm", "t-soft")
         if finite(row.value_um):
             end = panel.x(abs(row.value_um))
             svg.rect((LABELS, y - 7.0), (end - LABELS, 14.0), "f-c2")
             if finite(row.u_um) and row.u_um > 0.0:
-                svg.error_bar((end, y), panel.x(COVERAGE * row.u_um) - LABELS, horizontal=True)
+                _whisker(svg, panel, row, y)
     return svg.render()
+
+
+def _rounded(row: Contribution) -> str:
+    """Value and U (k = 2), rounded to the uncertainty; the value alone where there is none."""
+    if row.value_um is not None and row.u_um is not None and finite(row.value_um) and finite(row.u_um) and row.u_um > 0.0:
+        return "{} ± {}".format(*with_uncertainty(row.value_um, row.u_um))
+    return plain(row.value_um)
+
+
+def _whisker(svg: Svg, panel: Panel, row: Contribution, y: float) -> None:
+    """U of a contribution; a size is never below zero, so the whisker ends there."""
+    value, u = abs(row.value_um or 0.0), COVERAGE * (row.u_um or 0.0)
+    low, high = panel.x(max(value - u, 0.0)), panel.x(value + u)
+    svg.error_bar((0.5 * (low + high), y), 0.5 * (high - low), horizontal=True)
 
 
 def uncertainty_bars(rows: Sequence[ParameterRow], *, key: str = "parameters") -> list[str]:

@@ -5,12 +5,16 @@ import copy
 import numpy as np
 import pytest
 
+from models.machine import Machine
 from models.paths.helix import helix_points
 from models.paths.lines import step_diagonal
 from service.errors import CampaignRefused
-from service.workflows.campaign_checks import Finding, refuse
-from service.workflows.provenance import campaign_digest, revision, run_digest, versions
+from service.workflows.campaign_checks import check_files, refuse
+from service.workflows.finding import Finding
+from service.workflows.provenance import campaign_digest, machine_digest, revision, run_digest, versions
 from service.workflows.run_geometry import geometry
+from service.workflows.run_times import times
+from service.workflows.solve import _whole
 
 MACHINE = {"chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 
@@ -116,10 +120,67 @@ def test_a_digest_is_of_the_data_not_of_the_name():
     again["columns"]["deviation_mm"][3] += 1e-9
     assert run_digest(first) != run_digest(again)
     one, two = {"a": "1", "b": "2"}, {"x": "2", "y": "1"}
-    assert campaign_digest(one, "rigid21") == campaign_digest(two, "rigid21") != campaign_digest(one, "rigid6")
+    assert campaign_digest(one, "rigid21", "m") == campaign_digest(two, "rigid21", "m") != campaign_digest(one, "rigid6", "m")
+    assert campaign_digest(one, "rigid21", "m") != campaign_digest(one, "rigid21", "other machine")
 
 
 def test_versions_say_which_program():
     found = versions()
     assert {"abbe", "numpy", "scipy"} <= set(found)
-    assert revision() is None or len(found["revision"]) == 40
+    assert revision() is None or len(found["revision"].removesuffix("+changes")) == 40
+
+
+def test_a_machine_is_known_by_its_geometry():
+    stroke = np.array([[0.0, 600], [0, 500], [0, 450]])
+    one = Machine("w-X-Y-b-Z-t", stroke)
+    moved = Machine("w-X-Y-b-Z-t", stroke, pivots_mm=np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 700]]))
+    assert machine_digest(one) == machine_digest(Machine("w-X-Y-b-Z-t", stroke.copy())) != machine_digest(moved)
+
+
+def of_lines(runs):
+    return [f.line for f in check_files(MACHINE, runs)]
+
+
+def test_one_spike_is_left_to_the_weights_and_many_are_another_unit():
+    spike, um, lost, none = helix(), helix(), helix(), helix()
+    spike["columns"]["deviation_mm"][50] = 5.0
+    um["columns"]["deviation_mm"] = [3.0 + k % 7 for k in range(300)]
+    lost["columns"]["deviation_mm"][200:260] = [8.0] * 60
+    none["columns"]["deviation_mm"][5] = 1e300
+    assert of_lines([spike]) == []
+    assert "look like µm" in of_lines([um])[0]
+    assert "60 of 300 readings are beyond 2 mm" in of_lines([lost])[0]
+    assert "1e+300 mm in row 6 is no reading" in of_lines([none])[0]
+
+
+def test_readings_that_are_all_the_same_are_one_line():
+    still = [helix() | {"run_id": n} for n in "abc"]
+    for r in still:
+        r["columns"]["deviation_mm"] = [0.0] * 300
+    with pytest.raises(CampaignRefused) as told:
+        refuse(check_files(MACHINE, still))
+    assert str(told.value).startswith("run a: in this run and all others every reading is the same")
+
+
+def fed(run, label, start, factor=1.0):
+    points = np.stack([run["columns"][f"{c}_mm"] for c in "xyz"], axis=1)
+    t = np.concatenate([[0.0], np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()]) * 60 / 1000
+    run["columns"] |= {"t_s": ((start + t) * factor).tolist(), "feed_mm_min": [1000.0] * len(t)}
+    return run | {"run_id": label}
+
+
+def test_times_in_ms_and_runs_at_the_same_time_are_flagged_by_name():
+    good = [fed(helix(), "a", 0), fed(helix(), "b", 2000), fed(circle(), "c", 4000)]
+    assert times(good) == []
+    (flag,) = times([*good, fed(helix(), "d", 6000, factor=1e3)])
+    assert (flag.run, flag.refuse) == ("d", False)
+    assert "t_s holds ms" in flag.what
+    (flag,) = times([*good, fed(helix(), "e", 2010)])
+    assert {flag.run} <= {"b", "e"}
+    assert "lies within that of run" in flag.what
+
+
+def test_a_set_up_is_found_by_its_whole_name():
+    assert _whole(["B1", "B12", "B"], "cup_B12_x") == "B12"
+    assert _whole(["B1"], "cup_B12_x") is None
+    assert _whole(["r1", "far_r1"], "zero_far_r1") == "far_r1"

@@ -1,0 +1,44 @@
+"""The coefficients of a solution with all their uncertainty, as stored: its predictions can be made again from them.
+
+Deviation at points = field @ coefficients, covariance = field @ covariance @ field^T, where field holds the deviation per unit of each term
+(`models.uncertainty.frame.field`, with the machine's tool and the frame asked for).
+"""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.geometry.bases import Term
+from models.uncertainty.sources import ErrorSources
+
+ENCODING = "base64 of float64, little endian, lower triangle by rows"
+
+
+def prediction_doc(sources: ErrorSources) -> dict[str, Any]:
+    """Terms (motion, order, axis, component), coefficients in mm and rad, and their covariance from all sources."""
+    total = np.zeros((len(sources.terms), len(sources.terms)))
+    for s in sources.sources:
+        total += s.factor @ s.factor.T
+        if s.less is not None:
+            total -= s.less @ s.less.T
+    lower = total[np.tril_indices(len(total))]
+    return {
+        "terms": [[t.motion, t.order, t.axis, t.component] for t in sources.terms],
+        "coefficients": [float(v) for v in sources.coefficients],
+        "covariance": {"encoding": ENCODING, "shape": list(total.shape), "data": base64.b64encode(lower.astype("<f8").tobytes()).decode()},
+        "scatter_mm": float(np.sqrt(sum(s.scatter_mm**2 for s in sources.sources))),
+    }
+
+
+def stored_prediction(doc: dict[str, Any]) -> tuple[tuple[Term, ...], F1, F2]:
+    """Terms, coefficients and covariance of a stored document's ``prediction``."""
+    n = int(doc["covariance"]["shape"][0])
+    out = np.zeros((n, n))
+    out[np.tril_indices(n)] = np.frombuffer(base64.b64decode(doc["covariance"]["data"]), dtype="<f8")
+    out = out + np.tril(out, -1).T
+    terms = tuple(Term(*t) for t in doc["terms"])
+    return terms, np.asarray(doc["coefficients"], dtype=np.float64), out
