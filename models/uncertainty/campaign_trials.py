@@ -1,5 +1,8 @@
 """Trials of a whole campaign: readings, calibrations, temperatures and omitted orders drawn anew, solved anew, predicted anew.
 
+Memory: one batch of results, 10^4 trials of 3 figures per point, and single-precision readings in parts; `MOST_POINTS` at a time. The
+same seed draws the same trials whatever the points (but for a single approach), so more points are worked in parts.
+
 Linear: the solver's own gain, applied to all trials of a batch at once. Exact: every trial is iterated with the exact reading of every run
 (finite rotations, length of the bar, tilted mirror) as the solver iterates; slow, and there to show that the linear one is good enough.
 """
@@ -13,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
+from models.arrays import F1, F2, F3
 from models.solvers.joint import JointSolution
 from models.solvers.observe import predict
 from models.uncertainty.distributions import NORMAL, Distribution
@@ -28,6 +31,10 @@ LIMITS: Mapping[str, Distribution] = MappingProxyType(
 )
 """For inputs that were stated as limits: rectangular, of unit standard deviation. What no distribution is given for is normal."""
 EXACT_ROUNDS = 4
+MOST_POINTS = 500
+"""Points of one set of trials: a batch of 10^4 results is then 120 MB, and so are the copies that sorting and moments make."""
+CHUNK_READINGS = 4_000_000
+"""Simulated readings held at once: 16 MB."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +65,12 @@ class CampaignTrials:
         n = len(self.sources.solution.terms)
         readings = ((self.predict_per_unit[:, :n] @ self.response.gain[:n]).T * self._reading_sd()[:, None]).astype(np.float32)
         others = self._others()
+        size = max(1, CHUNK_READINGS // max(len(readings), 1))
 
         def draw(rng: np.random.Generator, trials: int) -> F2:
-            out: F2 = (self._readings(rng, trials) @ readings).astype(np.float64)  # single precision: seven digits of what is random
+            out: F2 = np.empty((trials, len(self.predict_per_unit)))
+            for i in range(0, trials, size):  # single precision: seven digits of what is random
+                out[i : i + size] = self._readings(rng, min(size, trials - i)) @ readings
             return self._with_others(out, others, rng)
 
         return draw
@@ -107,8 +117,7 @@ class CampaignTrials:
                 continue
             factor = (b @ s.factor).T
             if s.less is not None:
-                value, vector = np.linalg.eigh(factor.T @ factor - (b @ s.less) @ (b @ s.less).T)
-                factor = (vector * np.sqrt(np.maximum(value, 0.0))).T
+                factor = _clamped(factor, (b @ s.less).T)
             out.append((s.name, factor))
         return out
 
@@ -132,6 +141,26 @@ class CampaignTrials:
         return out
 
 
+def _clamped(plus: F2, less: F2) -> F2:
+    """Factor (inputs, 3 m) of what the estimated sizes add: at every point not less than nothing, as the law of propagation has it.
+
+    Every point takes its share of the same draws, so it stays in step with the others, and what it gets does not depend on them.
+    """
+    points = plus.reshape(len(plus), -1, 3).transpose(1, 2, 0)  # (m, 3, inputs)
+    minus = less.reshape(len(less), -1, 3).transpose(1, 2, 0)
+    whole = points @ np.swapaxes(points, 1, 2)
+    kept = _powered(whole - minus @ np.swapaxes(minus, 1, 2), 0.5)
+    return np.asarray((kept @ _powered(whole, -0.5) @ points).transpose(2, 0, 1).reshape(len(plus), -1))
+
+
+def _powered(covariance: F3, power: float) -> F3:
+    """Power of each of m symmetric matrices, (m, 3, 3), on what is positive of them."""
+    value, vector = np.linalg.eigh(covariance)
+    positive = value > 1e-12 * np.maximum(value[:, -1:], 1e-300)
+    powered = np.where(positive, np.where(positive, value, 1.0) ** power, 0.0)
+    return np.asarray((vector * powered[:, None, :]) @ np.swapaxes(vector, 1, 2))
+
+
 def _predicted(solution: JointSolution, theta: F1) -> F1:
     return np.concatenate([predict(solution.machine, solution.terms, run, solution.setup, theta) for run in solution.data])
 
@@ -148,6 +177,17 @@ def campaign_trials(
 
     ``distributions``: per source name, of unit standard deviation (``u`` 1 for normal and rectangular), e.g. `LIMITS`; normal where none
     is given. The repeatability of the machine is drawn with the readings it is part of.
+
+    Raises
+    ------
+    ValueError
+        More than `MOST_POINTS` points, or positions that are none.
     """
+    if points_mm.ndim != 2 or points_mm.shape[1] != 3 or not len(points_mm) or not np.isfinite(points_mm).all():
+        raise ValueError(f"campaign trials: points_mm must be finite numbers of shape (m, 3), got shape {points_mm.shape}")
+    if len(points_mm) > MOST_POINTS:
+        raise ValueError(
+            f"campaign trials: {len(points_mm)} points need too much memory, at most {MOST_POINTS}: work them in parts, same seed"
+        )
     d = field(sources.solution.machine, sources.terms, points_mm, tool_mm, frame)
     return CampaignTrials(sources, response(sources.solution), d.reshape(-1, d.shape[2]), distributions or {})

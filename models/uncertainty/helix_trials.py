@@ -51,7 +51,7 @@ class HelixTask:
     Raises
     ------
     ValueError
-        Fewer points than unknowns, or a figure that is not positive.
+        Fewer points than unknowns, points that do not tell the unknowns apart (a plane circle), or a figure that is not positive.
     """
 
     d_mm: F2
@@ -65,6 +65,13 @@ class HelixTask:
             raise ValueError(f"helix trials: points of shape {self.d_mm.shape} cannot carry {len(self.names)} unknowns")
         if not (self.radius_mm > 0 and self.sigma_mm > 0) or (self.u_length_mm is not None and not self.u_length_mm > 0):
             raise ValueError("helix trials: radius, sigma and length uncertainty must be positive")
+        if not np.isfinite(self.d_mm).all():
+            raise ValueError("helix trials: points must be finite")
+        j = self.jacobian(np.zeros((1, len(self.names))))[1][0]
+        size = np.linalg.norm(j, axis=0)
+        told = np.linalg.matrix_rank(j / np.where(size > 0, size, 1.0), tol=1e-9)
+        if told < len(self.names) - (self.u_length_mm is not None):  # the bar's length has its calibration
+            raise ValueError(f"helix trials: the points tell only {told} of {len(self.names)} unknowns apart, as those of a plane circle")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -105,10 +112,18 @@ def fit_trials(task: HelixTask, readings_mm: F2, length_mm: F1 | None = None) ->
     Returns
     -------
     HelixFits, in the order of the trials; ``converged`` is False where neither way settled.
+
+    Raises
+    ------
+    ValueError
+        Readings of another shape, none at all, or not finite (names the trial: one of them would spoil the start of all).
     """
     readings = np.asarray(readings_mm, dtype=np.float64)
-    if readings.ndim != 2 or readings.shape[1] != len(task.d_mm):
+    if readings.ndim != 2 or readings.shape[1] != len(task.d_mm) or not len(readings):
         raise ValueError(f"helix trials: readings of shape {readings.shape} do not fit {len(task.d_mm)} points")
+    bad = np.flatnonzero(~np.isfinite(readings).all(axis=1))
+    if bad.size:
+        raise ValueError(f"helix trials: trial {bad[0]} (and {bad.size - 1} more) holds readings that are not finite")
     readings, stated = _about_calibration(task, readings, length_mm)
     start, _ = _gauss_newton(task, readings.mean(axis=0)[None], np.zeros((1, len(task.names))))
     theta = np.empty((len(readings), len(task.names)))

@@ -56,6 +56,8 @@ def linear_estimator(a: F2, sigma_mm: F1, prior_sd: F1 | None = None) -> LinearE
     """
     n, p = a.shape
     prior = np.full(p, np.inf) if prior_sd is None else prior_sd
+    if not np.isfinite(a).all():
+        raise ValueError("linear trials: the design holds numbers that are not finite")
     if sigma_mm.shape != (n,) or prior.shape != (p,) or not (sigma_mm > 0).all() or not (prior > 0).all():
         raise ValueError(f"linear trials: design {a.shape}, sigma {sigma_mm.shape} and prior {prior.shape} do not fit or are not positive")
     known = np.isfinite(prior)
@@ -106,8 +108,15 @@ def linear_trials(
     TrialStatistics
         From ``trials`` times n simulated readings; memory stays at `CHUNK_VALUES` of them. The noise is drawn and solved in single
         precision (seven digits of what is random anyway), readings and sums are double.
+
+    Raises
+    ------
+    ValueError
+        No trials are asked for, or readings are not finite.
     """
     n = readings_mm.size
+    if trials < 1 or not np.isfinite(readings_mm).all():
+        raise ValueError(f"linear trials: {trials} trials of readings, must be 1 or more of finite readings")
     centre = estimator.gain @ readings_mm
     unit = np.sqrt(np.diag(estimator.covariance))
     scaled = np.ascontiguousarray((estimator.gain * estimator.sigma_mm).T / unit, dtype=np.float32)

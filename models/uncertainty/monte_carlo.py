@@ -15,8 +15,15 @@ from models.uncertainty.moments import Moments
 Draw = Callable[[np.random.Generator, int], F2]
 """Results of so many trials, shape (trials, m): inputs drawn from their distributions, sent through the whole measurement."""
 BATCH = 10_000
-"""Trials of one batch: GUM-S1 7.9.4 asks for 10^4, or 100 / (1 - p) where that is more."""
+"""Fewest trials of one batch; 100 / (1 - p) where that is more (GUM-S1 7.9.4)."""
+FEWEST_BATCHES = 10
+"""The spread of two batches says nothing: by chance it is below a tenth of its true size in one case of twelve. Of ten it is known to a
+quarter."""
 LARGEST = 1_000_000
+VALIDATION_SHARE = 0.2
+"""The trials that judge the law of propagation must be known this much better than what they judge (GUM-S1 8.2)."""
+COLUMNS = 300
+"""Results whose trials are sorted at once."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +39,11 @@ class MonteCarlo:
     probability : float
     trials : int
     tolerance : array, shape (m,)
-        Numerical tolerance that was asked for: half a unit of the last wanted digit of u.
+        Numerical tolerance that was asked for: half a unit of the last wanted digit of u, times the share.
     settled : array of bool, shape (m,)
         Whether mean, u and both ends of the shortest and the symmetric interval are known that well, at 95 %.
+    ends_known : array, shape (m,)
+        How well the ends of the symmetric interval are known in fact, at 95 %; inf from fewer than `FEWEST_BATCHES` batches.
     """
 
     mean: F1
@@ -46,6 +55,7 @@ class MonteCarlo:
     trials: int
     tolerance: F1
     settled: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    ends_known: F1
 
 
 def adaptive(
@@ -54,50 +64,82 @@ def adaptive(
     *,
     probability: float = PROBABILITY,
     digits: int = 2,
-    batch: int = BATCH,
+    share: float = 1.0,
     largest: int = LARGEST,
 ) -> MonteCarlo:
-    """Run batches of trials until every figure is stable (GUM-S1 7.9.4).
+    """Run batches of trials, at least `FEWEST_BATCHES`, until every figure is stable (GUM-S1 7.9.4).
 
     Parameters
     ----------
     draw : callable
-        Gives the results of one batch; its memory is the only one that grows with the batch.
+        Gives the results of one batch. Memory is one batch of all results, 0.24 MB per point, some three times.
     rng : Generator
         Seeded by the caller; the same seed gives the same figures.
     digits : int
         How many digits of u shall be right: 1 or 2 (GUM-S1 7.9.2).
-    batch, largest : int
-        Trials of one batch; where to give up. What did not settle by then says so.
+    share : float
+        Part of half a unit of the last digit to which all shall be known; `VALIDATION_SHARE` for trials that `validate` is given.
+    largest : int
+        Trials at which to give up. What did not settle by then says so.
 
     Raises
     ------
     ValueError
-        ``digits`` is neither 1 nor 2, or a batch is too small for the probability.
+        ``digits`` is neither 1 nor 2, the share is none, or fewer than one batch is allowed.
     """
-    if digits not in (1, 2):
-        raise ValueError(f"Monte Carlo: digits {digits}, must be 1 or 2")
-    if batch < 10.0 / (1.0 - probability):
-        raise ValueError(f"Monte Carlo: {batch} trials per batch are too few for intervals of {probability:.0%}")
+    batch = batch_size(probability)
+    if digits not in (1, 2) or not 0.0 < share <= 1.0:
+        raise ValueError(f"Monte Carlo: digits {digits}, must be 1 or 2; share {share}, must be above 0 and at most 1")
+    if largest < batch:
+        raise ValueError(f"Monte Carlo: {largest} trials are too few for intervals of {probability:.4g}: one batch has {batch}")
     figures: list[F2] = []
     moments: Moments | None = None
     while True:
         results = draw(rng, batch)
         moments = moments or Moments(results.mean(axis=0))
         moments.add(results)
-        ends = (symmetric_interval(results, probability), shortest_interval(results, probability))
-        figures.append(np.stack([results.mean(axis=0), results.std(axis=0, ddof=1), *(e for i in ends for e in (i.low, i.high))]))
+        figures.append(_figures(results, probability))
         u = np.sqrt(np.diag(moments.covariance))
-        tolerance = numerical_tolerance(u, digits)
-        settled = np.zeros(u.size, dtype=np.bool_)
-        if len(figures) > 1:
-            spread = np.std(figures, axis=0, ddof=1) / np.sqrt(len(figures))
-            settled = (2.0 * spread <= tolerance).all(axis=0)
+        tolerance = share * numerical_tolerance(u, digits)
+        known = _known(figures)
+        settled = (known <= tolerance).all(axis=0)
         if settled.all() or moments.count + batch > largest:
             break
     middle = np.mean(figures, axis=0)
     both = Interval(middle[2], middle[3]), Interval(middle[4], middle[5])
-    return MonteCarlo(moments.mean, u, moments.covariance, *both, probability, moments.count, tolerance, settled)
+    return MonteCarlo(
+        moments.mean, u, moments.covariance, *both, probability, moments.count, tolerance, np.asarray(settled), known[2:4].max(axis=0)
+    )
+
+
+def batch_size(probability: float) -> int:
+    """Trials of one batch: 10^4, or 100 / (1 - p) where that is more (GUM-S1 7.9.4).
+
+    Raises
+    ------
+    ValueError
+        The probability is not between 0 and 1.
+    """
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"Monte Carlo: probability {probability} must lie between 0 and 1")
+    return max(BATCH, int(np.ceil(100.0 / (1.0 - probability) - 1e-6)))
+
+
+def _figures(results: F2, probability: float) -> F2:
+    """Mean, u and the ends of both intervals of one batch, shape (6, m); sorted in parts, which keeps the copies small."""
+    out = np.empty((6, results.shape[1]))
+    for i in range(0, results.shape[1], COLUMNS):
+        part = results[:, i : i + COLUMNS]
+        ends = (symmetric_interval(part, probability), shortest_interval(part, probability))
+        out[:, i : i + COLUMNS] = [part.mean(axis=0), part.std(axis=0, ddof=1), *(e for k in ends for e in (k.low, k.high))]
+    return out
+
+
+def _known(figures: list[F2]) -> F2:
+    """How well every figure is known, (6, m): twice the standard deviation of its mean over the batches; inf from too few of them."""
+    if len(figures) < FEWEST_BATCHES:
+        return np.full(figures[0].shape, np.inf)
+    return np.asarray(2.0 * np.std(figures, axis=0, ddof=1) / np.sqrt(len(figures)))
 
 
 def numerical_tolerance(u: F1, digits: int) -> F1:
@@ -129,9 +171,20 @@ def validate(value: F1, expanded: F1, found: MonteCarlo, *, digits: int = 1) -> 
     ----------
     value, expanded : array, shape (m,)
     found : MonteCarlo
-        Of the same results and probability, with a numerical tolerance no larger than a fifth of the one meant here (GUM-S1 8.2).
+        Of the same results and probability, ends known to a fifth of the tolerance meant here (GUM-S1 8.2): ``adaptive(...,
+        digits=digits, share=VALIDATION_SHARE)``.
     digits : int
         Of u that are taken to be meaningful.
+
+    Raises
+    ------
+    ValueError
+        The trials are not known well enough to judge by.
     """
     tolerance = numerical_tolerance(found.u, digits)
+    if not (found.ends_known <= VALIDATION_SHARE * tolerance).all():
+        raise ValueError(
+            f"Monte Carlo: {found.trials} trials do not know the ends of the interval to a fifth of half a unit in {digits} digits of u, "
+            f"so they cannot validate the law of propagation: run adaptive(..., digits={digits}, share={VALIDATION_SHARE}) with more trials"
+        )
     return Validation(np.abs(value - expanded - found.symmetric.low), np.abs(value + expanded - found.symmetric.high), tolerance)

@@ -1,15 +1,18 @@
 """Monte Carlo of a whole campaign against the law of propagation; stated intervals against machines that the solver does not know."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from models.solvers.joint import solve_joint
 from models.solvers.observations import block_average
+from models.uncertainty import campaign_trials as module
 from models.uncertainty.campaign_trials import LIMITS, campaign_trials
 from models.uncertainty.distributions import Distribution
 from models.uncertainty.frame import RigidFree, rigid_at, volume_frame
 from models.uncertainty.inputs import Inputs
-from models.uncertainty.monte_carlo import adaptive, validate
+from models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
 from models.uncertainty.prediction import predict_deviation
 from models.uncertainty.sources import error_sources
 from models.volumetric import rigid_design, volume_grid
@@ -33,9 +36,10 @@ def sources(solution):
 
 def test_trials_give_the_propagated_uncertainty_and_validate_its_intervals(sources):
     """GUM-S1 8: ends of the 95 % interval agree within half a unit of the first digit of u; u within its sampling error."""
-    found = adaptive(campaign_trials(sources, POINTS, frame=FRAME).linear(), np.random.default_rng(1), digits=1, largest=300_000)
-    p = predict_deviation(sources, POINTS, frame=FRAME)
-    assert found.settled.all()
+    points = POINTS[:2]
+    draw = campaign_trials(sources, points, frame=FRAME).linear()
+    found = adaptive(draw, np.random.default_rng(1), digits=1, share=VALIDATION_SHARE, largest=400_000)
+    p = predict_deviation(sources, points, frame=FRAME)
     assert validate(p.deviation_mm.ravel(), p.expanded_mm.ravel(), found).valid.all()
     np.testing.assert_allclose(found.u, p.u_mm.ravel(), rtol=5.0 / np.sqrt(2.0 * found.trials))
     assert np.abs((found.mean - p.deviation_mm.ravel()) / found.u).max() < 5.0 / np.sqrt(found.trials)
@@ -58,10 +62,48 @@ def test_limits_make_shorter_intervals_than_the_law_of_propagation_says(solution
     point = np.array([[580.0, 20.0, 20.0]])
     p = predict_deviation(hot, point, frame=FRAME)
     draw = campaign_trials(hot, point, frame=FRAME, distributions=LIMITS).linear()
-    found = adaptive(draw, np.random.default_rng(3), digits=1, largest=60_000)
+    found = adaptive(draw, np.random.default_rng(3), digits=1, share=VALIDATION_SHARE, largest=200_000)
     assert found.u[0] == pytest.approx(p.u_mm[0, 0], rel=0.02)
     assert (found.symmetric.width / found.u)[0] < 2 * 1.75
-    assert not validate(p.deviation_mm.ravel(), p.expanded_mm.ravel(), found, digits=2).valid[0]
+    assert not validate(p.deviation_mm.ravel(), p.expanded_mm.ravel(), found).valid[0]
+
+
+@pytest.mark.parametrize("repeatability_mm", [1e-4, 5e-4, 3e-3])
+def test_repeatability_counts_once_however_large_it_is_stated(solution, repeatability_mm):
+    """3 um stated for readings that scatter by less: the law of propagation and trials of the readings agree all the same."""
+    inputs = replace(Inputs().of_the_data_alone(), repeatability_mm=repeatability_mm)
+    stated, none = error_sources(solution, inputs), error_sources(solution, Inputs().of_the_data_alone())
+    u, without = (predict_deviation(s, POINTS, frame=FRAME).u_mm for s in (stated, none))
+    np.testing.assert_allclose(u, without, rtol=1e-9)
+    drawn = campaign_trials(stated, POINTS, frame=FRAME).linear()(np.random.default_rng(1), 20_000)
+    np.testing.assert_allclose(drawn.std(axis=0), u.ravel(), rtol=5.0 / np.sqrt(2.0 * len(drawn)))
+
+
+def test_trials_of_a_point_do_not_depend_on_the_points_beside_it(solution):
+    """What the estimated sizes add is cut at nothing point by point, as the law has it: 200 other points change nothing."""
+    sources = error_sources(solution, Inputs().of_the_data_alone())
+    others = np.random.default_rng(3).uniform(MACHINE.stroke_mm[:, 0], MACHINE.stroke_mm[:, 1], (200, 3))
+    alone, among = (
+        campaign_trials(sources, p, frame=FRAME).linear()(np.random.default_rng(1), 300)[:, :18] for p in (POINTS, np.r_[POINTS, others])
+    )
+    np.testing.assert_allclose(among, alone, rtol=1e-5, atol=1e-9)
+    size = dict(campaign_trials(sources, others, frame=FRAME)._others())["estimated_sizes"]
+    p = predict_deviation(sources, others, frame=FRAME)
+    law = p.variance_mm2[p.names.index("estimated_sizes")].ravel()
+    np.testing.assert_allclose((size**2).sum(axis=0), law, rtol=1e-6, atol=1e-6 * law.max())
+
+
+def test_readings_are_drawn_in_parts_and_too_many_points_are_refused(sources, monkeypatch):
+    trials = campaign_trials(sources, POINTS, frame=FRAME)
+    whole = trials.linear()(np.random.default_rng(6), 200)
+    monkeypatch.setattr(module, "CHUNK_READINGS", 7 * trials.response.weight.size)
+    parts = trials.linear()(np.random.default_rng(6), 200)
+    np.testing.assert_allclose(parts.std(), whole.std(), rtol=0.1)  # other draws of the same readings
+    monkeypatch.setattr(module, "MOST_POINTS", 5)
+    with pytest.raises(ValueError, match="6 points need too much memory"):
+        campaign_trials(sources, POINTS)
+    with pytest.raises(ValueError, match="finite numbers"):
+        campaign_trials(sources, np.full((1, 3), np.nan))
 
 
 def test_one_approach_scatters_more_than_the_mean_of_many(solution):

@@ -6,7 +6,7 @@ import pytest
 from models.uncertainty.coverage import coverage_factor, effective_dof, shortest_interval, symmetric_interval, vector_factor
 from models.uncertainty.distributions import Distribution
 from models.uncertainty.moments import Moments
-from models.uncertainty.monte_carlo import adaptive, numerical_tolerance, validate
+from models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, batch_size, numerical_tolerance, validate
 
 
 def test_effective_degrees_of_freedom_of_the_guide_s_end_gauge():
@@ -64,7 +64,7 @@ def additive(*inputs: Distribution):
     ],
 )
 def test_additive_models_of_supplement_1(inputs, u, end, valid):
-    found = adaptive(additive(*inputs), np.random.default_rng(9), largest=2_000_000)
+    found = adaptive(additive(*inputs), np.random.default_rng(9), share=VALIDATION_SHARE, largest=10_000_000)
     assert found.settled.all()
     assert found.u[0] == pytest.approx(u, rel=0.005)
     for interval in (found.symmetric, found.shortest):
@@ -88,7 +88,51 @@ def test_numerical_tolerance_is_half_a_unit_of_the_last_digit():
     np.testing.assert_allclose(numerical_tolerance(np.array([0.00035]), 1), [5e-5])
 
 
-@pytest.mark.parametrize("arguments", [{"digits": 3}, {"batch": 50}])
+def test_a_batch_is_as_large_as_the_supplement_asks_and_ten_of_them_are_run():
+    """GUM-S1 7.9.4: M = max(J, 10^4), J of 100 / (1 - p) or more."""
+    assert [batch_size(p) for p in (0.5, 0.95, 0.99, 0.999)] == [10_000, 10_000, 10_000, 100_000]
+    seen = []
+
+    def constant(rng, trials):
+        seen.append(trials)
+        return np.zeros((trials, 1)) + rng.normal(0.0, 1e-9, (trials, 1)) ** 3
+
+    found = adaptive(constant, np.random.default_rng(0), digits=1)
+    assert seen[:10] == [10_000] * 10  # the spread of two batches may be small by chance
+    assert found.trials >= 100_000
+    adaptive(constant, np.random.default_rng(0), digits=1, probability=0.999)
+    assert seen[-1] == 100_000
+
+
+def test_what_is_called_settled_is_known_to_the_tolerance():
+    """Ends of 1.96 sd for 40 seeds; twice the standard deviation of the mean, so 5 % of each of six figures may miss it, not by much."""
+    off = []
+    for seed in range(40):
+        found = adaptive(lambda rng, n: 2.0 * rng.standard_normal((n, 1)), np.random.default_rng(seed), digits=1, share=0.1)
+        assert found.settled.all()
+        off.append(abs(found.symmetric.high[0] - 1.96 * 2.0) / found.tolerance[0])
+    assert np.mean(np.array(off) < 1.0) > 0.9
+    assert max(off) < 2.0
+
+
+def test_trials_that_are_not_known_well_enough_do_not_judge_the_law_of_propagation():
+    """GUM-S1 8.2: a fifth of the tolerance."""
+
+    def normal(rng, trials):
+        return 2.0 * rng.standard_normal((trials, 1))
+
+    coarse = adaptive(normal, np.random.default_rng(1), digits=1)
+    fine = adaptive(normal, np.random.default_rng(1), digits=1, share=VALIDATION_SHARE)
+    short = adaptive(normal, np.random.default_rng(1), digits=2, share=VALIDATION_SHARE, largest=20_000)
+    for found, digits in ((coarse, 2), (fine, 2), (short, 1), (short, 2)):
+        with pytest.raises(ValueError, match="cannot validate"):
+            validate(np.zeros(1), np.full(1, 3.92), found, digits=digits)
+    assert validate(np.zeros(1), np.full(1, 3.92), fine).valid.all()
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"digits": 3}, {"share": 0.0}, {"share": 2.0}, {"largest": 500}, {"probability": 1.0}, {"probability": float("nan")}]
+)
 def test_monte_carlo_refuses_what_it_cannot_do(arguments):
     with pytest.raises(ValueError, match="Monte Carlo"):
         adaptive(additive(Distribution()), np.random.default_rng(0), **arguments)

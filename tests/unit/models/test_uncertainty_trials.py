@@ -16,6 +16,10 @@ POINTS = helix_points(np.zeros(3), RADIUS, turns=3, n=63, law="angle", axis=2)
 TRUE = np.array([120e-6, -80e-6, 40e-6, 60e-6, -90e-6, 30e-6, 0.012, -0.02, 0.008, 1.2e-3])
 
 
+ANGLE = np.linspace(0.0, 2.0 * np.pi, 63, endpoint=False)
+CIRCLE = RADIUS * np.column_stack([np.cos(ANGLE), np.sin(ANGLE), 0.0 * ANGLE])
+
+
 def problem(seed=0, n=80, p=12):
     rng = np.random.default_rng(seed)
     return rng.normal(size=(n, p)) * np.logspace(-3, 3, p), rng.uniform(0.5, 2.0, n), rng.normal(size=p)
@@ -84,6 +88,23 @@ def test_linear_trials_refuse_what_has_no_solution():
         linear_estimator(a, sigma)
     with pytest.raises(ValueError, match="do not fit or are not positive"):
         linear_estimator(a, np.zeros(len(sigma)))
+
+
+def test_one_trial_that_is_no_number_is_named_and_spoils_no_other_silently():
+    y = readings(task()) + np.random.default_rng(2).normal(0.0, SIGMA, (20, len(POINTS)))
+    y[3, 5] = np.nan
+    with pytest.raises(ValueError, match="trial 3"):
+        fit_trials(task(), y)
+
+
+def test_linear_trials_refuse_no_trials_and_numbers_that_are_none():
+    a, sigma, theta = problem()
+    estimator = linear_estimator(a, sigma)
+    for readings_mm, trials in ((a @ theta, 0), (np.full(len(sigma), np.nan), 10)):
+        with pytest.raises(ValueError, match="linear trials"):
+            linear_trials(estimator, readings_mm, np.random.default_rng(0), trials)
+    with pytest.raises(ValueError, match="linear trials: the design"):
+        linear_estimator(np.where(a == a[0, 0], np.nan, a), sigma)
 
 
 @pytest.mark.parametrize("u_length_mm", [None, 1e-3])
@@ -164,6 +185,11 @@ def test_the_jacobian_of_a_helix_is_its_derivative():
         lambda: fit_trials(task(), np.zeros((3, 5))),
         lambda: fit_trials(task(), np.zeros((3, 63)), np.zeros(3)),
         lambda: helix_trials(task(), np.zeros(63), np.random.default_rng(0), 0),
+        lambda: helix_trials(task(), np.full(63, np.nan), np.random.default_rng(0), 100),
+        lambda: fit_trials(task(), np.zeros((0, 63))),
+        lambda: HelixTask(np.full((63, 3), np.nan), RADIUS, SIGMA),
+        lambda: HelixTask(CIRCLE, RADIUS, SIGMA),
+        lambda: HelixTask(CIRCLE, RADIUS, SIGMA, 1e-3),
     ],
 )
 def test_helix_trials_refuse_what_cannot_be_solved(wrong):
