@@ -66,10 +66,24 @@ class LinearCase:
         return self.undisturbed + noise * self.sigma_mm
 
     @cached_property
+    def _gain(self) -> F2:
+        """Estimates per whitened reading, without any of the contestants' code."""
+        return (np.linalg.inv(self.rows.T @ self.rows) @ self.rows[: len(self.sigma_mm)].T) * self.prior_sd[:, None]
+
+    @cached_property
+    def covariance(self) -> F2:
+        """How the estimates scatter from trial to trial, by propagation: K Sigma K^T."""
+        return self._gain @ self._gain.T
+
+    @cached_property
+    def centre(self) -> F1:
+        """Estimates of the undisturbed readings."""
+        return self._gain @ (self.undisturbed / self.sigma_mm)
+
+    @cached_property
     def u(self) -> F1:
         """How far the estimates scatter from trial to trial, by propagation."""
-        gain = np.linalg.inv(self.rows.T @ self.rows) @ self.rows[: len(self.sigma_mm)].T
-        return np.linalg.norm(gain, axis=1) * self.prior_sd
+        return np.sqrt(np.diag(self.covariance))
 
 
 def linear_case(points: int = 63) -> LinearCase:
@@ -100,10 +114,20 @@ class HelixCase:
         return self.reading_mm + self.task.sigma_mm * np.random.default_rng(seed).normal(size=(trials, len(self.reading_mm)))
 
     @property
+    def covariance(self) -> F2:
+        """Covariance of the unknowns by propagation, about their true values."""
+        j = self.task.jacobian(SIX[None])[1][0] / self.task.sigma_mm
+        return np.linalg.inv(j.T @ j)
+
+    @property
+    def centre(self) -> F1:
+        """Estimates of the undisturbed readings: the truth."""
+        return SIX
+
+    @property
     def u(self) -> F1:
         """Standard uncertainties of the unknowns by propagation."""
-        j = self.task.jacobian(SIX[None])[1][0] / self.task.sigma_mm
-        return np.sqrt(np.diag(np.linalg.inv(j.T @ j)))
+        return np.sqrt(np.diag(self.covariance))
 
 
 @cache

@@ -1,8 +1,10 @@
-"""The least error that any solver can leave: Bayesian Cramer-Rao bound of a campaign on a machine whose statistics are known beforehand.
+"""The least error that any solver can leave on the average over machines: Bayesian Cramer-Rao bound of a campaign on a machine of known
+statistics.
 
 The solver of the bound is told what nobody knows of a real machine: how large each of its 21 error motions is and how their Legendre
 coefficients belong together (from the population's own law), how well bars, cups, mirrors and wavelength are set, and the noise. Everything
-enters linearly, so the posterior covariance is the bound (van Trees).
+enters linearly, so the posterior covariance is the bound (van Trees). It is an expectation over machines and readings: on one machine a
+solver may come out below it by chance, on all of them together only within their sampling error (`tests.campaigns.accuracy.pooled`).
 """
 
 from dataclasses import replace
@@ -24,7 +26,7 @@ FUNCTIONS = 600
 
 
 def bound_mm(case: Case, pairs: Pairs) -> float:
-    """Rms error of the distances between pairs of points that the best solver leaves, mm."""
+    """Rms error of the distances between pairs of points that the best solver leaves in expectation, mm."""
     conditions = case.truth.rig.conditions
     priors = true_priors(case)
     terms = smooth_terms(ORDER)

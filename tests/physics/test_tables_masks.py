@@ -1,9 +1,10 @@
-"""Where the error is known worse than it is large: not compensated, no step, and never worse than doing nothing."""
+"""Where the error is known worse than it is large: not compensated, no step, and by the identified field never worse than nothing."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import linalg
 
 from models.compensation.distances import inner_box_mm, random_pairs
 from models.compensation.grid import compensable_nodes, grid_table, nodes_mm
@@ -35,7 +36,7 @@ def distance_errors(error, correction, pairs):
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.95), st.sampled_from([0.3, 1.0, 5.0]))
 @settings(max_examples=40, deadline=None)
-def test_no_mask_makes_distances_worse_than_doing_nothing(seed, share, bend):
+def test_no_mask_makes_distances_of_the_identified_field_worse_than_doing_nothing(seed, share, bend):
     error = field(seed, bend)
     mask = np.random.default_rng(seed + 1).random(SHAPE) < share
     correction, done = blend(NODES, error, mask)
@@ -88,15 +89,33 @@ def test_the_border_is_no_larger_than_the_error_that_is_left_uncorrected():
         assert step.max() <= 1.5 * free.max()
 
 
-def test_a_mask_that_cuts_a_smooth_error_to_pieces_compensates_nothing():
-    u = POINTS / BOX[:, 1]
-    error = np.zeros((*SHAPE, 3))
-    error[..., 0] = (1e-3 * u[:, 0] + 20e-3 * (u[:, 2] > 0.5) * (u[:, 1] > 0.5)).reshape(SHAPE)
-    worst = [blend(NODES, error, np.random.default_rng(k).random(SHAPE) < 0.5) for k in range(20)]
-    for correction, done in worst:
-        pairs = random_pairs(BOX)
-        assert np.sum(distance_errors(error, correction, pairs) ** 2) <= np.sum(distance_errors(error, 0 * correction, pairs) ** 2)
-        assert done.any() or not correction.any()
+def worst_error(mask):
+    """The error that the rule would make worst with this mask: largest eigenvalue of "after" against "before", quadratic in the error."""
+    n, pairs = len(POINTS), random_pairs(BOX)
+    free = np.repeat(mask.reshape(-1), 3)
+    units = np.eye(3 * n).reshape(3 * n, *SHAPE, 3)
+    to_distance = np.stack([distance_errors(unit, 0 * unit, pairs) for unit in units], axis=1)
+    moves = rigid_design(POINTS).reshape(-1, 6) * free[:, None]
+    frame = np.linalg.lstsq(to_distance @ moves, -to_distance * ~free, rcond=None)[0]
+    after = to_distance * ~free + to_distance @ moves @ frame
+    before = to_distance.T @ to_distance
+    little = 1e-6 * np.trace(before) / len(before) * np.eye(3 * n)
+    error = linalg.eigh(after.T @ after, before + little, subset_by_index=[3 * n - 1, 3 * n - 1])[1][:, 0]
+    return (0.02 * error / np.abs(error).max()).reshape(*SHAPE, 3)
+
+
+@pytest.mark.parametrize(("seed", "share"), [(0, 0.5), (2, 0.9), (4, 0.1)])
+def test_where_the_rule_would_do_harm_nothing_is_compensated(seed, share):
+    """Random errors never get there: it takes the worst error there is for a mask (2 to 5 times the sum of squares)."""
+    mask = np.random.default_rng(seed).random(SHAPE) < share
+    error = worst_error(mask)
+    correction, done = blend(NODES, error, mask)
+    assert mask.any()
+    assert not done.any()
+    assert not correction.any()
+    whole, all_done = blend(NODES, error, np.ones(SHAPE, dtype=bool))  # the same error, all of it known, is compensated
+    assert all_done.all()
+    assert np.abs(distance_errors(error, whole, random_pairs(BOX, 300, seed=2))).max() < 1e-9
 
 
 def corner_campaign(truth):
@@ -108,21 +127,32 @@ def corner_campaign(truth):
     return tuple(runs)
 
 
-def test_what_a_campaign_in_one_corner_does_not_know_is_marked_and_the_table_does_no_harm():
-    truth = Truth(5)
-    s = solve_joint(MACHINE, corner_campaign(truth))
-    mask = compensable_nodes(s, (7, 6, 5))
-    assert not mask.all()
-    table = grid_table(s, (7, 6, 5), compensable=mask)
-    left_alone = table.correction_mm[~table.compensated]
-    assert np.abs(left_alone - left_alone[0]).max() < 1e-12
-    pairs = random_pairs(inner_box_mm(MACHINE), 3000, seed=4)
+PAIRS = random_pairs(inner_box_mm(MACHINE), 3000, seed=4)
 
-    def rms(correction):
-        off = [truth.deviation(p + correction(p)) + correction(p) for p in (pairs.first_mm, pairs.second_mm)]
-        return np.sqrt(np.mean(pairs.error_mm(*off) ** 2))
 
-    assert rms(table.correction_at) <= rms(np.zeros_like)
+def true_rms(truth, correction):
+    off = [truth.deviation(p + correction(p)) + correction(p) for p in (PAIRS.first_mm, PAIRS.second_mm)]
+    return float(np.sqrt(np.mean(PAIRS.error_mm(*off) ** 2)))
+
+
+def test_what_a_campaign_in_one_corner_does_not_know_is_marked_and_eight_machines_together_are_not_harmed():
+    """ "No worse" is promised for the identified field. A true machine may become worse; all together may not, and less than unmasked."""
+    before, masked, full = [], [], []
+    for seed in range(1, 9):
+        truth = Truth(seed)
+        s = solve_joint(MACHINE, corner_campaign(truth))
+        mask = compensable_nodes(s, (7, 6, 5))
+        assert mask.mean() < 0.6  # seen: 0 to 0.42
+        table = grid_table(s, (7, 6, 5), compensable=mask)
+        left_alone = table.correction_mm[~table.compensated]
+        assert np.abs(left_alone - left_alone[0]).max() < 1e-12
+        before.append(true_rms(truth, np.zeros_like))
+        masked.append(true_rms(truth, table.correction_at))
+        full.append(true_rms(truth, grid_table(s, (7, 6, 5)).correction_at))
+    ratio, without = (np.array(v) / before for v in (masked, full))
+    assert ratio.mean() < 1.0  # seen: 0.91
+    assert ratio.max() < 1.2  # one machine may lose; seen: 1.00
+    assert without.max() > 1.2  # the same campaigns do harm without the mask; seen: 1.37
 
 
 def test_a_good_campaign_leaves_almost_nothing_uncompensated_and_loses_nothing_by_the_mask():
@@ -130,11 +160,5 @@ def test_a_good_campaign_leaves_almost_nothing_uncompensated_and_loses_nothing_b
     s = solve_joint(MACHINE, truth.campaign())
     mask = compensable_nodes(s, (9, 9, 9))
     assert mask.mean() > 0.9
-    pairs = random_pairs(inner_box_mm(MACHINE), 3000, seed=4)
-
-    def rms(correction):
-        off = [truth.deviation(p + correction(p)) + correction(p) for p in (pairs.first_mm, pairs.second_mm)]
-        return np.sqrt(np.mean(pairs.error_mm(*off) ** 2))
-
-    masked, full = (rms(grid_table(s, (9, 9, 9), compensable=m).correction_at) for m in (mask, None))
+    masked, full = (true_rms(truth, grid_table(s, (9, 9, 9), compensable=m).correction_at) for m in (mask, None))
     assert masked < 1.5 * full

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.campaigns.accuracy import line, one, ratios, summary
+from tests.campaigns.accuracy import line, one, pooled, ratios, summary
 
 SEEDS = (0, 12, 25)
 """Three machines that are good already, the hardest to make ten times better."""
@@ -37,6 +37,22 @@ def test_the_grid_is_near_the_bound_and_the_prediction_is_true():
     )
     assert after < 1.2 * least
     assert 0.4 < after / stated < 1.2
+
+
+def test_the_identified_field_is_at_the_bound_within_the_sampling_of_the_machines():
+    """The bound is an expectation: all machines together may be below it by chance only, which three of them know coarsely."""
+    ratio = pooled([row(seed) for seed in SEEDS], lambda r: r.solution_mm, lambda r: r.bound_mm)
+    assert ratio.value + 3.0 * ratio.u > 1.0
+    assert ratio.value - 3.0 * ratio.u < 1.2
+
+
+def test_the_sampling_error_of_a_pooled_ratio_is_that_of_drawn_machines():
+    rng = np.random.default_rng(3)
+    drawn = [pooled(list(rng.chisquare(3, 30) ** 0.5), lambda r: r, lambda r: 3.0**0.5) for _ in range(400)]
+    values = np.array([d.value for d in drawn])
+    assert values.mean() == pytest.approx(1.0, abs=0.02)
+    assert np.mean([d.u for d in drawn]) == pytest.approx(values.std(), rel=0.15)
+    assert pooled([1.0], lambda r: r, lambda r: 1.0).u == np.inf
 
 
 def test_the_summary_names_the_bound():

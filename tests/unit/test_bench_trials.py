@@ -50,8 +50,7 @@ def test_trials_of_every_contestant_agree_with_ours(name, sizes, needs, ours, re
 
 
 def judge(case, result, ours):
-    u = (cases.linear_case() if case == "linear" else cases.helix_case()).u
-    return sampled(result, ours, u, SAME_DRAWS_U[case])
+    return sampled(result, ours, cases.linear_case() if case == "linear" else cases.helix_case(), SAME_DRAWS_U[case])
 
 
 @pytest.mark.parametrize("name", ["uncertainties", "gtc"])
@@ -84,6 +83,19 @@ def test_the_judge_sees_another_estimate_another_mean_another_covariance(case, o
     assert not judge(case, {**good, "common": good["common"] + 0.02 * u}, good)["ok"]
     assert not judge(case, {**good, "mean": good["mean"] + 0.06 * u}, good)["ok"]
     assert not judge(case, {**good, "covariance": 1.1 * good["covariance"]}, good)["ok"]
+
+
+@pytest.mark.parametrize("case", ["linear", "helix"])
+def test_ours_is_held_against_the_law_of_propagation(case, ours):
+    """A tenth more or less variance, or a mean off by 0.06 u, in our own figures: nobody to compare with would see it in 400 trials."""
+    good = ours[case]
+    verdict = judge(case, good, good)
+    assert verdict["ok"]
+    assert verdict["covariance_sigmas"] > 0.0
+    u = (cases.linear_case() if case == "linear" else cases.helix_case()).u
+    for wrong in ({"covariance": 1.1 * good["covariance"]}, {"covariance": 0.9 * good["covariance"]}, {"mean": good["mean"] + 0.06 * u}):
+        falsified = {**good, **wrong}
+        assert not judge(case, falsified, falsified)["ok"]
 
 
 def test_a_joint_solution_of_a_smaller_campaign_finds_the_waves_and_a_wrong_one_is_seen():
