@@ -28,7 +28,7 @@ def not_observable(what: Problem, runs: Iterable[RunData]) -> tuple[str, ...]:
     if silent:
         tool = ", ".join(f"{v:g}" for v in what.machine.tool_mm)
         out.append(
-            f"{silent} combinations of error motions move nothing with the tool ({tool}) mm, but do with another: "
-            "all of this holds for this tool length only."
+            f"What {silent} of the error motions' {len(what.terms)} degrees of freedom do is not seen: they move nothing with the tool "
+            f"({tool}) mm, but do with another. All of this holds for this tool length only."
         )
     return (*out, *(a.text for a in found.advice))

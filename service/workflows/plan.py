@@ -112,7 +112,8 @@ def words(test: Measurement) -> str:
     """A measurement as an operator reads it."""
     if isinstance(test, HelixTest):
         at = ", ".join(f"{v:g}" for v in test.centre_mm)
-        return f"ball-bar {test.radius_mm:g} mm about ({at}){'' if test.direction > 0 else ', equator to pole'}"
+        opens = "" if (test.axis, test.opens) == (2, 1) else f", opening along {'+' if test.opens > 0 else '-'}{AXES[test.axis]}"
+        return f"ball-bar {test.radius_mm:g} mm about ({at}){opens}{'' if test.direction > 0 else ', equator to pole'}"
     if isinstance(test, DiagonalTest):
         return f"laser, body diagonal {test.diagonal}, {f'steps {test.order}' if test.order else 'straight'}"
     others = [a for a in range(3) if a != test.axis]

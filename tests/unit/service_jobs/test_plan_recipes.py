@@ -286,5 +286,6 @@ def test_too_few_minutes_are_one_clear_line():
 
 def test_words_for_the_operator_name_every_kind():
     assert words(HelixTest((1.0, 2.0, 3.0), 150.0)) == "ball-bar 150 mm about (1, 2, 3)"
+    assert words(HelixTest((1.0, 2.0, 3.0), 150.0, axis=1, opens=-1)) == "ball-bar 150 mm about (1, 2, 3), opening along -Y"
     assert words(LineTest(1, (0.1, 0.9))) == "laser along Y, X at 10 %, Z at 90 % of the stroke"
     assert words(DiagonalTest("ppp", "")) == "laser, body diagonal ppp, straight"
