@@ -14,6 +14,8 @@ LEVEL = 0.01
 """A test is flagged when chance explains it with less than this, after correction for the number of tests (Holm)."""
 FEWEST = 10
 
+STILL = 1e-3
+"""Positions or times closer together than this, in mm or s, are one place."""
 
 @dataclass(frozen=True, slots=True)
 class ResidualTest:
@@ -94,7 +96,8 @@ def _alike(label: str, name: str, z: F1, at: F1, unit: str) -> ResidualTest:
     if length == 0:
         text = f"{label}: neighbouring residuals {along} oppose each other"
     else:
-        text = f"{label}: residuals {along} are alike over {span:.3g} {unit}: more than the model follows"
+        far = f"over {span:.3g} {unit}" if span > STILL else "at one place"
+        text = f"{label}: residuals {along} are alike {far}: more than the model follows"
     return ResidualTest(label, name, q, p, p, False, text)
 
 
