@@ -13,13 +13,13 @@ from models.compensation.grid import GridTable, compensable_nodes, grid_table, n
 from models.uncertainty.budget import worst_point
 from models.uncertainty.campaign_trials import LIMITS, campaign_trials
 from models.uncertainty.frame import volume_frame
-from models.uncertainty.monte_carlo import adaptive, validate
+from models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
 from service.errors import TableRefused
 from service.workflows.solve_report import Account, judged
 
 Say = Callable[[str], None]
 GRID_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,u_dx_um,u_dy_um,u_dz_um,compensated"
-SEED, TRIALS = 101, 200_000
+SEED, TRIALS = 101, 400_000
 
 
 def table_rows(found: Account, lsb_mm: float) -> list[dict[str, Any]]:
@@ -76,7 +76,7 @@ def monte_carlo(found: Account, say: Say) -> dict[str, Any]:
         say(f"Monte Carlo: {done} trials")
         return draw(rng, n)
 
-    drawn = adaptive(counted, np.random.default_rng(SEED), digits=1, largest=TRIALS)
+    drawn = adaptive(counted, np.random.default_rng(SEED), digits=1, share=VALIDATION_SHARE, largest=TRIALS)
     valid = validate(p.deviation_mm[at], p.expanded_mm[at], drawn).valid
     half = 0.5 * (drawn.symmetric.high - drawn.symmetric.low) * 1e3
     stated = p.expanded_mm[at] * 1e3
