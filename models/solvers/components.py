@@ -1,8 +1,8 @@
 """Variance components: how noisy the instruments are and how large errors of each class typically are, from the readings themselves.
 
 Marginal likelihood of a linear normal model (restricted maximum likelihood with weak hyperpriors), maximised by Fisher scoring on the
-logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". Their own uncertainty is carried into the covariance of the
-unknowns (Kackar and Harville 1984). Deterministic: no random numbers, a fixed number of steps at most.
+logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". Their own uncertainty widens the prior of the error motions
+(`cautious`). Deterministic: no random numbers, a fixed number of steps at most.
 """
 
 from __future__ import annotations
@@ -204,21 +204,3 @@ def cautious(model: SizeModel, found: Found) -> tuple[SizeModel, Components]:
         held = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
         factor[at] = scale * np.hypot(held, SMALLEST_BEND) / held
     return replace(model, root=model.root * factor), c
-
-
-def widened(model: SizeModel, p: Posterior, spread: F2) -> F2:
-    """Covariance of the unknowns with the uncertainty of the sizes in it, shape (p, p), in units of the prior.
-
-    Second order in the log variances psi with covariance V: mean of the conditional covariance plus covariance of the conditional mean.
-    With Q = X V X^T (X the design of the sizes) both together are S + S [(S + x x^T) o Q - diag(Q)/2] S. A class of which the data say
-    little has a size that is known badly, and its unknowns become more uncertain by that. In no direction less: there the second order
-    is not enough, and may even leave less than nothing.
-    """
-    h = model.design.shape[1]
-    q = model.design @ spread[:h, :h] @ model.design.T
-    inner = (p.cov + np.outer(p.x, p.x)) * q
-    np.fill_diagonal(inner, inner.diagonal() - 0.5 * q.diagonal())
-    low = linalg.cholesky(p.cov, lower=True)
-    more, axes = linalg.eigh(low.T @ inner @ low)
-    wide = low @ axes
-    return np.asarray((wide * (1.0 + np.maximum(more, 0.0))) @ wide.T)

@@ -12,7 +12,7 @@ from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term
 from models.machine import Machine
 from models.solvers import robust
-from models.solvers.components import Components, Posterior, blend, cautious, estimate, fit_length, posterior, widened
+from models.solvers.components import Components, Posterior, blend, cautious, estimate, fit_length, posterior
 from models.solvers.information import I1, KINDS, Grams, Readings, Sums, grams, sums, total
 from models.solvers.noise import DEFAULT_SIGMA_MM, RESOLUTION_MM, repeat_noise_mm
 from models.solvers.observations import RunData
@@ -174,7 +174,7 @@ def _finish(problem: Problem, x: F1, weight: F1, c: Components, gram: Grams) -> 
     sizes, c = cautious(sizes, found)
     p = posterior(whole.turned(sizes.root, sizes.blocks), c, sizes)
     root = typical[:, None] * sizes.root * c.half(sizes)
-    cov = root @ widened(sizes, p, found.spread) @ root.T
+    cov = root @ p.cov @ root.T
     theta = root @ p.x
     left = problem.measured - problem.predicted(theta)
     return Fit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, thinning, parts)

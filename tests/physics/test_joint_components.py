@@ -6,9 +6,9 @@ from numpy.polynomial import legendre
 from scipy import stats
 
 from models.geometry.bases import smooth_terms
-from models.solvers.components import Components, estimate, posterior, slope, widened
+from models.solvers.components import Components, Found, cautious, estimate, posterior, slope
 from models.solvers.information import Sums
-from models.solvers.priors import Priors, SizeModel, size_model, smooth_shapes
+from models.solvers.priors import SMALLEST_BEND, Priors, SizeModel, size_model, smooth_shapes
 from tests.physics.truth import MACHINE
 
 SIZES = SizeModel(np.ones(6), np.eye(6), (), 0.5, ("a", "b"), np.repeat(np.eye(2), 3, axis=0), np.array([2.0, 2.0]))
@@ -59,13 +59,20 @@ def test_noise_and_sizes_come_back_without_bias():
     assert np.median(noise, axis=0) == pytest.approx([0.5, 2.0], rel=0.1)
 
 
-def test_sizes_that_are_known_badly_widen_what_rests_on_them():
-    _, _, sums = problem(2, (3, 2))
-    found = estimate(sums, SIZES, Components(np.zeros(2), np.zeros(2)))
-    p = posterior(sums, found.components, SIZES)
-    wider = widened(SIZES, p, found.spread)
-    assert (wider.diagonal() > p.cov.diagonal()).any()
-    assert np.linalg.eigvalsh(wider).min() > 0
+def test_sizes_that_are_known_badly_widen_the_prior_and_no_shape_is_held_to_nanometres():
+    model = size_model(MACHINE, smooth_terms(6), (), np.ones(0), Priors())
+    n, h = model.typical.size, model.sd.size
+    small = Components(np.array([-12.0 * (name == "angle") for name in model.names]), np.zeros(2))
+    found = [cautious(model, Found(small, v * np.eye(h + 2), 0.0)) for v in (1e-12, 0.5)]
+    before, known, unknown = (np.linalg.norm(m.root * c.half(m), axis=1) for m, c in ((model, small), *found))
+    at = np.concatenate(model.blocks)
+    rest = np.setdiff1d(np.arange(n), at)
+    assert before[at].min() < 0.2 * SMALLEST_BEND
+    assert known[at].min() >= SMALLEST_BEND
+    large = at[before[at] > 0.1]
+    assert known[large] == pytest.approx(before[large], rel=1e-3)
+    assert (unknown[large] > 1.1 * known[large]).all()
+    assert (unknown[rest] == before[rest]).all()
 
 
 def test_an_error_motion_is_equally_large_at_the_ends_and_in_the_middle():
