@@ -17,6 +17,7 @@ FEWEST = 10
 STILL = 1e-3
 """Positions or times closer together than this, in mm or s, are one place."""
 
+
 @dataclass(frozen=True, slots=True)
 class ResidualTest:
     """One test of one run's whitened residuals.

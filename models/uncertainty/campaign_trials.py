@@ -147,7 +147,7 @@ def _clamped(plus: F2, less: F2) -> F2:
     Every point takes its share of the same draws, so it stays in step with the others, and what it gets does not depend on them.
     """
     points = plus.reshape(len(plus), -1, 3).transpose(1, 2, 0)  # (m, 3, inputs)
-    minus = less.reshape(len(less), -1, 3).transpose(1, 2, 0)
+    minus = less.reshape(len(less), less.shape[1] // 3, 3).transpose(1, 2, 0)
     whole = points @ np.swapaxes(points, 1, 2)
     kept = _powered(whole - minus @ np.swapaxes(minus, 1, 2), 0.5)
     return np.asarray((kept @ _powered(whole, -0.5) @ points).transpose(2, 0, 1).reshape(len(plus), -1))
