@@ -116,12 +116,12 @@ def test_a_goal_is_reached_with_fewer_minutes_or_said_to_be_out_of_reach():
     # it ends with the step that reaches it
     assert [2 * s.u_worst_mm <= 25e-3 for s in easy.steps] == [False] * (len(easy.steps) - 1) + [True]
     assert easy.goal.minutes_needed == easy.minutes == easy.steps[-1].until_min
-    hopeless = plan_campaign(MACHINE, minutes=5.0, goal_mm=1e-5)
+    hopeless = plan_campaign(MACHINE, minutes=5.0, goal_mm=1e-5, tools=replace(TOOLS, bar_lengths_mm=(100.0, 200.0)))
     assert not hopeless.goal.reached
     assert hopeless.goal.minutes_needed is None
     assert hopeless.goal.limit_mm > 1e-5
     assert "temperature of the machine's scales" in hopeless.goal.limit_by
-    cold = replace(TOOLS, inputs=Inputs().of_the_data_alone())
+    cold = replace(TOOLS, bar_lengths_mm=(100.0, 200.0), inputs=Inputs().of_the_data_alone())
     perfect = plan_campaign(MACHINE, minutes=5.0, goal_mm=1e-5, tools=cold)
     assert "calibration" in perfect.goal.limit_by
     assert perfect.goal.limit_mm < hopeless.goal.limit_mm
