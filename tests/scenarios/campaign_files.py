@@ -42,7 +42,7 @@ def _document(run: RunData, machine: Doc) -> Doc:
     columns = {
         "t_s": run.t_s.tolist(),
         **columns,
-        "feed_mm_min": [1000.0] * n,
+        "feed_mm_min": [_feed_mm_min(run)] * n,
         "direction": [1] * n,
         "deviation_mm": run.deviation_mm.tolist(),
     }
@@ -52,6 +52,13 @@ def _document(run: RunData, machine: Doc) -> Doc:
         setup["tool_mm"] = run.tool_mm.tolist()
     head = {"format": "abbe-run/1", "campaign": "c1", "run_id": run.label, "test": test, "role": "identify", "machine": machine}
     return head | {"setup": setup, "columns": columns}
+
+
+def _feed_mm_min(run: RunData) -> float:
+    """A ball-bar moves all the time: its feed is path over time. A laser run stands still at every point: what its drives were told."""
+    if run.kind == "laser":
+        return 1000.0
+    return float(np.linalg.norm(np.diff(run.axes_mm, axis=0), axis=1).sum() / (run.t_s[-1] - run.t_s[0]) * 60.0)
 
 
 def _bar(run: RunData) -> tuple[str, Doc]:
