@@ -23,7 +23,7 @@ demo: $(RUN_READY) ## measure, correct and verify a simulated machine; writes a 
 	@$(BIN)/abbe demo $(ARGS)
 
 test: $(DEV_READY) ## all tests
-	@$(BIN)/pytest $(ARGS)
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
 
 lint: $(DEV_READY) ## style, formatting, types, import walls
 	$(BIN)/ruff check --output-format concise

@@ -23,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments : sequence of str, optional
         Instead of the command line's, for tests.
     """
+    # Matrices of some hundred unknowns: threads of the linear algebra cost more than they give, minutes where other programs compute too.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = run(arguments)
     except KeyboardInterrupt:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,8 +31,6 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
-    # Before numpy is loaded: for matrices this small a second thread costs more than it does, on a busy computer twenty times more.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from service.cli.progress import display
     from service.config import load_machine
     from service.report.page_file import write_page
