@@ -67,7 +67,7 @@ def test_words_on_the_screen_say_the_same(solved, capsys):
     told = account(solved)
     _print(told, {"campaign": "c1"} | solution_doc(told))
     text = " ".join(capsys.readouterr().out.split())
-    for words in ("about this sphere only", "Tilt of the mirrors", "temperature", "step diagonals XYZ", "one tool length"):
+    for words in ("about that sphere only", "Tilt of the mirrors", "temperature", "step diagonals XYZ", "one tool length"):
         assert words in text
     assert "1 combinations" not in text
     assert any("temperature" in row.note for row in parameter_rows(solved.joint))
