@@ -231,7 +231,7 @@ def _result(geometry: Geometry, readings: Readings, frame: F2, pivot: F1 | None,
 
 def _combination(hidden: Combination) -> str:
     """All parameters that a hidden combination moves together."""
-    return " with ".join(name for name, _ in hidden.weights)
+    return " with ".join(hidden.told)
 
 
 def _largest(errors_mm: F2) -> float:

@@ -13,17 +13,25 @@ RANK_TOLERANCE = 1e-9
 EFFECTIVE_TOLERANCE = 1e-3
 HIDDEN = 1e-6
 """A parameter takes part in what is hidden if its unit column has this component in the null space."""
+TOLD = 1e-3
+"""Words name members of a combination from this share of its largest on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Combination:
     """A direction of parameter space that the observations do not see.
 
-    ``weights`` relate the parameters in units of their typical size, largest first; ``text`` says it in words.
+    ``weights`` relate the parameters in units of their typical size, largest first, small members too: without them the combination leaves
+    a trace. ``text`` says it in words, of the members that matter (`TOLD`).
     """
 
     weights: tuple[tuple[str, float], ...]
     text: str
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Names of the members that matter, largest first."""
+        return _told(self.weights)
 
 
 @dataclass(frozen=True)
@@ -115,13 +123,18 @@ def sparse_rows(null: F2) -> F2:
     return m
 
 
+def _told(parts: tuple[tuple[str, float], ...]) -> tuple[str, ...]:
+    return tuple(n for n, w in parts if abs(w) > TOLD)
+
+
 def _in_words(names: tuple[str, ...], v: F1) -> Combination:
     order = np.argsort(-np.abs(v))
-    parts = tuple((names[i], float(v[i])) for i in order if abs(v[i]) > 1e-3)
-    shown = [n for n, _ in parts[:4]]
-    if len(parts) == 1:
+    parts = tuple((names[i], float(v[i])) for i in order if abs(v[i]) > HIDDEN)
+    told = _told(parts)
+    shown = told[:4]
+    if len(told) == 1:
         text = f"{shown[0]} leaves no trace in these data"
     else:
-        more = f" and {len(parts) - 4} more" if len(parts) > 4 else ""
+        more = f" and {len(told) - 4} more" if len(told) > 4 else ""
         text = f"{', '.join(shown[:-1])} and {shown[-1]}{more} cannot be told apart"
     return Combination(parts, text)

@@ -28,9 +28,8 @@ SHARE = 0.5
 """Data share from which on a parameter counts as stated observable."""
 NO_TRACE = 0.02
 """Independent data share (errors of typical size) below which a parameter leaves no trace: 0.14 sigma over all readings together."""
-HIDDEN_TRACE = 3e-3
-"""Trace of a combination stated hidden, over what its parts would show. Combinations are told without members of a weight below 1e-3 of
-typical sizes; without them up to 1.7e-3 was seen, however small the machine's errors. False statements left 1e-2 to 0.5."""
+HIDDEN_TRACE = 1e-3
+"""Trace of a combination stated hidden, over what its parts would show. False statements left 1e-2 to 0.5."""
 FAR_OFF = 6.0
 TABLE_NODES = (5, 5, 5)
 POINTS = 100
