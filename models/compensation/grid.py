@@ -23,6 +23,7 @@ from models.uncertainty.inputs import Inputs
 from models.uncertainty.mask import compensable_mask
 from models.uncertainty.prediction import predict_deviation
 from models.uncertainty.sources import ErrorSources, error_sources
+from models.uncertainty.unseen import unseen_mm
 
 Mask = NDArray[np.bool_]
 
@@ -138,10 +139,13 @@ def compensable_nodes(
     """Nodes at which the deviation is larger than its expanded uncertainty (`models.uncertainty.mask`), shape ``counts``.
 
     All sources of uncertainty count; the deviation is that without rigid motion over the grid. ``k``: coverage factor, default 95 %.
+    Nor is a node compensated where what leaves no trace in any reading may be larger than the deviation (`models.uncertainty.unseen`).
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
-    prediction = predict_deviation(error_sources(solution, inputs), points, frame=RigidFree(points))
-    return compensable_mask(prediction, k=k).points.reshape(counts)
+    frame = RigidFree(points)
+    prediction = predict_deviation(error_sources(solution, inputs), points, frame=frame)
+    seen = unseen_mm(solution, points, frame) <= np.linalg.norm(prediction.deviation_mm, axis=1)
+    return np.asarray((compensable_mask(prediction, k=k).points & seen).reshape(counts), dtype=bool)
 
 
 def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:

@@ -21,6 +21,8 @@ NOISE_SD = 2.0
 LEAST_ETA = -8.0
 """Least log noise variance over the expected one: a factor of 55 in the standard deviation, under the resolution of every instrument that
 is sold. Readings without any noise would drive it to minus infinity and the normal equations out of the digits of a double."""
+ROUGHER = 0.2
+"""Standard deviations of what is known of a motion's roughness by which it is taken rougher than most probable (`cautious`)."""
 STEPS = 25
 TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
@@ -186,7 +188,7 @@ def cautious(model: SizeModel, found: Found) -> tuple[SizeModel, Components]:
 
     Three remedies; where readings are plenty none of them changes anything.
 
-    - Every motion is as rough as one standard deviation of what is known of its roughness allows: it looks as rough as it is where it was
+    - Every motion is a little rougher (`ROUGHER`) than most probable: it looks as rough as it is where it was
       measured; beyond, near the ends of the stroke, it may be rougher, and what was measured does not speak against it.
     - The variance of a motion is the mean of what it may be (of a log-normal: exp(psi + v/2)), not its most probable value. Two motions
       that the readings hardly tell apart take from each other, and the most probable size of both is then too small.
@@ -195,7 +197,7 @@ def cautious(model: SizeModel, found: Found) -> tuple[SizeModel, Components]:
     rough = np.array([name.startswith("roughness ") for name in model.names])
     bent = np.array([name in ("fade", "cut") for name in model.names])
     sd = np.sqrt(found.spread.diagonal()[: rough.size])
-    c = Components(found.components.psi + np.where(rough, sd, 0.0), found.components.eta)
+    c = Components(found.components.psi + np.where(rough, ROUGHER * sd, 0.0), found.components.eta)
     sizes = model.design * ~(rough | bent)
     unsure = np.einsum("ij,jk,ik->i", sizes, found.spread[: rough.size, : rough.size], sizes)
     factor = np.ones(model.typical.size)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from models.arrays import F1, F2, F3
+from models.solvers.decomposition import singular_values, svd
 from models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
 
 Field = Callable[[F2], F3]
@@ -103,7 +104,7 @@ def ranks(a: F2, setup: F2) -> tuple[int, int]:
     -------
     two integers of at most p: how many combinations of the machine's parameters the readings show, and how many they show well.
     """
-    s = linalg.svd(project_out(unit_columns(a)[0], setup), compute_uv=False)
+    s = singular_values(project_out(unit_columns(a)[0], setup))
     return int((s > RANK_TOLERANCE * s[0]).sum()), int((s > EFFECTIVE_TOLERANCE * s[0]).sum())
 
 
@@ -119,7 +120,7 @@ def hidden_combination(a: F2, setup: F2, support: list[int]) -> tuple[F1, float]
     """
     b = project_out(a[:, support], setup)
     size = np.where(np.linalg.norm(b, axis=0) > 0, np.linalg.norm(b, axis=0), 1.0)
-    _, _, vt = linalg.svd(b / size)
+    _, _, vt = svd(b / size, full_matrices=True)
     v = vt[-1] / size
     w: F1 = v / v[int(np.argmax(np.abs(v)))]
     shown = float(np.linalg.norm(a[:, support] * w))
@@ -137,7 +138,7 @@ def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
         Deviation per unit of each parameter at the nodes of the map.
     """
     unit, factor = unit_columns(a)
-    _, s, vt = linalg.svd(project_out(unit, setup), full_matrices=False)
+    _, s, vt = svd(project_out(unit, setup), full_matrices=False)
     seen = s > RANK_TOLERANCE * s[0]
     gain = (predict * factor) @ (vt[seen].T / s[seen])
     return np.asarray(np.sqrt((gain**2).sum(axis=2)))

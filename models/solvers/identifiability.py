@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from models.arrays import F1, F2
+from models.solvers.decomposition import svd
 
 RANK_TOLERANCE = 1e-9
 EFFECTIVE_TOLERANCE = 1e-3
@@ -74,7 +74,7 @@ def project_out(a: F2, nuisance: F2) -> F2:
     if nuisance.shape[1] == 0:
         return a
     norm = np.linalg.norm(nuisance, axis=0)
-    u, s, _ = linalg.svd(nuisance[:, norm > 0] / norm[norm > 0], full_matrices=False)
+    u, s, _ = svd(nuisance[:, norm > 0] / norm[norm > 0], full_matrices=False)
     basis = u[:, s > RANK_TOLERANCE * s[0]] if s.size else u[:, :0]
     return np.asarray(a - basis @ (basis.T @ a))
 
@@ -92,7 +92,7 @@ def analyse(names: tuple[str, ...], a: F2, typical: F1 | None = None, *, toleran
     norm = np.linalg.norm(a, axis=0)
     seen = norm > tolerance * (norm.max() if norm.size else 1.0)
     scale = np.where(seen, 1.0 / np.where(seen, norm, 1.0), 1.0) if typical is None else typical
-    _, s, vt = linalg.svd(a * scale, full_matrices=True)
+    _, s, vt = svd(a * scale, full_matrices=True)
     s = np.concatenate([s, np.zeros(len(names) - s.size)])
     top = s[0] if s.size and s[0] > 0 else 1.0
     rank = int((s > tolerance * top).sum())

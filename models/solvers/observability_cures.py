@@ -13,6 +13,7 @@ from scipy import linalg
 from models.arrays import F2
 from models.geometry.bases import Term
 from models.machine import Machine
+from models.solvers.decomposition import singular_values
 from models.solvers.identifiability import project_out
 from models.solvers.observability_additions import Addition, additions
 from models.solvers.observability_free import Play, play
@@ -50,7 +51,7 @@ class Trial:
 
 def count_seen(seen: F2) -> int:
     """How many hidden combinations a design, shape (rows, k), shows; what was hidden shows less than 1e-9 there (unit columns)."""
-    s = linalg.svd(seen, compute_uv=False, check_finite=False) if seen.size else np.zeros(0)
+    s = singular_values(seen) if seen.size else np.zeros(0)
     return int((s > SHOWN).sum())
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from models.arrays import F2
+from models.solvers.decomposition import svd
 from models.solvers.designs import unit_columns
 from models.solvers.identifiability import HIDDEN, RANK_TOLERANCE
 from models.solvers.observability_rank import Columns, Knowledge, Seen, with_knowledge
@@ -47,7 +47,7 @@ def play(columns: Columns, known: Knowledge, seen: Seen) -> Play:
     """Null space of machine and free unknowns together, from that of the machine alone (`what_is_seen`)."""
     machine, free, groups = with_knowledge(columns, known)
     unit, factor = unit_columns(free)
-    u, s, vt = linalg.svd(unit, full_matrices=True, check_finite=False)
+    u, s, vt = svd(unit, full_matrices=True)
     rank = int((s > RANK_TOLERANCE * s[0]).sum()) if s.size else 0
     hidden = seen.null_space * seen.factor[:, None]
     answer = vt[:rank].T @ ((u[:, :rank].T @ (machine @ hidden)) / s[:rank, None])

@@ -10,6 +10,7 @@ from scipy import linalg
 from models.arrays import F1, F2
 from models.geometry.bases import Term
 from models.machine import Machine
+from models.solvers.decomposition import singular_values, svd
 from models.solvers.identifiability import RANK_TOLERANCE
 from models.solvers.observability_additions import Addition
 from models.solvers.observability_cures import Campaign, Trial, best_sequence, trials
@@ -121,14 +122,14 @@ def _silent(null_space: F2, field: F2) -> F2:
     """Hidden combinations that move the tool nowhere in the volume, orthonormal in unit columns, shape (p, m)."""
     if not null_space.shape[1]:
         return null_space
-    _, s, vt = linalg.svd(field @ null_space, full_matrices=True, check_finite=False)
+    _, s, vt = svd(field @ null_space, full_matrices=True)
     s = np.concatenate([s, np.zeros(null_space.shape[1] - s.size)])
     top = float(np.linalg.norm(field, axis=0).max())
     return np.asarray(null_space @ vt[s <= HARMLESS * top].T)
 
 
 def _reachable(field: F2) -> int:
-    s = linalg.svd(field, compute_uv=False, check_finite=False)
+    s = singular_values(field)
     return int((s > RANK_TOLERANCE * s[0]).sum())
 
 

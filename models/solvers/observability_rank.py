@@ -20,6 +20,7 @@ from scipy import linalg
 from models.arrays import F1, F2
 from models.geometry.bases import DIRECTIONS, Term
 from models.machine import Machine
+from models.solvers.decomposition import svd
 from models.solvers.designs import unit_columns
 from models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
 from models.solvers.observations import RunData
@@ -165,7 +166,7 @@ def what_is_seen(columns: Columns, known: Knowledge) -> Seen:
         raise ValueError(f"observability: {', '.join(sorted(strangers - set(columns.setup_names)))} is no set-up unknown of these runs")
     machine, free, _ = with_knowledge(columns, known)
     unit, factor = unit_columns(_without_rounding(machine))
-    _, s, vt = linalg.svd(project_out(unit, free), full_matrices=True, check_finite=False)
+    _, s, vt = svd(project_out(unit, free), full_matrices=True)
     s = np.concatenate([s, np.zeros(unit.shape[1] - s.size)])
     top = float(s[0]) if s.size else 0.0
     rank = int((s > RANK_TOLERANCE * top).sum())

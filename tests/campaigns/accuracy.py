@@ -12,6 +12,7 @@ The bound: `tests.campaigns.accuracy_bound` together with what the grid leaves o
 
 import argparse
 import multiprocessing
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -176,6 +177,7 @@ def ratios(r: Row) -> tuple[float, float, float, float, float]:
 
 def main() -> None:
     """Print the table."""
+    os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read by the workers when they start
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--machines", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
