@@ -1,4 +1,4 @@
-"""``python -m simulators``: the outside world as a process of its own, or (``truth``) its sealed truth as figures."""
+"""``python -m simulators``: the outside world as a process; ``truth``: its sealed truth as figures; ``hidden-suite``: sealed cases."""
 
 import argparse
 import asyncio
@@ -27,12 +27,28 @@ def _parser(prog: str, what: str) -> _Parser:
     parser = _Parser(prog=prog, description=what)
     parser.add_argument("scenario", nargs="?", type=Path, default=scenarios.DEFAULT_PATH, help="TOML file (default: the packaged vmc.toml)")
     parser.add_argument("--seed", type=int, help="draw another machine")
+    parser.add_argument("--hidden", type=int, metavar="SEED", help="instead of a scenario: let the seed choose one that may hide something")
     return parser
+
+
+def _scenario(options: argparse.Namespace) -> Scenario:
+    """The scenario that the command line names, or the one that a seed stands for."""
+    if options.hidden is None:
+        return scenarios.load(options.scenario)
+    from simulators.hidden.picks import picked
+
+    scenario = picked(options.hidden)
+    scenarios.check(scenario)
+    return scenario
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command line; gives the exit code."""
     try:
+        if argv[:1] == ["hidden-suite"]:
+            from simulators.hidden.suite import main as hidden_suite
+
+            return hidden_suite(argv[1:])
         return _truth(argv[1:]) if argv[:1] == ["truth"] else _serve(argv)
     except (ScenarioError, OSError) as exc:
         sys.stderr.write(f"simulators: {exc}\n".replace("\n", " ").rstrip() + "\n")
@@ -49,7 +65,7 @@ def _serve(argv: Sequence[str]) -> int:
     for device in ("ballbar", "laser", "cnc", "fixture"):
         parser.add_argument(f"--{device}-port", type=int, help=f"TCP port of the {device} (0 = any)")
     options = parser.parse_args(argv)
-    return asyncio.run(_run(_overridden(scenarios.load(options.scenario), options), options.link_dir, watch=options.watch_stdin))
+    return asyncio.run(_run(_overridden(_scenario(options), options), options.link_dir, watch=options.watch_stdin))
 
 
 def _overridden(scenario: Scenario, options: argparse.Namespace) -> Scenario:
@@ -100,7 +116,7 @@ def _truth(argv: Sequence[str]) -> int:
     parser.add_argument("--nodes", type=int, default=9, help="grid nodes per axis")
     parser.add_argument("--arrows", action="store_true", help="add grid and deviation vectors")
     options = parser.parse_args(argv)
-    scenario = scenarios.load(options.scenario)
+    scenario = _scenario(options)
     if options.seed is not None:
         scenario = dataclasses.replace(scenario, seed=options.seed)
         scenarios.check(scenario)

@@ -90,6 +90,20 @@ class PortConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class HiddenConfig:
+    """One effect that nobody is told about (simulators/hidden); no name: none.
+
+    ``key``: axis, component or plane; ``parameters``: ``strength`` in the unit of the exchange files and what else the effect needs;
+    ``wild``: seed of how it departs from the textbook, 0: not at all.
+    """
+
+    name: str = ""
+    key: str = ""
+    wild: int = 0
+    parameters: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Scenario:
     """Everything that decides how the simulated world behaves. Same scenario, same world, bit for bit."""
 
@@ -101,6 +115,7 @@ class Scenario:
     laser: LaserConfig = field(default_factory=LaserConfig)
     cnc: PortConfig = field(default_factory=PortConfig)
     fixture: PortConfig = field(default_factory=PortConfig)
+    hidden: HiddenConfig = field(default_factory=HiddenConfig)
 
 
 def load(path: Path = DEFAULT_PATH) -> Scenario:
@@ -179,6 +194,8 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         return value
     if kind is float and _is_number(value):
         return float(value)
+    if kind == dict[str, float] and isinstance(value, dict) and all(_is_number(v) for v in value.values()):
+        return {name: float(v) for name, v in value.items()}
     if kind in (Pair, Triple):
         length = 2 if kind == Pair else 3
         if isinstance(value, list) and len(value) == length and all(_is_number(v) for v in value):

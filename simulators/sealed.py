@@ -3,6 +3,7 @@
 import struct
 
 from simulators.cnc import bank
+from simulators.hidden.live import live_of
 from simulators.scenario import Scenario, ScenarioError
 from simulators.truth.draws import describe, draw_machine
 from simulators.truth.figures import no_correction, report
@@ -13,8 +14,10 @@ def truth(scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool =
     """Evaluate a machine without any wire; ``image`` is a compensation image as big-endian bytes, None for no correction."""
     draws = draw_machine(scenario)
     machine = Machine(Geometry(scenario.machine), draws)
+    secret = live_of(scenario.hidden, machine.geometry.low_mm, machine.geometry.high_mm)
+    hidden: dict[str, object] = {} if secret is None else {"hidden": secret.describe()}
     correction = no_correction if image is None else _correction(image)
-    return {**report(machine, correction, nodes, arrows=arrows), **describe(draws)}
+    return {**report(machine, correction, nodes, arrows=arrows), **describe(draws), **hidden}
 
 
 def _correction(image: bytes) -> bank.Correction:

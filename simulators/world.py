@@ -1,13 +1,16 @@
 """The world: one machine and the instruments that watch it, moved on by one ``advance``."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from simulators.arrays import F
 from simulators.ballbar.device import BallbarDevice
 from simulators.cnc.device import Controller
+from simulators.hidden.live import live_of
 from simulators.laser.device import RATE_HZ, LaserDevice
-from simulators.scenario import Scenario
-from simulators.truth.draws import draw_machine
+from simulators.scenario import Magnitudes, Scenario
+from simulators.truth.draws import UM, Draws, draw_machine
 from simulators.truth.machine import Geometry, Machine
 from simulators.truth.play import Play
 from simulators.truth.surroundings import Air, drift
@@ -26,13 +29,16 @@ class World:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.time_s = 0.0
-        self.draws = draw_machine(scenario)
         geometry = Geometry(scenario.machine)
+        self.hidden = live_of(scenario.hidden, geometry.low_mm, geometry.high_mm)
+        self.draws = with_hidden_bar(draw_machine(scenario), scenario)
         self.machine = Machine(geometry, self.draws)
         # a host's lease lives in wall time, see Compensation
         self.controller = Controller(geometry, lease_scale=scenario.speed)
         self.ballbar = BallbarDevice(self.draws, scenario.magnitudes, self.locate, clock_offset_us=BALLBAR_CLOCK_US)
-        self.laser = LaserDevice(self.draws, scenario.magnitudes, Air(scenario.seed), self.locate)
+        self.laser = LaserDevice(self.draws, laser_sizes(scenario), Air(scenario.seed), self.locate)
+        if self.hidden is not None:
+            self.laser.too_much = self.hidden.laser_mm
         self._play = Play(self.draws.backlash_mm, self.controller.position_mm)
         self._laser_tick = 0
         self.laser.record(0, 0.0, self._play.position_mm)
@@ -50,7 +56,7 @@ class World:
         times = np.concatenate([bar_s, tick_s, self.controller.turning_times(to_s), [to_s]])
         order = np.argsort(times, kind="stable")
         axes = np.empty((len(times), 3))
-        axes[order] = self._play.run(self._drives(times[order]))
+        axes[order] = self._axes(times[order])
         if len(bar_s):
             self.ballbar.record(axes[: len(bar_s)], self.controller.sync_level(bar_s))
         if len(tick_s):
@@ -65,7 +71,7 @@ class World:
 
     def tool_position(self) -> F:
         """Actual tool position now, (3,) mm."""
-        axes = self._play.run(self._drives(np.array([self.time_s])))
+        axes = self._axes(np.array([self.time_s]))
         actual: F = self.locate(np.array([self.time_s]), axes)[0]
         return actual
 
@@ -75,8 +81,29 @@ class World:
         self.laser.output()
         self.machine.extra_scale[axis] += scale
 
+    def _axes(self, times_s: F) -> F:
+        """Where the axes stand at n instants from now on, in order: lost motion and hidden effects remember what went before, (n, 3) mm."""
+        drives = self._drives(times_s)
+        axes = self._play.run(drives)
+        return axes if self.hidden is None else np.asarray(axes + self.hidden.displacement(times_s, drives))
+
     def _drives(self, times_s: F) -> F:
         """Where the drives are at n instants from now on: command + correction, (n, 3) mm."""
         command = self.controller.commanded(times_s)
         driven: F = command + self.controller.comp.correction(command)
         return driven
+
+
+def with_hidden_bar(draws: Draws, scenario: Scenario) -> Draws:
+    """Draws in which the bar is as wrong as a hidden effect wants it."""
+    if scenario.hidden.name != "bar_length_error":
+        return draws
+    return replace(draws, bar_length_error_mm=draws.bar_length_error_mm + scenario.hidden.parameters["strength"] * UM)
+
+
+def laser_sizes(scenario: Scenario) -> Magnitudes:
+    """Sizes of the laser's set-up; a hidden cosine error (mrad) puts every beam askew by that much."""
+    if scenario.hidden.name != "laser_cosine":
+        return scenario.magnitudes
+    askew = 1e3 * scenario.hidden.parameters["strength"]
+    return replace(scenario.magnitudes, beam_misalignment_urad=(0.97 * askew, 1.03 * askew))

@@ -62,6 +62,9 @@ class LaserDevice:
         self._lost = True  # latched; no mirror at power-on
         self._zeroed = False
         self._compensating = False
+        self._zero_s = 0.0
+        self.too_much: Callable[[float, float, float], float] | None = None
+        """What a hidden effect adds: instant, s since the zero, and path in mm to mm."""
         self._pending: tuple[int, float, F] | None = None
         self._output = Output(0, 0.0, 0.0, 0, 0b10001, air.at(0.0))
 
@@ -95,6 +98,8 @@ class LaserDevice:
         path = self._mount.displacement(position)
         if not self._compensating:
             path *= 1.0 + air.refractivity
+        if self.too_much is not None:
+            path += self.too_much(time_s, time_s - self._zero_s, path)
         return replace(output, displacement_mm=path + noise)
 
     def _signal_now(self) -> int:
@@ -138,6 +143,7 @@ class LaserDevice:
         if self._mount is None or self._blocked or self._lost:
             return LaserResult.BLOCKED
         self._mount = replace(self._mount, zero_mm=position_mm.copy())
+        self._zero_s = self._output.time_s
         self._zeroed = True
         return LaserResult.OK
 

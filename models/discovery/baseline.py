@@ -1,0 +1,139 @@
+"""The present simulation of a campaign as unknowns and columns: smooth error motions, set-ups as far as known, zeros of laser runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.discovery.case import Case
+from models.effects.path import Path
+from models.geometry.bases import Term, smooth_terms, term_values
+from models.machine import Machine
+from models.solvers.observations import RunData
+from models.solvers.observe import Setup, linearise, predict
+from models.solvers.observe_kinematics import LOST, Places, with_tool
+from models.solvers.observe_setup import bar_length_name
+from models.solvers.priors import Priors, smooth_shapes, term_prior_sd
+
+ORDER = 14
+"""Highest Legendre order of each error motion. With 7 coefficients nulls look like discoveries, with 10 to 18 not (discovery.md 5)."""
+LENGTH = 0.4
+"""Correlation length of the error motions that predictions assume, strokes."""
+BAR = "bar_length"
+CUP_MM, BAR_MM, TILT_RAD, ZERO_MM = 60e-3, 20e-3, 1e-3, 20e-3
+"""Prior standard deviations of set-up unknowns, wide: what a careless hand leaves."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Unknowns of the present simulation.
+
+    Attributes
+    ----------
+    setup : set-up unknowns as `models.solvers.observe` takes them. parts : array, shape (theirs, ours): theirs from ours.
+    names, prior_sd : of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves all radii, so that it is too long by
+        the same ``bar_length`` with all of them.
+    root : array, shape (p, p)
+        The same prior with the smoothness of the error motions: covariance = root root^T.
+    """
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    setup: Setup
+    parts: F2
+    names: tuple[str, ...]
+    prior_sd: F1
+    root: F2
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.names)
+
+    def _full(self, theta: F1) -> F1:
+        n = len(self.terms)
+        return np.concatenate([theta[:n], np.zeros(LOST), self.parts @ theta[n:]])
+
+    def read(self, run: RunData, theta: F1) -> F1:
+        """Reading of a run, mm, shape (n,): exact (`models.solvers.observe`), with a mirror that turns with the tool."""
+        value = predict(self.machine, self.terms, run, self.setup, self._full(theta))
+        return value + self._turning(run) @ theta[: len(self.terms)]
+
+    def linear(self, run: RunData, theta: F1) -> tuple[F1, F2]:
+        """Reading of a run and its derivative, shapes (n,), (n, p)."""
+        value, jacobian = linearise(self.machine, self.terms, run, self.setup, self._full(theta))
+        n, turning = len(self.terms), self._turning(run)
+        return value + turning @ theta[:n], np.concatenate([jacobian[:, :n] + turning, jacobian[:, n + LOST :] @ self.parts], axis=1)
+
+    def _turning(self, run: RunData) -> F2:
+        """What a plane mirror on the tool adds to a laser's reading as it turns with the tool, per unit of each term, shape (n, terms).
+
+        On a step diagonal the beam meets the mirror up to a step away from where it met it first; 50 mm times 20 urad is 1 um.
+        """
+        out = np.zeros((len(run.axes_mm), len(self.terms)))
+        if run.kind == "laser":
+            assert run.beam is not None
+            turns = [i for i, t in enumerate(self.terms) if t.component >= 3]
+            if turns:
+                lever = np.cross(run.beam, run.axes_mm - run.axes_mm[0])  # (e x beam).d = e.(beam x d)
+                chosen = tuple(self.terms[i] for i in turns)
+                values = term_values(chosen, run.axes_mm, self.machine.stroke_mm)
+                out[:, turns] = values * lever[:, [t.component - 3 for t in chosen]]
+        return out
+
+    def along(self, path: Path, run: RunData, theta: F1) -> Path:
+        """The path as the fitted machine really looks along it: a bar turns with the cup's offset and the machine's deviation.
+
+        A lag of a millimetre along the path times an offset of 30 um over a bar of 150 mm is 0.2 um of reading (discovery.md 5).
+        """
+        if path.kind != "bar":
+            return path
+        full, machine = self._full(theta), with_tool(self.machine, run.tool_mm)
+        off = []
+        for axes in (run.axes_mm, path.centre_mm[None]):
+            places = Places.of(machine, self.terms, axes, np.zeros_like(axes))
+            off.append(places.deviation_mm(places.motions(full)))
+        known = dict(zip(self.setup.names, full[len(self.terms) + LOST :], strict=True))
+        cup = np.array([known.get(f"cup_{run.setup}_{a}", 0.0) for a in "xyz"])
+        bar = run.axes_mm - path.centre_mm + off[0] - off[1] - cup
+        return replace(path, look=bar / np.linalg.norm(bar, axis=1, keepdims=True))
+
+
+def baseline_of(case: Case) -> Baseline:
+    """Unknowns that ``case.includes`` says the present simulation has; those of sealed runs that no other run shares are left at zero."""
+    terms = tuple(t for t in smooth_terms(ORDER) if "rigid21" in case.includes or t.order == 0 or (t.order == 1 and t.component == t.axis))
+    sd: dict[str, float] = {}
+    for run in case.runs:
+        p = run.path
+        if p.kind == "bar":
+            if "setup_centre_offset" in case.includes:
+                sd |= {f"cup_{p.setup}_{a}": CUP_MM for a in "xyz"}
+            if "bar_length_error" in case.includes:
+                sd[bar_length_name(p.radius_mm)] = BAR_MM
+        else:
+            if "mirror_tilt" in case.includes:
+                sd |= {f"tilt_{p.setup}_{k}": TILT_RAD for k in "12"}
+            sd[f"zero_{p.label}"] = ZERO_MM
+    setup = Setup(tuple(sorted(sd)), np.array([sd[k] for k in sorted(sd)]))
+    own = [BAR if name.startswith(f"{BAR}_") else name for name in setup.names]
+    ours = tuple(dict.fromkeys(own))
+    parts = np.array([[float(name == o) for o in ours] for name in own]).reshape(len(own), len(ours))
+    setup_sd = np.array([BAR_MM if o == BAR else sd[o] for o in ours])
+    priors = Priors(cup_mm=CUP_MM)
+    prior_sd = np.concatenate([term_prior_sd(case.machine, terms, priors), setup_sd])
+    names = tuple(t.name for t in terms) + ours
+    return Baseline(case.machine, terms, setup, parts, names, prior_sd, _root(terms, prior_sd, priors))
+
+
+def _root(terms: tuple[Term, ...], prior_sd: F1, priors: Priors) -> F2:
+    """Independent unknowns but for the coefficients of order 2 and more of one motion, which belong to one stationary process."""
+    root = np.diag(prior_sd)
+    motion = np.array([t.motion if t.order >= 2 else "" for t in terms])
+    shapes, variance = smooth_shapes(ORDER, LENGTH)
+    for name in dict.fromkeys(m for m in motion if m):
+        at = np.flatnonzero(motion == name)
+        size = priors.angle_rad if terms[at[0]].component >= 3 else priors.straightness_mm
+        root[np.ix_(at, at)] = shapes * np.sqrt(variance) * size
+    return root

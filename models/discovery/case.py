@@ -1,0 +1,60 @@
+"""A campaign as the discovery takes it: runs with their paths, readings and roles; what the present simulation knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from models.arrays import F1
+from models.effects.path import Path
+from models.machine import Machine
+from models.solvers.observations import RunData
+
+Role = Literal["identify", "holdout", "sealed"]
+
+
+@dataclass(frozen=True)
+class CaseRun:
+    """One run. ``deviation_mm`` (n,) is None for a sealed run; ``valid`` (n,) marks readings the instrument itself did not flag."""
+
+    path: Path
+    role: Role
+    deviation_mm: F1 | None
+    valid: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    u_length_mm: float | None = None
+    length_calibrated: bool | None = None
+
+    def data(self) -> RunData:
+        """The run as the joint solver's observation models take it (zeros in place of sealed readings), every reading, invalid ones too."""
+        p = self.path
+        reading = np.zeros(p.n) if self.deviation_mm is None else np.where(self.valid, self.deviation_mm, 0.0)
+        bar = p.kind == "bar"
+        return RunData(
+            p.label, p.setup, p.kind, p.at.q_mm, reading, p.at.sign, p.at.t_s, np.ones(p.n),
+            centre_mm=p.centre_mm if bar else None, radius_mm=p.radius_mm if bar else None, beam=None if bar else p.look[0],
+            u_length_mm=self.u_length_mm, length_calibrated=self.length_calibrated, tool_mm=p.machine.tool_mm,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """A campaign (run-format.md 4).
+
+    Attributes
+    ----------
+    includes : frozenset of str
+        What the present simulation knows: ``rigid6`` or ``rigid21``, ``setup_centre_offset``, ``bar_length_error``, ``mirror_tilt``.
+    resolution_mm : smallest step of the readings of "bar" and "laser".
+    """
+
+    name: str
+    machine: Machine
+    includes: frozenset[str]
+    runs: tuple[CaseRun, ...]
+    resolution_mm: dict[str, float]
+
+    def of(self, *roles: Role) -> tuple[CaseRun, ...]:
+        """Runs with one of the roles, in their order."""
+        return tuple(r for r in self.runs if r.role in roles)

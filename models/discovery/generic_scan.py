@@ -1,0 +1,165 @@
+"""Where a search for an unnamed structure starts: the few places, moments and periods at which what is left of the readings stands out.
+
+A step may be at any moment, a surge of any period: thousands of starts, too many to project each onto the complement of the present model.
+The product of a candidate's column with the residual needs no projection (the residual is projected already), only its length does; so a
+scan with approximate lengths finds the candidates' best starts, which then compete with their exact columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+from scipy.signal import fftconvolve
+from scipy.spatial import cKDTree
+
+from models.arrays import F1, F2
+from models.effects.path import Path
+
+PERIODS_S = (18.0, 110.0)
+PITCHES_MM = (6.0, 60.0)
+BURST_S = (0.35, 0.8, 1.8)
+BURST_HZ = (0.15, 8.0)
+CELL_MM = 14.0
+"""Distance of the bumps' centres that are tried."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is left of the readings of some runs: ``rest`` whitened, ``sigma_mm`` of one reading of each run."""
+
+    paths: tuple[Path, ...]
+    rest: tuple[F1, ...]
+    sigma_mm: tuple[float, ...]
+
+    def only(self, which: list[int]) -> Seen:
+        """Some of the runs, in this order."""
+        return Seen(tuple(self.paths[k] for k in which), tuple(self.rest[k] for k in which), tuple(self.sigma_mm[k] for k in which))
+
+    def stacked(self) -> tuple[F1, F2, F1]:
+        """Clock, look per sigma (n, 3) and rest of all runs."""
+        look = np.concatenate([p.look / s for p, s in zip(self.paths, self.sigma_mm, strict=True)])
+        return np.concatenate([p.at.t_s for p in self.paths]), look, np.concatenate(self.rest)
+
+
+def best(score: F1, count: int, apart: int) -> list[int]:
+    """Indices of the highest values, at least ``apart`` from each other, highest first."""
+    left = score.copy()
+    out: list[int] = []
+    while len(out) < count and np.isfinite(left).any() and left.max() > 0:
+        i = int(np.argmax(left))
+        out.append(i)
+        left[max(i - apart, 0) : i + apart + 1] = -np.inf
+    return out
+
+
+def step_moments(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
+    """Moments of a step per axis and, ``""``, in all directions at once: by set-up of a bar, by run of a laser, whose zero is new."""
+    groups: dict[str, list[int]] = {}
+    for k, p in enumerate(seen.paths):
+        groups.setdefault(f"bar {p.setup}" if p.kind == "bar" else f"laser {p.label}", []).append(k)
+    moments, gains = [], []
+    for group in groups.values():
+        order = sorted(group, key=lambda k: seen.paths[k].at.t_s[0])
+        t, look, rest = seen.only(order).stacked()
+        moved = np.cumsum((look * rest[:, None])[::-1], axis=0)[::-1][1:]
+        size = np.cumsum((look * look)[::-1], axis=0)[::-1]
+        whole, size = size[0] + 1e-12, size[1:]
+        length = size * (1.0 - size / whole)
+        gain = np.where(length > 1e-3 * whole, moved**2 / np.maximum(length, 1e-12), 0.0)
+        moments.append(0.5 * (t[1:] + t[:-1]))
+        gains.append(gain)
+    t0, gain = np.concatenate(moments), np.concatenate(gains)
+    columns = {"X": gain[:, 0], "Y": gain[:, 1], "Z": gain[:, 2], "": gain.sum(axis=1)}
+    return {key: tuple(float(t0[i]) for i in best(score, count, 15)) for key, score in columns.items()}
+
+
+def periods(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
+    """Periods on the clock, by axis and by instrument ("bar", "laser")."""
+    t, look, rest = seen.stacked()
+    per_mm = np.concatenate([np.full(p.n, 1.0 / s) for p, s in zip(seen.paths, seen.sigma_mm, strict=True)])
+    bar = np.concatenate([np.full(p.n, p.kind == "bar") for p in seen.paths])
+    columns = np.column_stack([look, np.where(bar, per_mm, 0.0), np.where(bar, 0.0, per_mm)])
+    step_hz = 0.4 / max(float(np.ptp(t)), PERIODS_S[1])
+    f, power = _wave_gain(1.0 / PERIODS_S[1], 1.0 / PERIODS_S[0], step_hz, t, columns, rest, 1.0)
+    return {k: tuple(float(1.0 / f[i]) for i in best(power[j], count, 2)) for j, k in enumerate(("X", "Y", "Z", "bar", "laser"))}
+
+
+def pitches(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
+    """Pitches of a wave along one axis in the direction of another, by component."""
+    q = np.concatenate([p.at.q_mm for p in seen.paths])
+    _, look, rest = seen.stacked()
+    out = {}
+    for a, axis in enumerate("XYZ"):
+        across = [d for d in range(3) if d != a]
+        step = 0.4 / max(float(np.ptp(q[:, a])), PITCHES_MM[1])
+        f, power = _wave_gain(1.0 / PITCHES_MM[1], 1.0 / PITCHES_MM[0], step, q[:, a], look[:, across], rest, 0.5)
+        for j, d in enumerate(across):
+            out[f"E{'XYZ'[d]}{axis}"] = tuple(float(1.0 / f[i]) for i in best(power[j], count, 2))
+    return out
+
+
+def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F1, bin_size: float) -> tuple[F1, F2]:
+    """Frequencies, and the chi-square that a wave in ``x`` of every one of them takes out, shape (columns, frequencies).
+
+    By a Fourier transform of readings that are binned in ``x``; lengths are those of an unprojected column.
+    """
+    length = np.sum(columns**2, axis=0) / 2.0 + 1e-12
+    cell = ((x - x.min()) / bin_size).astype(np.intp)
+    size = fft.next_fast_len(max(int(np.ceil(1.0 / (step * bin_size))), int(cell.max()) + 1), real=True)
+    binned = np.stack([np.bincount(cell, c * rest, size) for c in columns.T])
+    f = np.arange(size // 2 + 1) / (size * bin_size)
+    inside = (f >= low) & (f <= high)
+    power = np.abs(fft.rfft(binned, axis=1)[:, inside]) ** 2 / length[:, None]
+    return f[inside], power
+
+
+def bursts(seen: Seen, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Moments, widths and frequencies of short swings in single bar runs: each the values of the best few combinations."""
+    found: list[tuple[float, float, float, float]] = []
+    for p, rest in zip(seen.paths, seen.rest, strict=True):
+        if p.kind != "bar" or p.n < 20:
+            continue
+        dt = float(np.median(np.diff(p.at.t_s)))
+        for width in BURST_S:
+            if width < dt:
+                continue
+            lag = np.arange(-int(3 * width / dt), int(3 * width / dt) + 1) * dt
+            window = np.exp(-0.5 * (lag / width) ** 2)
+            f = np.arange(BURST_HZ[0], min(BURST_HZ[1], 0.45 / dt), 0.2 / width)
+            if not f.size or len(lag) > p.n:
+                continue
+            swing = np.exp(2j * np.pi * f[:, None] * lag)
+            power = np.abs(fftconvolve(np.broadcast_to(rest, (len(f), p.n)), window * swing, mode="same", axes=1)) ** 2
+            power /= 0.5 * float(np.sum(window**2))
+            k, i = np.unravel_index(int(np.argmax(power)), power.shape)
+            found.append((float(power[k, i]), float(p.at.t_s[i]), width, float(f[k])))
+    top = sorted(found, reverse=True)[:count]
+    return tuple(tuple(dict.fromkeys(round(v[j], 6) for v in top)) for j in (1, 2, 3))  # type: ignore[return-value]
+
+
+def bumps(seen: Seen, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
+    """Moments at which the path passes the places where a bump would take out most."""
+    q = np.concatenate([p.at.q_mm for p in seen.paths])
+    t, look, rest = seen.stacked()
+    _, cells = np.unique(np.round(q / CELL_MM).astype(int), axis=0, return_index=True)
+    near = cKDTree(q[cells]).sparse_distance_matrix(cKDTree(q), 2.5 * max(widths_mm), output_type="coo_matrix")
+    total = np.zeros(len(cells))
+    for width in widths_mm:
+        g = np.exp(-0.5 * (near.data / width) ** 2)
+        pull = np.zeros((len(cells), 3))
+        shape = np.zeros((len(cells), 3, 3))
+        for a in range(3):
+            pull[:, a] = np.bincount(near.row, g * (look[:, a] * rest)[near.col], len(cells))
+            for b in range(a, 3):
+                shape[:, a, b] = shape[:, b, a] = np.bincount(near.row, g * g * (look[:, a] * look[:, b])[near.col], len(cells))
+        shape += 0.1 * np.trace(shape, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-9 * np.eye(3)
+        total = np.maximum(total, np.einsum("na,na->n", pull, np.linalg.solve(shape, pull[:, :, None])[:, :, 0]))
+    chosen: list[int] = []
+    for i in np.argsort(-total):
+        if all(np.linalg.norm(q[cells[i]] - q[cells[j]]) > 1.5 * max(widths_mm) for j in chosen):
+            chosen.append(int(i))
+        if len(chosen) == count:
+            break
+    return tuple(float(t[cells[i]]) for i in chosen)

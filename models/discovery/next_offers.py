@@ -1,0 +1,257 @@
+"""What could be measured next on this machine: the additions of run-format.md 5 that a campaign does not hold, as runs to be simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.discovery.case import Case, CaseRun
+from models.effects.path import Path, Places, driven, standing
+from models.machine import AXES, Machine
+from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+
+BAR_MIN, LASER_MIN, LINE_MIN, TOOL_MIN, WAIT_MIN, LENGTH_MIN = 10.0, 25.0, 20.0, 15.0, 120.0, 10.0
+"""Minutes to set up: ball-bar; laser on one diagonal; laser or angular interferometer on one axis; another tool; a late repeat's wait; a
+length standard. Shop practice as ball-bar and laser makers state it (effects.md sources [R], [Opt]), rounded."""
+RUN_MIN = 1.0
+POSITION_S = 4.5
+"""A laser needs this long per position: move, dwell, read."""
+READINGS = 120
+MARGIN = 0.05
+LONGER_TOOL_MM = 100.0
+ARM_MM = 100.0
+"""Two beams this far apart tell an angle."""
+LATE_S = 3.0 * 3600.0
+GAP_S = 900.0
+FEED_MM_MIN = 1500.0
+
+
+@dataclass(frozen=True)
+class Offer:
+    """One addition: its runs; ``less``: runs whose readings are taken off (angular); minutes; why, for people."""
+
+    adds: str
+    runs: tuple[CaseRun, ...]
+    minutes: float
+    why: str
+    less: tuple[CaseRun, ...] = ()
+    knows_length: bool = False
+
+    @property
+    def special(self) -> bool:
+        """Whether it needs more than a ball-bar and a laser for straight lines."""
+        return self.adds in ("angular_interferometer", "second_tool_length", "reference_length")
+
+
+def offers(case: Case) -> tuple[Offer, ...]:
+    """Every addition that the identify runs do not hold already."""
+    runs = [r.path for r in case.of("identify")]
+    bars, lasers = [p for p in runs if p.kind == "bar"], [p for p in runs if p.kind == "laser"]
+    if not runs:
+        return ()
+    start = max(float(r.path.at.t_s[-1]) for r in case.runs) + GAP_S
+    out: list[Offer] = []
+    if bars:
+        out += _bar_variants(bars, start)
+    else:
+        out.append(_ballbar(runs[0], start))
+    if not any(p.test == "laser_diagonal" for p in lasers):
+        out.append(_diagonals(runs[0], start))
+    if not any(p.test == "laser_linear" for p in lasers):
+        found = tuple(_line(runs[0], a, start + a * 3000.0, f"next_line_{AXES[a]}") for a in range(3))
+        out.append(Offer("single_axis_laser", found, 3 * LINE_MIN + _minutes(found), "a laser along each axis alone"))
+    out += [_angles(runs[0], start), _late(bars or lasers, start)]
+    if len({tuple(np.round(p.machine.tool_mm)) for p in runs}) < 2:
+        out.append(_second_tool(bars or lasers, start))
+    if bars and not any(r.length_calibrated for r in case.of("identify")):
+        out.append(Offer("reference_length", (), LENGTH_MIN, "the bar's length against a standard", knows_length=True))
+    return tuple(out)
+
+
+def _minutes(runs: tuple[CaseRun, ...]) -> float:
+    return sum(float(np.ptp(r.path.at.t_s)) / 60.0 + RUN_MIN for r in runs)
+
+
+def _bar_variants(bars: list[Path], start: float) -> list[Offer]:
+    out, first = [], bars[0]
+    feeds = {float(np.round(np.median(p.feed_mm_min))) for p in bars}
+    if max(feeds) < 1.3 * min(feeds):
+        other = max(feeds) * (0.4 if max(feeds) > 1500.0 else 2.5)
+        both = _with_back(first, bars, lambda q, t, label: _bar(first, q, other, t, label), start, "next_feed")
+        out.append(Offer("second_feed", both, BAR_MIN + _minutes(both), f"the same path at {other:.0f} mm/min"))
+    if len({float(np.sign(p.direction[0])) for p in bars}) < 2:
+        again = (_bar(first, first.at.q_mm[::-1], min(feeds), start, "next_back"),)
+        out.append(Offer("opposite_direction", again, BAR_MIN + _minutes(again), "the same path the other way round"))
+    if len({round(p.radius_mm) for p in bars}) < 2:
+        radius = first.radius_mm * (2.0 / 3.0 if first.radius_mm > 100.0 else 1.5)
+        if _fits(first.machine, first.centre_mm, radius):
+            shape = (first.at.q_mm - first.centre_mm) * (radius / first.radius_mm) + first.centre_mm
+            both = _with_back(first, bars, lambda q, t, label: _bar(first, q, max(feeds), t, label), start, "next_radius", shape)
+            out.append(Offer("second_radius", both, BAR_MIN + _minutes(both), f"the same path with a bar of {radius:.0f} mm"))
+    if not any(p.test == "ballbar_circle" for p in bars):
+        found = _circles(first, start, max(feeds))
+        if found:
+            out.append(Offer("planar_circles", found, BAR_MIN + _minutes(found), "circles in planes of two axes, both ways"))
+    return out
+
+
+def _with_back(
+    like: Path, bars: list[Path], make: Callable[[F2, float, str], CaseRun], start: float, label: str, q_mm: F2 | None = None
+) -> tuple[CaseRun, ...]:
+    """A path and, where the campaign goes both ways, its way back."""
+    q = like.at.q_mm if q_mm is None else q_mm
+    out = [make(q, start, label)]
+    if len({float(np.sign(p.direction[0])) for p in bars}) > 1:
+        out.append(
+            replace(
+                make(q[::-1], start + 300.0, f"{label}_back"), path=_same_setup(make(q[::-1], start + 300.0, f"{label}_back").path, out[0])
+            )
+        )
+    return tuple(out)
+
+
+def _same_setup(path: Path, first: CaseRun) -> Path:
+    return replace(path, setup=first.path.setup, t_set_s=first.path.t_set_s, reference=first.path.reference)
+
+
+def _fits(machine: Machine, centre_mm: F1, radius_mm: float) -> bool:
+    """Whether most of a hemisphere stays inside the strokes: the side that helices open to is not known here."""
+    room = np.minimum(centre_mm - machine.stroke_mm[:, 0], machine.stroke_mm[:, 1] - centre_mm)
+    return bool(np.sum(room >= radius_mm) >= 2)
+
+
+def _bar(like: Path, q_mm: F2, feed_mm_min: float, t_set_s: float, label: str, centre_mm: F1 | None = None) -> CaseRun:
+    """A ball-bar run over given positions, thinned, in a set-up of its own."""
+    q = q_mm[:: max(len(q_mm) // READINGS, 1)]
+    centre = like.centre_mm if centre_mm is None else centre_mm
+    way = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1).cumsum()
+    t = t_set_s + 5.0 + way / (feed_mm_min / 60.0) + 1e-3 * np.arange(len(q))
+    feed = np.full(len(q), feed_mm_min)
+    at = driven(q, t, feed, dwelling=False, temp_c={})
+    away = q - centre
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    path = Path(
+        label, f"~{label}", "ballbar_helix", "bar", like.machine, like.vertical, at, standing(centre, t_set_s, {}), away / length, feed,
+        np.ones(len(q)), np.zeros(len(q)), t_set_s, 0.0, float(np.median(length)), centre,
+    )  # fmt: skip
+    return _run(path)
+
+
+def _run(path: Path) -> CaseRun:
+    return CaseRun(path, "identify", np.zeros(path.n), np.ones(path.n, dtype=bool))
+
+
+def _circles(like: Path, start: float, feed: float) -> tuple[CaseRun, ...]:
+    """Circles in the planes that fit, both ways, about the middle of the strokes."""
+    centre = like.machine.centre_mm
+    out: list[CaseRun] = []
+    radius = like.radius_mm if like.kind == "bar" else min(150.0, float(np.floor(0.45 * like.machine.length_mm.min())))
+    angle = np.linspace(0.0, 2.0 * np.pi, READINGS)
+    for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 0))):
+        if radius > 0.48 * min(like.machine.length_mm[a], like.machine.length_mm[b]):
+            continue
+        q = np.tile(centre, (len(angle), 1))
+        q[:, a] += radius * np.cos(angle)
+        q[:, b] += radius * np.sin(angle)
+        for back in (False, True):
+            t = start + 120.0 * (2 * k + back)
+            run = _bar(like, q[::-1] if back else q, feed, t, f"next_circle_{k}{'b' if back else ''}", centre)
+            path = replace(run.path, test="ballbar_circle")
+            out.append(replace(run, path=_same_setup(path, out[0]) if out else path))
+    return tuple(out)
+
+
+def _ballbar(like: Path, start: float) -> Offer:
+    runs = _circles(like, start, 2.0 * FEED_MM_MIN) + tuple(
+        replace(r, path=replace(r.path, label=f"{r.path.label}_slow", setup=f"{r.path.setup}_slow"))
+        for r in _circles(like, start + 1500.0, FEED_MM_MIN)
+    )
+    return Offer("ballbar", runs, BAR_MIN + _minutes(runs), "a ball-bar in three planes at two feeds, both ways")
+
+
+def _laser(like: Path, q_mm: F2, beam: F1, start: float, label: str, test: str) -> CaseRun:
+    n = len(q_mm)
+    t: F1 = start + 5.0 + POSITION_S * np.arange(n, dtype=np.float64)
+    feed, half = np.full(n, 3000.0), np.where(np.arange(n) < n // 2, 1.0, -1.0)
+    at = driven(q_mm, t, feed, dwelling=True, temp_c={})
+    first = Places(q_mm[:1], at.sign[:1], at.since_mm[:1], at.v_mm_s[:1], at.a_mm_s2[:1], t[:1], {})
+    dead = like.dead_path_mm if like.dead_path_mm > 0 else 500.0
+    path = Path(
+        label, f"~{label}", test, "laser", like.machine, like.vertical, at, first, np.tile(beam, (n, 1)), feed, half,
+        (q_mm - q_mm[0]) @ beam, start, dead, 0.0, np.zeros(3),
+    )  # fmt: skip
+    return _run(path)
+
+
+def _box(machine: Machine) -> F2:
+    inside = MARGIN * machine.length_mm
+    return np.column_stack([machine.stroke_mm[:, 0] + inside, machine.stroke_mm[:, 1] - inside])
+
+
+def _diagonals(like: Path, start: float) -> Offer:
+    found = []
+    for k, name in enumerate(DIAGONALS):
+        a, b = diagonal_ends(_box(like.machine), name)
+        beam = (b - a) / np.linalg.norm(b - a)
+        found.append(_laser(like, step_diagonal(a, b, 12), beam, start + 2000.0 * k, f"next_{name}", "laser_diagonal"))
+    runs = tuple(found)
+    return Offer("laser_diagonals", runs, 4 * LASER_MIN + _minutes(runs), "the four body diagonals in steps, out and back")
+
+
+def _line(like: Path, axis: int, start: float, label: str, tool_mm: F1 | None = None) -> CaseRun:
+    box = _box(like.machine)
+    a, b = like.machine.centre_mm.copy(), like.machine.centre_mm.copy()
+    a[axis], b[axis] = box[axis]
+    run = _laser(like, straight_line(a, b, 21), np.eye(3)[axis], start, label, "laser_linear")
+    if tool_mm is None:
+        return run
+    return replace(run, path=replace(run.path, machine=replace(like.machine, tool_mm=like.machine.tool_mm + tool_mm)))
+
+
+def _angles(like: Path, start: float) -> Offer:
+    """An angular interferometer reads the difference of two beams; about both directions across each axis."""
+    one, two, t = [], [], start
+    for a in range(3):
+        for across in ((a + 1) % 3, (a + 2) % 3):
+            arm = ARM_MM * np.eye(3)[across]
+            label = f"next_angle_{AXES[a]}{AXES[across]}"
+            one.append(_line(like, a, t, label, arm))
+            two.append(_line(like, a, t, label, -arm))
+            t += 1500.0
+    runs = tuple(one)
+    return Offer("angular_interferometer", runs, 3 * LINE_MIN + _minutes(runs), "pitch and yaw of each axis by themselves", less=tuple(two))
+
+
+def _late(known: list[Path], start: float) -> Offer:
+    """The first paths again hours later, each in a set-up of its own."""
+    runs = []
+    for k, p in enumerate(_different(known)[:4]):
+        runs.append(_again(p, start + LATE_S + 1500.0 * k, f"next_late_{k}", p.machine))
+    setup = BAR_MIN if known[0].kind == "bar" else LASER_MIN
+    found = tuple(runs)
+    return Offer("longer_session", found, WAIT_MIN + len(found) * setup + _minutes(found), "the first runs again hours later")
+
+
+def _second_tool(known: list[Path], start: float) -> Offer:
+    tool = known[0].machine.tool_mm
+    along = tool / np.linalg.norm(tool) if np.linalg.norm(tool) > 1.0 else -np.eye(3)[2]
+    longer = replace(known[0].machine, tool_mm=tool + LONGER_TOOL_MM * along)
+    runs = tuple(_again(p, start + 1500.0 * k, f"next_tool_{k}", longer) for k, p in enumerate(_different(known)[:4]))
+    return Offer("second_tool_length", runs, TOOL_MIN + len(runs) * BAR_MIN + _minutes(runs), "the same runs with a tool 100 mm longer")
+
+
+def _different(known: list[Path]) -> list[Path]:
+    """One run of every set-up, in the order of time."""
+    first: dict[str, Path] = {}
+    for p in sorted(known, key=lambda p: float(p.at.t_s[0])):
+        first.setdefault(p.setup, p)
+    return list(first.values())
+
+
+def _again(p: Path, start: float, label: str, machine: Machine) -> CaseRun:
+    feed = float(np.median(p.feed_mm_min))
+    run = _bar(p, p.at.q_mm, feed, start, label) if p.kind == "bar" else _laser(p, p.at.q_mm, p.look[0], start, label, p.test)
+    return replace(run, path=replace(run.path, machine=machine, test=p.test))

@@ -1,0 +1,101 @@
+"""Noise of the instruments: white plus a slowly forgetting part, as fractions that all readings of one instrument share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, signal
+
+from models.arrays import F1, F2
+
+SHARE, MEMORY = 0.1, 0.75
+"""Share of the variance that is remembered from reading to reading, and how much of it; what is assumed before the readings say (typical of
+ball-bars and interferometers in a workshop: long-run variance 1.6 times that of one reading, discovery.md 4)."""
+CLEARLY = 0.85
+"""Differences of neighbours are believed where they say less than this share of what the residuals say."""
+LONE = 7.0
+"""A reading farther from its neighbours than this many standard deviations is none."""
+
+
+@dataclass(frozen=True)
+class Colour:
+    """Noise of one instrument: standard deviation of a reading, mm; share of its variance with memory; memory from reading to reading."""
+
+    sd_mm: float
+    share: float = SHARE
+    memory: float = MEMORY
+
+    def filter(self) -> tuple[float, float, float]:
+        """ARMA(1, 1) of the same autocovariance: (memory, weight of the last innovation, variance of an innovation over that of a reading).
+
+        Autocovariance 1, s m, s m^2, ...; (1 - m B) noise = (1 + c B) innovation.
+        """
+        s, m = self.share, self.memory
+        g0 = 1.0 + m * m - 2.0 * m * (s * m)
+        g1 = s * m * (1.0 + m * m) - m - s * m**3
+        if abs(g1) < 1e-12:
+            return m, 0.0, g0
+        half = g0 / (2.0 * g1)
+        c = half - np.sign(half) * np.sqrt(half * half - 1.0)
+        return m, float(c), float(g1 / c)
+
+
+def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> F2:
+    """Columns (n, k) of stacked runs, whitened by the innovations of their instrument's noise of 1 mm; its size is left to the caller."""
+    out = np.empty_like(columns)
+    start = 0
+    for n, kind in zip(lengths, kinds, strict=True):
+        m, c, v = colours[kind].filter()
+        part = columns[start : start + n]
+        scale = 1.0 / np.sqrt(v)
+        out[start : start + n] = signal.lfilter([scale, -m * scale], [1.0, c], part, axis=0)
+        out[start] *= np.sqrt(v)
+        start += n
+    return out
+
+
+def robust_sd(values: F1) -> float:
+    """Standard deviation from the median of absolute values."""
+    return float(np.median(np.abs(values)) / 0.6745) if values.size else float("nan")
+
+
+def level(
+    residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1, resolution_mm: Mapping[str, float]
+) -> dict[str, Colour]:
+    """Noise of each instrument from what is left of whitened readings (times the noise that was assumed, mm).
+
+    Differences of neighbours are blind to smooth effects that are not in the model yet: where they say clearly less, they are believed.
+    """
+    out: dict[str, Colour] = {}
+    for kind in dict.fromkeys(kinds):
+        alone, pairs = [], []
+        start = 0
+        for n, k in zip(lengths, kinds, strict=True):
+            part = slice(start, start + n)
+            start += n
+            if k == kind:
+                keep = use[part] > 0
+                scaled = residual[part] / np.sqrt(np.maximum(1.0 - leverage[part], 0.1))
+                alone.append(scaled[keep])
+                pairs.append(np.diff(scaled)[keep[1:] & keep[:-1]] / np.sqrt(2.0))
+        sd, smooth = robust_sd(np.concatenate(alone)), robust_sd(np.concatenate(pairs))
+        sd = smooth if smooth < CLEARLY * sd else sd
+        out[kind] = Colour(max(sd, resolution_mm[kind] / np.sqrt(12.0)))
+    return out
+
+
+def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str]) -> F1:
+    """1 for readings of a laser that go with their neighbours, 0 for lone ones far off (a beam that was cut for a moment), shape (n,)."""
+    out = np.ones(residual.size)
+    start = 0
+    for n, kind in zip(lengths, kinds, strict=True):
+        if kind == "laser" and n > 8:
+            part = residual[start : start + n]
+            off = part - ndimage.median_filter(part, 5, mode="nearest")
+            far = np.abs(off) > LONE * robust_sd(off)
+            if far.mean() <= 0.1:
+                out[start : start + n][far] = 0.0
+        start += n
+    return out

@@ -1,0 +1,164 @@
+"""Final solution with the effects that were found, and what every run reads then, sealed ones too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy import linalg
+
+from models.arrays import F1, F2
+from models.discovery.candidates import Pick, with_values
+from models.discovery.case import CaseRun
+from models.discovery.scene import Scene, ordered
+from models.effects.effect import Signal
+
+STEPS = 2
+LONGEST_STEP = 0.3
+"""Longest step of a non-linear parameter as a share of its value."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Unknowns of the simulation and of the effects from the identify runs, with usual sizes as priors.
+
+    Attributes
+    ----------
+    picks : with their non-linear parameters as solved.
+    theta, theta_covariance : of the simulation.
+    coefficients, covariance : of each pick, forms last.
+    shape_u : standard uncertainty of the non-linear parameters of each pick.
+    """
+
+    picks: tuple[Pick, ...]
+    theta: F1
+    theta_covariance: F2
+    coefficients: tuple[F1, ...]
+    covariance: tuple[F2, ...]
+    shape_u: tuple[Mapping[str, float], ...]
+
+
+def solve(scene: Scene, picks: Sequence[Pick]) -> Solved:
+    """Joint fit of simulation and effects, their non-linear parameters included (Gauss-Newton, inside their bounds)."""
+    picks = tuple(picks)
+    raw, first, second = _steps(scene, picks)
+    for _ in range(STEPS):
+        parts = zip(picks, second.coefficients, raw, second.covariance, strict=True)
+        moved = tuple(_moved(p, c[r.shape[1] :], cov) for p, c, r, cov in parts)
+        if moved == picks:
+            break
+        picks = moved
+        raw, first, second = _steps(scene, picks)
+    shape_u = []
+    for pick, r, cov in zip(picks, raw, second.covariance, strict=True):
+        k = r.shape[1]
+        shape_u.append({q.name: float(np.sqrt(cov[k + j, k + j])) for j, q in enumerate(pick.effect.shape)})
+    linear = tuple(c[: r.shape[1], : r.shape[1]] for c, r in zip(second.covariance, raw, strict=True))
+    return Solved(picks, first.theta, second.theta_covariance, first.coefficients, linear, tuple(shape_u))
+
+
+def _steps(scene: Scene, picks: Sequence[Pick]) -> tuple[list[F2], Solved, Solved]:
+    """Columns of the picks, the fit at their non-linear parameters, and the fit in which those may move too."""
+    raw = [p.raw(scene) for p in picks]
+    sd = [p.prior_sd(scene, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
+    first = _fit(scene, raw, sd)
+    slopes = [_slopes(scene, p, c) for p, c in zip(picks, first.coefficients, strict=True)]
+    wide = [np.concatenate([r, s], axis=1) for r, s in zip(raw, slopes, strict=True)]
+    return raw, first, _fit(scene, wide, [np.concatenate([s, _shape_sd(p)]) for p, s in zip(picks, sd, strict=True)])
+
+
+def _shape_sd(pick: Pick) -> F1:
+    return np.array([0.3 * (q.high - q.low) for q in pick.effect.shape])
+
+
+def _moved(pick: Pick, change: F1, covariance: F2) -> Pick:
+    """Non-linear parameters moved by a step, at most a third of their value, where the step is more than a tenth of what is known."""
+    k = len(covariance) - len(change)
+    values = dict(pick.values)
+    for j, q in enumerate(pick.effect.shape):
+        if abs(change[j]) > 0.1 * np.sqrt(covariance[k + j, k + j]):
+            most = LONGEST_STEP * max(abs(values[q.name]), 0.1 * (q.high - q.low))
+            values[q.name] = float(np.clip(values[q.name] + np.clip(change[j], -most, most), q.low, q.high))
+    return pick if values == dict(pick.values) else with_values(pick, values)
+
+
+def _slopes(scene: Scene, pick: Pick, coefficients: F1) -> F2:
+    """What the reading changes by with each non-linear parameter, by central differences, shape (n, parameters)."""
+    out = np.zeros((scene.gap.size, len(pick.effect.shape)))
+    for j, q in enumerate(pick.effect.shape):
+        value = pick.values[q.name]
+        step = 1e-3 * abs(value) if value else 1e-3 * (q.high - q.low)
+        ends = [with_values(pick, {**pick.values, q.name: value + s * step}).raw(scene) @ coefficients for s in (-1, 1)]
+        out[:, j] = (ends[1] - ends[0]) / (2.0 * step)
+    return out
+
+
+def _fit(scene: Scene, raw: Sequence[F2], sd: Sequence[F1]) -> Solved:
+    base, n, tangent, sd_mm = scene.base, scene.base.size, scene.tangent, scene.sd_mm()[:, None]
+    white = scene.white(np.column_stack([scene.gap + tangent.raw @ scene.theta, *raw]))
+    more = white[:, 1:]
+    cross = tangent.columns.T @ (white / sd_mm)
+    gram = np.block([[tangent.blend(scene.colours), cross[:, 1:]], [cross[:, 1:].T, more.T @ more]])
+    root = linalg.block_diag(base.root, *(np.diag(s) for s in sd))
+    gram = root.T @ gram @ root
+    gram.flat[:: len(gram) + 1] += 1.0
+    inverse = root @ np.linalg.inv(gram) @ root.T
+    x = inverse @ np.concatenate([cross[:, 0], more.T @ white[:, 0]])
+    at = n + np.concatenate([[0], np.cumsum([r.shape[1] for r in raw])]).astype(int)
+    parts = [slice(i, j) for i, j in pairwise(at)]
+    blocks = tuple(inverse[p, p] for p in parts)
+    return Solved((), x[:n], inverse[:n, :n], tuple(x[p] for p in parts), blocks, ())
+
+
+def predictions(scene: Scene, solved: Solved) -> dict[str, F1]:
+    """Reading of every run of the case, mm, sealed ones too. Set-ups that no identify run shares: cup and length at nominal."""
+    runs = ordered(scene.case.runs)
+    data = [r.data() for r in runs]
+    out = [scene.base.read(d, solved.theta) for d in data]
+    paths = tuple(scene.base.along(r.path, d, solved.theta) for r, d in zip(runs, data, strict=True))
+    identified = tuple(r.path.label in {p.label for p in scene.paths} for r in runs)
+    for pick, c in zip(solved.picks, solved.coefficients, strict=True):
+        used = 0
+        for signal in (pick.effect.signal, *(f.signal for f in pick.forms)):
+            columns = signal(paths, pick.key, pick.values)
+            width = _width(signal, scene, pick)
+            part = _spread(columns, identified, c[used : used + width])
+            used += width
+            out = [o + col @ part for o, col in zip(out, columns, strict=True)]
+    return {r.path.label: o for r, o in zip(runs, out, strict=True)}
+
+
+def _width(signal: Signal, scene: Scene, pick: Pick) -> int:
+    return int(signal(scene.paths, pick.key, pick.values)[0].shape[1])
+
+
+def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
+    """Coefficients for columns over all runs from those over the identify runs: a column that no identify run sees has none."""
+    if columns[0].shape[1] == c.size:
+        return c
+    seen = np.any([np.abs(col).max(axis=0) > 0.0 for col, known in zip(columns, identified, strict=True) if known], axis=0)
+    out = np.zeros(columns[0].shape[1])
+    out[np.flatnonzero(seen)] = c
+    return out
+
+
+def free_columns(run: CaseRun, seen: set[str]) -> F2:
+    """What a judged run may still set for itself: the zero of a laser; cup and bar length of a set-up that no identify run shares."""
+    p = run.path
+    if p.kind == "laser":
+        return np.ones((p.n, 1))
+    if p.setup in seen:
+        return np.zeros((p.n, 0))
+    return np.column_stack([p.look, np.ones(p.n)])
+
+
+def left_over(run: CaseRun, predicted_mm: F1, seen: set[str]) -> F1:
+    """Reading less prediction once the run has set what is its own, mm; flagged readings are NaN."""
+    assert run.deviation_mm is not None
+    gap = np.where(run.valid, run.deviation_mm, 0.0) - np.where(run.valid, predicted_mm, 0.0)
+    free = free_columns(run, seen) * run.valid[:, None]
+    if free.shape[1]:
+        gap = gap - free @ np.linalg.lstsq(free, gap, rcond=None)[0]
+    return np.asarray(np.where(run.valid, gap, np.nan))

@@ -1,0 +1,55 @@
+"""Names that are only what a stronger effect's formula leaves of its true form: no machine is true to a formula."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from models.discovery.answer import NamedEffect
+
+RESIDUE_SHARE = 0.001
+"""A name with less evidence than this share of the largest is nothing that can be told from what the largest one's formula leaves."""
+SCATTER_SHARE, SCATTER = 0.01, ("stick_slip", "vibration")
+"""Scatter of readings that move along with the axes: below this share of the strongest effect of the mean, at any axis, it is its rest."""
+AXIS_SHARE = 0.02
+AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
+"""What a drive shows at the turns of its axis is told from another such effect of the same axis by its form only: below this share it is
+that one's form."""
+
+
+def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
+    """Names that a stronger one's form explains.
+
+    A name is a residue with evidence below
+
+    - 0.1 % of the strongest name's;
+    - 1 % of the strongest effect of the mean's, where it is stick-slip or vibration, whatever the axis;
+    - 2 % of a stronger effect's of the same drive (lost motion, its change along the axis, spikes, play across, servo mismatch: keys that
+      end with the same axis).
+
+    What is weak but at another axis, or of another instrument (lost beams), stays: it is no form of the strong one.
+
+    Parameters
+    ----------
+    effects : everything with a name. scatter : labels of those that were found in the scatter of the readings.
+
+    Returns
+    -------
+    dict
+        Why, by label, for people.
+    """
+    out: dict[str, str] = {}
+    for small in effects:
+        for big in sorted(effects, key=lambda e: -e.evidence):
+            share = _share(small, big, big.label in scatter)
+            if small.evidence < share * big.evidence:
+                told = f"{small.evidence:.0f} nats, {small.evidence / big.evidence:.1%} of {big.label}'s"
+                out[small.label] = f"{told}: too small beside it to be more than what its formula leaves"
+                break
+    return out
+
+
+def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
+    """Share of the bigger one's evidence below which the smaller one is its residue."""
+    if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
+        return AXIS_SHARE
+    return SCATTER_SHARE if small.name in SCATTER and not big_is_scatter else RESIDUE_SHARE

@@ -1,0 +1,60 @@
+"""What else a named effect could be: every other name in its place, refined, against the same readings (discovery.md 4.9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from models.arrays import F2
+from models.discovery.candidates import Pick, gain_of
+from models.discovery.refine import refined
+from models.discovery.selection import Contest, Found, others
+
+EXCLUDED = 12.0
+"""A rival that explains less by this much chi-square, after its price, is excluded."""
+TRIED = 8
+KIN = 0.02
+"""Names that explain all but this share of the evidence are as good as the same: a curved form of the one is the other's."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A name that could stand in another's place, and by how much chi-square (after price) it explains less."""
+
+    pick: Pick
+    less: float
+    share: float
+
+
+def rivals_of(contest: Contest, found: Sequence[Found], i: int) -> list[Rival]:
+    """Names that the readings do not exclude in place of pick ``i``, the nearest first; variants of the same name are not rivals."""
+    picks = [f.pick for f in found]
+    rows = others(contest.scene, picks, i)
+    own = found[i]
+    without = [p.label for p in picks]
+    out = []
+    for candidate in contest.shortlist(rows, without, TRIED):
+        if candidate.pick.unnamed or _nested(candidate.pick, own.pick) or candidate.gain < 0.3 * own.gain:
+            continue
+        pick, gain = refined(contest.scene, candidate.pick, rows)
+        pick, gain, score = _formed(contest, pick, rows, gain)
+        rival = Rival(pick, own.score - score, gain / own.gain)
+        if rival.less < EXCLUDED or rival.share > 1.0 - KIN:
+            out.append(rival)
+    return sorted(out, key=lambda r: r.less)
+
+
+def _nested(a: Pick, b: Pick) -> bool:
+    """Whether one is a variant of the other: backlash and position-dependent backlash of one axis."""
+    return a.key == b.key and (a.effect.name.startswith(b.effect.name) or b.effect.name.startswith(a.effect.name))
+
+
+def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, float, float]:
+    """A rival with the freedoms of form that it earns: the same fairness as for the name that won."""
+    score = gain - contest.price(pick)
+    for form in pick.effect.forms:
+        more = replace(pick, forms=(*pick.forms, form))
+        with_form = gain_of(contest.scene, more, rows)
+        if with_form - contest.price(more) > score:
+            pick, gain, score = more, with_form, with_form - contest.price(more)
+    return pick, gain, score

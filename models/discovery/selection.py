@@ -1,0 +1,200 @@
+"""Which effects are missing: forward with a price for every parameter and every label tried, with back-steps (discovery.md 4.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from models.arrays import F2
+from models.discovery.candidates import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of
+from models.discovery.generic import generic_rivals
+from models.discovery.refine import refined
+from models.discovery.scene import Scene
+from models.effects.effect import Effect
+
+MOST_EFFECTS = 5
+SHORTLIST = 6
+THRESHOLD = 4.0
+"""Paid by every new name on top of its parameters and of how many names were tried."""
+UNNAMED_PRICE = 6.0
+FORM_LEAST = 0.0002
+"""... and explains at least this share of what the effect itself does; less would change its strength more than it is worth."""
+NEARLY = 0.93
+"""A name that explains this share of what a structure without a name explains goes first."""
+HOPELESS = 0.5
+"""A start that gains less than this share of the best name so far is not refined."""
+UNNAMED_LABELS = 40
+"""So many kinds of structure without a name are tried (`models.discovery.generic`)."""
+FORM_SHARE, FORM_PRICE = 0.6, 6.0
+"""A freedom of form of an effect already there pays this share of the price of its parameters, and this on top."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A pick with the chi-square it took away given all others, and what is left of that after its price."""
+
+    pick: Pick
+    gain: float
+    score: float
+
+
+def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
+    """What a new name has to gain: for each parameter, for the number of names that were tried, for being new.
+
+    ``logs``: sum of the logarithms of how many readings see each of its columns; a non-linear parameter takes all ``readings``.
+    """
+    return (
+        logs
+        + len(pick.effect.shape) * float(np.log(readings))
+        + 2.0 * float(np.log(max(labels, 1)))
+        + THRESHOLD
+        + (UNNAMED_PRICE if pick.unnamed else 0.0)
+    )
+
+
+def form_price(logs: float) -> float:
+    """The same for a freedom of form."""
+    return FORM_SHARE * logs + FORM_PRICE
+
+
+@dataclass(frozen=True)
+class Contest:
+    """The search over one scene: its bank of named candidates, the price of each label's columns, how many labels there are."""
+
+    scene: Scene
+    banks: list[Bank]
+    widths: dict[str, float]
+    labels: int
+    readings: int
+
+    @classmethod
+    def of(cls, scene: Scene, effects: Sequence[Effect]) -> Contest:
+        """All starts of all effects of the mean that the present simulation does not hold."""
+        bank = bank_of(scene, starts_of(competing(effects, scene.case.includes)))
+        widths = {p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)}
+        return cls(scene, [bank], widths, len(widths) + UNNAMED_LABELS, int(scene.use.sum()))
+
+    def look_for_unnamed(self, rows: F2) -> None:
+        """Structures without a name, with starts where what ``rows`` leave stands out; they take part from now on."""
+        scene = self.scene
+        left = scene.space.residual - rows.T @ (rows @ scene.space.y)
+        labels = [p.label for p in scene.paths]
+        sigma = {kind: c.sd_mm for kind, c in scene.colours.items()}
+        rivals = generic_rivals(scene.case, dict(zip(labels, scene.by_run(left), strict=True)), sigma)
+        bank = bank_of(scene, starts_of(competing(rivals, scene.case.includes)))
+        self.widths.update({p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)})
+        self.banks[1:] = [bank]
+
+    def price(self, pick: Pick) -> float:
+        """Price of a name in this contest, its forms included."""
+        plain = price(pick, self.widths[pick.label], self.readings, self.labels)
+        return plain + sum(form_price(self._form_width(pick, i)) for i in range(len(pick.forms)))
+
+    def _form_width(self, pick: Pick, i: int) -> float:
+        key = f"{pick.label}/{pick.forms[i].name}"
+        if key not in self.widths:
+            columns = np.abs(self.scene.raw(pick.forms[i].signal, pick.key, pick.values))
+            self.widths[key] = float(np.log(np.maximum((columns > 1e-5 * columns.max()).sum(axis=0), 2)).sum())
+        return self.widths[key]
+
+    def shortlist(self, rows: F2, without: Sequence[str], most: int = SHORTLIST) -> list[Found]:
+        """Best candidate of each label on the grid, best labels first."""
+        best: dict[str, Found] = {}
+        for bank in self.banks:
+            for pick, gain in zip(bank.picks, bank.gains(self.scene.space.y, rows), strict=True):
+                if pick.label not in without and (pick.label not in best or gain > best[pick.label].gain):
+                    best[pick.label] = Found(pick, float(gain), float(gain) - self.price(pick))
+        return sorted(best.values(), key=lambda f: (-f.score, f.pick.label))[:most]
+
+    def next(self, picks: Sequence[Pick], rows: F2, without: Sequence[str] = (), beat: float = 0.0) -> Found | None:
+        """The best new name after refinement whose score is above ``beat``, or None."""
+        tried: list[Found] = []
+        for candidate in self.shortlist(rows, [*without, *(p.label for p in picks)]):
+            most = max([beat, *(f.score for f in tried)])
+            if candidate.gain < HOPELESS * most - 20.0 or candidate.score < -30.0:
+                continue
+            pick, gain = refined(self.scene, candidate.pick, rows)
+            tried.append(Found(pick, gain, gain - self.price(pick)))
+        good = [f for f in tried if f.score > beat]
+        if not good:
+            return None
+        best = max(good, key=lambda f: f.score)
+        if best.pick.unnamed:  # a structure that holds a name's formula beside its own freedom: the name's own forms come next
+            near = [f for f in good if not f.pick.unnamed and f.gain > NEARLY * best.gain]
+            return max(near, key=lambda f: f.score, default=best)
+        return best
+
+    def next_form(self, picks: Sequence[Pick], rows: F2) -> tuple[int, Pick, float] | None:
+        """The best freedom of form of an effect that is there: its place, the pick with the form, its score."""
+        best: tuple[int, Pick, float] | None = None
+        for i, pick in enumerate(picks):
+            for form in pick.effect.forms:
+                if form in pick.forms:
+                    continue
+                more = replace(pick, forms=(*pick.forms, form))
+                only = replace(pick.effect, name=UNNAMED + "form", signal=form.signal, forms=())
+                gain = gain_of(self.scene, Pick(only, pick.key, pick.values), rows)
+                score = gain - form_price(self._form_width(more, len(more.forms) - 1))
+                if gain < FORM_LEAST * gain_of(self.scene, pick, others(self.scene, picks, i)):
+                    continue
+                if score > 0.0 and (best is None or score > best[2]):
+                    best = (i, more, score)
+        return best
+
+
+def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFECTS) -> list[Found]:
+    """All effects that are worth their price, with back-steps after every addition."""
+    picks, scene = list(start), contest.scene
+    for _ in range(3 * most):
+        rows = rows_for(scene, picks)
+        form = contest.next_form(picks, rows)
+        contest.look_for_unnamed(rows)
+        new = contest.next(picks, rows) if len(picks) < most else None
+        if form is not None and (new is None or form[2] > new.score or form[2] > 0.5 * new.score):
+            picks[form[0]] = form[1]
+        elif new is not None:
+            picks.append(new.pick)
+            picks = dropped(contest, swapped(contest, picks))
+        else:
+            break
+    return weighed(contest, dropped(contest, picks))
+
+
+def others(scene: Scene, picks: Sequence[Pick], i: int) -> F2:
+    """Rows of all picks but one."""
+    return rows_for(scene, [p for j, p in enumerate(picks) if j != i])
+
+
+def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
+    """Every older pick refined again beside the newer ones, and put in question by every other name."""
+    if len(picks) < 2:
+        return picks
+    for i in range(len(picks)):
+        rows = others(contest.scene, picks, i)
+        own, gain = refined(contest.scene, picks[i], rows, sweeps=1)
+        score = gain - contest.price(own)
+        rival = contest.next([p for j, p in enumerate(picks) if j != i], rows, without=[picks[i].label], beat=score + 1.0)
+        picks[i] = own if rival is None else rival.pick
+    return picks
+
+
+def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
+    """Without picks that the others have made worthless."""
+    while picks:
+        found = weighed(contest, picks)
+        worst = min(found, key=lambda f: f.score)
+        if worst.score > 0.0:
+            return picks
+        picks = [f.pick for f in found if f is not worst]
+    return picks
+
+
+def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Found]:
+    """Each pick with what it takes away beside all others, in the order of the picks."""
+    out = []
+    for i, pick in enumerate(picks):
+        gain = gain_of(contest.scene, pick, others(contest.scene, picks, i))
+        out.append(Found(pick, gain, gain - contest.price(pick)))
+    return out

@@ -1,0 +1,55 @@
+"""Structures without a name that a search found: how much evidence, where they live, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from models.discovery.answer import Where
+from models.discovery.case import Case
+from models.discovery.generic import is_unnamed, where_of
+from models.discovery.selection import Found
+from models.discovery.variance import VarianceFinding
+
+
+@dataclass(frozen=True)
+class Structure:
+    """One of them; ``title`` for people."""
+
+    label: str
+    title: str
+    evidence: float
+    where: Where
+
+
+def structures(case: Case, found: Sequence[Found], loud: Sequence[VarianceFinding]) -> tuple[Structure, ...]:
+    """Those among the effects of the mean (``found``) and of the scatter (``loud``), by evidence."""
+    out = [
+        Structure(f.pick.label, f.pick.effect.title, f.score / 2.0, where_of(f.pick.effect, f.pick.key, f.pick.values, case))
+        for f in found
+        if f.pick.unnamed
+    ]
+    out += [Structure(f.label, "short disturbance of the reading", f.evidence, f.where) for f in loud if is_unnamed(f.name)]
+    return tuple(sorted(out, key=lambda s: (-s.evidence, s.label)))
+
+
+def told_of(structure: Structure, *, beside: bool) -> str:
+    """``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: that it closes gap which the names do not."""
+    parts = [f"{structure.evidence:.0f} nats, without a name: {structure.title}", *_place(structure.where)]
+    return ", ".join(parts) + ("; what it closes of the gap is not the names'" if beside else "")
+
+
+def _place(where: Where) -> list[str]:
+    out = []
+    if where.time_s is not None:
+        out.append(f"at {where.time_s[0]:.0f} to {where.time_s[1]:.0f} s")
+    if where.position_mm is not None:
+        x, y, z = where.position_mm
+        out.append(f"around X {x:.0f} Y {y:.0f} Z {z:.0f} mm")
+    if where.period_s is not None:
+        out.append(f"period {where.period_s:.1f} s")
+    if where.period_mm is not None:
+        out.append(f"pitch {where.period_mm:.1f} mm")
+    if where.angular_lobes is not None:
+        out.append(f"{where.angular_lobes} lobes")
+    return out

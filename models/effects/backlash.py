@@ -1,0 +1,73 @@
+"""Backlash (lost motion): the axis stays behind by half the play in the direction it came from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F3
+from models.effects.columns import AXIS_KEYS, UM, along, axis_of, before_first_turn, first, of_machine, play, turn_between, wind_up
+from models.effects.effect import Effect, Form, Values
+from models.effects.path import Places
+
+WIND_UP_MM = (0.05, 0.15, 0.5, 2.0)
+"""Travel over which screw, coupling and guide wind up before the carriage follows; far below 0.05 mm the step is a step."""
+
+
+def lost_motion(at: Places, key: str, values: Values) -> F3:
+    """-(B/2) times the direction of the last motion, B = 1 um, after the play itself has been travelled."""
+    a = axis_of(key)
+    return along(a, -0.5 * UM * play(at, a))
+
+
+def _wind_up(at: Places, key: str, values: Values) -> F3:
+    a = axis_of(key)
+    return along(a, *(-0.5 * UM * w for w in wind_up(at, a, *WIND_UP_MM[:3])))
+
+
+def _slow_wind_up(at: Places, key: str, values: Values) -> F3:
+    a = axis_of(key)
+    return along(a, -0.5 * UM * wind_up(at, a, WIND_UP_MM[3])[0])
+
+
+def _turning(at: Places, key: str, values: Values) -> F3:
+    return along(axis_of(key), -0.5 * UM * turn_between(at, axis_of(key)))
+
+
+def _run_in(at: Places, key: str, values: Values) -> F3:
+    """Wind-up of a turn just before the first reading."""
+    a = axis_of(key)
+    return along(a, -0.5 * UM * at.sign[:, a] * np.exp(-before_first_turn(at, a) / WIND_UP_MM[2]))
+
+
+EFFECT = Effect(
+    name="backlash",
+    title="backlash (lost motion)",
+    family="drive",
+    keys=AXIS_KEYS,
+    unit="um",
+    per_unit=1.0,
+    typical=(2.0, 30.0),
+    shape=(),
+    signal=of_machine(lost_motion),
+    strength=first,
+    forms=(
+        Form("wind-up", of_machine(_wind_up)),
+        Form("slow wind-up", of_machine(_slow_wind_up)),
+        Form("turning", of_machine(_turning)),
+        Form("run-in", of_machine(_run_in)),
+    ),
+    needs="runs in both directions; a laser alone hardly tells X, Y and Z apart",
+    signature="circle and helix: a step outward at both ends of the axis, of the same size at all feeds; laser: forth and back stay apart",
+    remedy="control parameter",
+    remedy_text="enter the width as backlash compensation of the axis; if it grows or exceeds 30 um: screw nut, coupling, thrust bearing",
+    source="effects.md 1; docs/conventions.md, direction-dependent error",
+    separated_by={
+        "backlash": ("ballbar", "planar_circles", "opposite_direction"),
+        "backlash_position_dependent": ("second_radius",),
+        "dead_path": ("opposite_direction", "ballbar"),
+        "servo_mismatch": ("second_feed", "laser_diagonals"),
+        "reversal_spike": ("laser_diagonals", "second_feed"),
+        "lateral_play": ("ballbar", "planar_circles"),
+        "straightness": ("opposite_direction",),
+    },
+)

@@ -1,0 +1,37 @@
+"""Beam outliers: few laser readings are off because the beam was broken or bent for a moment."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F2
+from models.effects.columns import NO_KEY, UM, of_kind, size
+from models.effects.effect import Effect, Values
+from models.effects.path import Path
+
+
+def struck(path: Path, key: str, values: Values) -> F2:
+    """Where it may strike: any laser reading, with the variance of 1 um (before its small share of the readings)."""
+    return np.full((path.n, 1), UM**2)
+
+
+EFFECT = Effect(
+    name="beam_outliers",
+    title="outliers of the laser beam",
+    family="instrument",
+    keys=NO_KEY,
+    unit="um",
+    per_unit=1.0,
+    typical=(0.5, 60.0),
+    shape=(),
+    signal=of_kind("laser", struck, 1),
+    strength=size,
+    needs="laser runs; a robust fit shows them",
+    signature="isolated readings far from their neighbours, 1 to 4 in 100, in no order",
+    remedy="set-up",
+    remedy_text="clean the optics, keep chips and coolant mist off the beam, repeat the run",
+    source="effects.md 4",
+    kind="variance",
+    blind=("ballbar_helix", "ballbar_circle"),
+    separated_by={"backlash": ("longer_session",)},
+)

@@ -1,0 +1,76 @@
+"""Cyclic error: screw, encoder or gear repeats a small wave with every turn."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F1, F3
+from models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_machine, of_path, share_of_stroke
+from models.effects.effect import Effect, Form, Parameter, Values
+from models.effects.path import Path, Places
+
+LOW_MM, HIGH_MM, PER_MM = 4.0, 30.0, 0.0024
+"""Pitches of screws, and how far apart the starts' wave numbers (1/mm) are: over 300 mm two neighbours differ by less than a turn, so a
+refinement from the nearer one finds the truth between them."""
+STARTS = tuple(float(1.0 / k) for k in np.arange(1.0 / HIGH_MM, 1.0 / LOW_MM + PER_MM, PER_MM) if 1.0 / k >= LOW_MM)
+
+
+def _waves(at: Places, key: str, values: Values, harmonic: int) -> tuple[F3, F3]:
+    x = at.q_mm[:, axis_of(key)]
+    phase = 2.0 * np.pi * harmonic * x / values["pitch_mm"]
+    return UM * np.sin(phase), UM * np.cos(phase)
+
+
+def wave(at: Places, key: str, values: Values) -> F3:
+    """Sine and cosine of 2 pi x / pitch, 1 um."""
+    return along(axis_of(key), *_waves(at, key, values, 1))
+
+
+def _second(at: Places, key: str, values: Values) -> F3:
+    return along(axis_of(key), *_waves(at, key, values, 2))
+
+
+def _along(path: Path, at: Places, key: str) -> F1:
+    a = axis_of(key)
+    return share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
+
+
+def _modulated(path: Path, at: Places, key: str, values: Values) -> F3:
+    """The same wave growing along the screw, times -1 .. +1: the strength stays the mean amplitude."""
+    x = _along(path, at, key)
+    return along(axis_of(key), *(x * wave for wave in _waves(at, key, values, 1)))
+
+
+def _modulated_twice(path: Path, at: Places, key: str, values: Values) -> F3:
+    """The same wave strongest in the middle or at the ends of the screw; the strength stays the mean amplitude where tests go."""
+    x = _along(path, at, key)
+    return along(axis_of(key), *((x**2 - VISITED) * wave for wave in _waves(at, key, values, 1)))
+
+
+EFFECT = Effect(
+    name="cyclic_error",
+    title="cyclic error of screw or encoder",
+    family="drive",
+    keys=AXIS_KEYS,
+    unit="um",
+    per_unit=1.0,
+    typical=(0.5, 5.0),
+    shape=(Parameter("pitch_mm", "mm", LOW_MM, HIGH_MM, 10.0, "effects.md 1: screw lead 5...25 mm", STARTS),),
+    signal=of_machine(wave),
+    strength=amplitude,
+    forms=(
+        Form("second harmonic", of_machine(_second)),
+        Form("modulated", of_path(_modulated)),
+        Form("modulated twice", of_path(_modulated_twice)),
+    ),
+    needs="at least four readings per pitch along the axis; a laser step that is no multiple of the pitch",
+    signature="a chirp on the circle: fast across the axis, slow near its reversals, the same in both directions",
+    remedy="mechanics",
+    remedy_text="align screw, bearing and encoder coupling; a control with pitch-wise compensation can take the rest out",
+    source="effects.md 1",
+    separated_by={
+        "positioning_nonlinear": ("second_radius", "single_axis_laser"),
+        "reversal_spike": ("laser_diagonals",),
+        "cyclic_error": ("single_axis_laser",),
+    },
+)

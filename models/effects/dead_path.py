@@ -1,0 +1,50 @@
+"""Dead path: air that drifts in the part of the beam that is never travelled shifts the laser's zero."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F2
+from models.effects.columns import AIR_PER_K, NO_KEY, first, of_kind
+from models.effects.effect import Effect, Form, Values
+from models.effects.path import Path
+
+
+def _hours(path: Path) -> F2:
+    return np.asarray((path.at.t_s - path.reference.t_s[0]) / 3600.0)[:, None]
+
+
+def zero_drift(path: Path, key: str, values: Values) -> F2:
+    """0.93e-6 times the dead path times the hours since the first record, 1 K/h."""
+    return np.asarray(AIR_PER_K * path.dead_path_mm * _hours(path))
+
+
+def _bent(path: Path, key: str, values: Values) -> F2:
+    """A drift that is not straight in time."""
+    return np.asarray(AIR_PER_K * path.dead_path_mm * _hours(path) ** 2)
+
+
+EFFECT = Effect(
+    name="dead_path",
+    title="drift of the laser's dead path",
+    family="instrument",
+    keys=NO_KEY,
+    unit="K/h",
+    per_unit=1.0,
+    typical=(1.0, 8.0),
+    shape=(),
+    signal=of_kind("laser", zero_drift, 1),
+    strength=first,
+    forms=(Form("bent", of_kind("laser", _bent, 1)),),
+    needs="a diagonal there and back, so that time is not position",
+    signature="the reading drifts with time inside a run, whatever the position: forth and back make a loop",
+    remedy="set-up",
+    remedy_text="bring the interferometer near the start of the travel, shield the beam, set the zero when the air has settled",
+    source="effects.md 4",
+    blind=("ballbar_helix", "ballbar_circle"),
+    separated_by={
+        "backlash": ("opposite_direction", "ballbar"),
+        "axis_thermal_growth": ("ballbar", "longer_session"),
+        "spindle_thermal_drift": ("ballbar",),
+    },
+)

@@ -1,0 +1,48 @@
+"""Cosine error of the laser: the beam is not along the nominal direction, so its whole displacement is scaled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.effects.columns import NO_KEY, PPM, per_setup
+from models.effects.effect import Effect, Values
+from models.effects.path import Path
+
+
+def scaled(path: Path) -> F2:
+    """+1/2 mrad^2 times the displacement; one coefficient per laser set-up, theta^2 - 2 theta tilt in mrad^2."""
+    return np.asarray(0.5 * PPM * path.travel_mm)[:, None]
+
+
+def strength(coefficients: F1, values: Values) -> float:
+    """Misalignment in mrad from the mean over the set-ups (the mirror's tilt enters with either sign); negative: the beam reads short."""
+    seen = coefficients[coefficients != 0.0]
+    mean = float(seen.mean()) if seen.size else 0.0
+    return float(np.sign(mean) * np.sqrt(abs(mean)))
+
+
+EFFECT = Effect(
+    name="laser_cosine",
+    title="cosine error of the laser beam",
+    family="instrument",
+    keys=NO_KEY,
+    unit="mrad",
+    per_unit=1.0,
+    typical=(1.0, 5.0),
+    shape=(),
+    signal=per_setup("laser", 1, scaled),
+    strength=strength,
+    needs="a ball-bar scale as reference: with a laser alone it is part of the axes' scales",
+    signature="one scale error per diagonal, constant over time and direction",
+    remedy="set-up",
+    remedy_text="align the beam again over the full travel before the next diagonal",
+    source="effects.md 4; Wang: 1 mrad makes 0.5 um/m",
+    blind=("ballbar_helix", "ballbar_circle"),
+    separated_by={
+        "contour_lag": ("second_feed",),
+        "bar_length_error": ("reference_length", "second_radius"),
+        "axis_thermal_growth": ("longer_session", "second_radius"),
+        "air_refraction": ("longer_session",),
+    },
+)

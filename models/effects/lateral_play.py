@@ -1,0 +1,49 @@
+"""Lateral play: a carriage jumps sideways when its axis turns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F3
+from models.effects.columns import LATERAL_KEYS, UM, along, axis_of, direction_of, first, of_machine
+from models.effects.effect import Effect, Form, Values
+from models.effects.path import Places
+
+SETTLING_MM = (0.1, 0.5, 3.0)
+
+
+def jump(at: Places, key: str, values: Values) -> F3:
+    """+(P/2) times the direction of the moving axis, sideways, P = 1 um."""
+    return along(direction_of(key), 0.5 * UM * at.sign[:, axis_of(key)])
+
+
+def _settling(at: Places, key: str, values: Values) -> F3:
+    """The jump comes late: over some travel of the axis."""
+    a = axis_of(key)
+    return along(direction_of(key), *(0.5 * UM * at.sign[:, a] * np.exp(-at.since_mm[:, a] / d) for d in SETTLING_MM))
+
+
+EFFECT = Effect(
+    name="lateral_play",
+    title="lateral play of a carriage",
+    family="structure",
+    keys=LATERAL_KEYS,
+    unit="um",
+    per_unit=1.0,
+    typical=(1.0, 8.0),
+    shape=(),
+    signal=of_machine(jump),
+    strength=first,
+    forms=(Form("settling", of_machine(_settling)),),
+    needs="runs in both directions",
+    signature="a step across the axis where it turns, so a pair of spikes or steps that does not lie on the axis' own ends",
+    remedy="mechanics",
+    remedy_text="adjust gib or preload of the carriage's guide",
+    source="effects.md 2",
+    separated_by={
+        "lateral_play": ("ballbar", "planar_circles"),
+        "backlash": ("planar_circles", "ballbar"),
+        "servo_mismatch": ("second_feed", "laser_diagonals"),
+        "straightness": ("opposite_direction",),
+    },
+)

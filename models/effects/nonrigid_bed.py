@@ -1,0 +1,61 @@
+"""Bed that gives way: straightness of one axis that changes its sign across another."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F1, F3
+from models.effects.columns import LATERAL_KEYS, UM, along, axis_of, direction_of, first, of_path, share_of_stroke, third_axis
+from models.effects.effect import Effect, Form, Values
+from models.effects.path import Path, Places
+
+
+def _shares(path: Path, at: Places, key: str) -> tuple[F1, F1]:
+    """0 .. 1 along the moving axis and -1 .. +1 across, on the axis that the key does not name."""
+    stroke = path.machine.stroke_mm
+    x = 0.5 * (1.0 + share_of_stroke(at.q_mm[:, axis_of(key)], stroke[axis_of(key)]))
+    other = third_axis(key)
+    return x, share_of_stroke(at.q_mm[:, other], stroke[other])
+
+
+def twisted(path: Path, at: Places, key: str, values: Values) -> F3:
+    """sin(pi x / L) (2 y / L_y - 1), 1 um."""
+    x, y = _shares(path, at, key)
+    return along(direction_of(key), UM * np.sin(np.pi * x) * y)
+
+
+def _double_bow(path: Path, at: Places, key: str, values: Values) -> F3:
+    x, y = _shares(path, at, key)
+    return along(direction_of(key), UM * np.sin(2.0 * np.pi * x) * y)
+
+
+def _curved_across(path: Path, at: Places, key: str, values: Values) -> F3:
+    x, y = _shares(path, at, key)
+    return along(direction_of(key), UM * np.sin(np.pi * x) * (y**2 - 1.0 / 3.0), UM * np.sin(np.pi * x) * (y**3 - 0.6 * y))
+
+
+EFFECT = Effect(
+    name="nonrigid_bed",
+    title="bed that is not rigid",
+    family="structure",
+    keys=LATERAL_KEYS,
+    unit="um",
+    per_unit=1.0,
+    typical=(2.0, 20.0),
+    shape=(),
+    signal=of_path(twisted),
+    strength=first,
+    forms=(Form("double bow", of_path(_double_bow)), Form("curved across", of_path(_curved_across))),
+    needs="at least two origins on the other axis and laser diagonals; inside 21 error motions little of it remains",
+    signature="the straightness of an axis turns over from one side of the table to the other",
+    remedy="mechanics",
+    remedy_text="level the machine, check feet and foundation, put heavy loads in the middle; a spatial table can take the rest out",
+    source="effects.md 2",
+    separated_by={
+        "nonrigid_bed": ("laser_diagonals", "second_radius"),
+        "ram_sag": ("laser_diagonals", "ballbar"),
+        "straightness": ("laser_diagonals", "second_radius"),
+        "angular_error": ("second_tool_length", "angular_interferometer"),
+        "air_refraction": ("ballbar", "longer_session"),
+    },
+)

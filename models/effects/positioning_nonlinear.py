@@ -1,0 +1,34 @@
+"""Positioning error that is no pure scale: a smooth function of the axis' own position, along it."""
+
+from __future__ import annotations
+
+from models.effects.columns import AXIS_KEYS, axis_of, rms
+from models.effects.effect import Effect
+from models.effects.smooth import WITH_LINE, finer_shifts, shifts
+
+EFFECT = Effect(
+    name="positioning_nonlinear",
+    title="non-linear positioning of an axis",
+    family="geometry",
+    keys=AXIS_KEYS,
+    unit="um",
+    per_unit=1.0,
+    typical=(1.0, 20.0),
+    shape=(),
+    signal=shifts(axis_of, 2, 6),  # order 1 is the line that the present model knows
+    strength=rms,
+    forms=finer_shifts(axis_of),
+    unseen=WITH_LINE,
+    needs="two positions of the other axes, to tell it from angular errors; several places on the axis",
+    signature="a smooth curve over the axis, along it, the same at all positions of the others",
+    remedy="table",
+    remedy_text="enter it as screw (pitch) error compensation of the axis",
+    source="effects.md 2; Pahk: positioning bands of 6-71 um",
+    absorbed_by=("rigid21",),
+    separated_by={
+        "angular_error": ("second_tool_length", "angular_interferometer"),
+        "cyclic_error": ("single_axis_laser",),
+        "straightness": ("planar_circles", "ballbar"),
+        "positioning_nonlinear": ("single_axis_laser",),
+    },
+)

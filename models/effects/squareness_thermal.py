@@ -1,0 +1,54 @@
+"""Squareness that drifts: columns or beams warm up on one side and lean."""
+
+from __future__ import annotations
+
+from models.arrays import F1, F3
+from models.effects.columns import CAMPAIGN_S, PPM, along, first, of_path, warmth
+from models.effects.effect import Effect, Form, Parameter, Values
+from models.effects.path import Path, Places
+
+CARRIED = {"XY": (1, 0, -1.0), "ZX": (2, 0, 1.0), "YZ": (2, 1, -1.0)}
+"""Axis that travels, direction that deviates, sign of the right-hand rotation C0Y, B0Z, A0Z (docs/conventions.md)."""
+
+
+def _travel(path: Path, at: Places, key: str) -> tuple[int, F1]:
+    axis, direction, sign = CARRIED[key]
+    return direction, sign * PPM * (at.q_mm[:, axis] - float(path.machine.stroke_mm[axis, 0]))
+
+
+def leaning(path: Path, at: Places, key: str, values: Values) -> F3:
+    """C0Y, B0Z or A0Z of 1 urad, times 1 - exp(-t / tau)."""
+    direction, travel = _travel(path, at, key)
+    return along(direction, travel * warmth(at.t_s, values["tau_s"]))
+
+
+def _second_time(path: Path, at: Places, key: str, values: Values) -> F3:
+    direction, travel = _travel(path, at, key)
+    now = warmth(at.t_s, values["tau_s"])
+    return along(direction, *(travel * (warmth(at.t_s, values["tau_s"] * k) - now) for k in (1.0 / 3.0, 3.0)))
+
+
+EFFECT = Effect(
+    name="squareness_thermal",
+    title="squareness that drifts as the machine warms up",
+    family="thermal",
+    keys=tuple(CARRIED),
+    unit="urad",
+    per_unit=1.0,
+    typical=(5.0, 60.0),
+    shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "effects.md 3: as the growth of axes", (900.0, 2500.0, 7000.0)),),
+    signal=of_path(leaning),
+    strength=first,
+    forms=(Form("second time constant", of_path(_second_time)),),
+    needs="an early run repeated late; laser diagonals, to tell it from the growth of one axis",
+    signature="an oval at 45 degrees that drifts from run to run",
+    remedy="warm up or sensor",
+    remedy_text="warm up before work, keep sun and draught off the column; a sensor-driven squareness correction if the control has one",
+    source="effects.md 3; Procedia CIRP 58 (2017) 457: tilt of about 50 urad",
+    separated_by={
+        "axis_thermal_growth": ("laser_diagonals", "longer_session"),
+        "spindle_thermal_drift": ("second_radius", "longer_session", "laser_diagonals"),
+        "squareness_thermal": ("planar_circles", "laser_diagonals"),
+        "air_refraction": ("ballbar",),
+    },
+)

@@ -1,0 +1,36 @@
+"""Straightness: a carriage leaves its straight line sideways, as a smooth function of its own position."""
+
+from __future__ import annotations
+
+from models.effects.columns import LATERAL_KEYS, direction_of, rms
+from models.effects.effect import Effect
+from models.effects.smooth import WITH_LINE, finer_shifts, shifts
+
+EFFECT = Effect(
+    name="straightness",
+    title="straightness of an axis",
+    family="geometry",
+    keys=LATERAL_KEYS,
+    unit="um",
+    per_unit=1.0,
+    typical=(1.0, 15.0),
+    shape=(),
+    signal=shifts(direction_of, 2, 6),  # order 1 is the line that the present model knows
+    strength=rms,
+    forms=finer_shifts(direction_of),
+    unseen=WITH_LINE,
+    needs="at least two positions of the other axes, to tell it from angular errors",
+    signature="a smooth bow over the axis, the same at all positions of the others",
+    remedy="table",
+    remedy_text="enter it as straightness compensation over the axis; realign the guide if it is large",
+    source="effects.md 2; Pahk: EYX and its kin",
+    absorbed_by=("rigid21",),
+    separated_by={
+        "angular_error": ("second_tool_length", "angular_interferometer"),
+        "ram_sag": ("laser_diagonals", "second_radius"),
+        "nonrigid_bed": ("laser_diagonals", "second_radius"),
+        "lateral_play": ("opposite_direction",),
+        "straightness": ("planar_circles", "ballbar"),
+        "backlash": ("opposite_direction",),
+    },
+)

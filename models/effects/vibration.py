@@ -1,0 +1,53 @@
+"""Vibration: an axis swings at a frequency of its own while it moves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F2
+from models.effects.columns import AXIS_KEYS, UM, axis_of, of_kind, order_of, size
+from models.effects.effect import Effect, Values
+from models.effects.path import Path
+
+
+def swinging(path: Path, key: str, values: Values) -> F2:
+    """Extra variance of a sine of 1 um (1 um^2 / 2) as the bar sees it; its phase differs from run to run."""
+    return np.asarray(UM**2 / 2.0 * path.look[:, axis_of(key)] ** 2)[:, None]
+
+
+def line(paths: tuple[Path, ...], key: str, f_hz: float) -> list[F2]:
+    """Sine and cosine of one frequency along the axis, 1 um, with columns of their own for every ball-bar run (its phase is not known).
+
+    Mean signal of a steady vibration, for a search over frequencies: shape (n, 2 runs) per path, runs in order of their labels.
+    """
+    a, place = axis_of(key), order_of(path.label for path in paths if path.kind == "bar")
+    out = []
+    for path in paths:
+        columns = np.zeros((path.n, 2 * max(len(place), 1)))
+        if path.kind == "bar":
+            phase, k = 2.0 * np.pi * f_hz * path.at.t_s, 2 * place[path.label]
+            columns[:, k : k + 2] = UM * path.look[:, a : a + 1] * np.column_stack([np.sin(phase), np.cos(phase)])
+        out.append(columns)
+    return out
+
+
+EFFECT = Effect(
+    name="vibration",
+    title="vibration of an axis",
+    family="drive",
+    keys=AXIS_KEYS,
+    unit="um",
+    per_unit=1.0,
+    typical=(0.3, 3.0),
+    shape=(),
+    signal=of_kind("bar", swinging, 1),
+    strength=size,
+    needs="time stamps, and two rates of sampling to resolve the frequency",
+    signature="a line in the spectrum of the readings over time, folded by the sampling, strongest along the axis",
+    remedy="control parameter",
+    remedy_text="lower the gain or set a notch filter at the frequency; look for a loose motor mount, an unbalanced spindle, a pump nearby",
+    source="effects.md 1",
+    kind="variance",
+    blind=("laser_diagonal", "laser_linear"),
+    separated_by={"stick_slip": ("second_feed",), "vibration": ("planar_circles", "ballbar")},
+)

@@ -1,0 +1,135 @@
+"""``python -m simulators hidden-suite``: many sealed cases in the exchange format."""
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from simulators.arrays import F
+from simulators.hidden.cases import Case, make_case
+from simulators.hidden.draws import KINDS
+from simulators.hidden.effect import Hidden
+from simulators.hidden.instrument import DEAD_PATH_MM
+from simulators.hidden.plans import Run
+from simulators.hidden.sensors import temperatures
+
+SENSOR_NOISE_C = 0.03
+
+
+def kinds_of(count: int, kinds: Sequence[str], first: int) -> list[str]:
+    """Kinds of the cases of a suite in practice's proportions, shuffled by the seed."""
+    shares = np.array([KINDS[k] for k in kinds], dtype=np.float64)
+    wanted = count * shares / shares.sum()
+    numbers = np.floor(wanted).astype(int)
+    for i in np.argsort(numbers - wanted, kind="stable")[: count - int(numbers.sum())]:
+        numbers[i] += 1
+    out = [k for k, n in zip(kinds, numbers, strict=True) for _ in range(n)]
+    np.random.default_rng([52, first]).shuffle(out)
+    return out
+
+
+def make_suite(first: int, count: int, kinds: Sequence[str] = tuple(KINDS), *, wild: bool = True) -> Iterator[Case]:
+    """Cases with the seeds first, first + 1, ..., one after another."""
+    for i, kind in enumerate(kinds_of(count, kinds, first)):
+        yield make_case(f"case{i:04d}", first + i, kind, wild=wild)
+
+
+def write_case(case: Case, folder: Path) -> None:
+    """Write ``public/<case>/`` (campaign and runs) and ``sealed/<case>.json``."""
+    public = folder / "public" / case.name
+    public.mkdir(parents=True, exist_ok=True)
+    (folder / "sealed").mkdir(exist_ok=True)
+    readings = {r.run_id: case.setting.noise.put(case.clean_mm[r.run_id], r, case.setting.seed) for r in case.runs}
+    _write(public / "campaign.json", campaign(case))
+    for run in case.runs:
+        _write(public / f"{run.run_id}.json", run_file(case, run, readings[run.run_id]))
+    _write(folder / "sealed" / f"{case.name}.json", sealed(case, readings))
+
+
+def _write(path: Path, data: dict[str, object]) -> None:
+    path.write_text(json.dumps(data), encoding="utf-8")
+
+
+def campaign(case: Case) -> dict[str, object]:
+    """The ``abbe-campaign/1`` object."""
+    setups = {r.track.setup: {"kind": "ballbar" if r.track.kind == "bar" else "laser", "t_set_s": r.track.set_s} for r in case.runs}
+    noise = case.setting.noise
+    return {
+        "format": "abbe-campaign/1", "campaign": case.name, "machine": case.setting.document,
+        "current_model": {"includes": sorted([case.setting.model.level, *case.setting.model.terms])},
+        "instruments": {
+            "ballbar": {"resolution_mm": noise.bar_step_mm}, "laser": {"resolution_mm": noise.laser_step_mm, "dead_path_mm": DEAD_PATH_MM},
+        },
+        "setups": setups, "temperature_sensors": case.setting.sensors,
+        "runs": [{"run_id": r.run_id, "test": r.test, "role": r.role, "file": f"{r.run_id}.json"} for r in case.runs],
+    }  # fmt: skip
+
+
+def run_file(case: Case, run: Run, reading_mm: F) -> dict[str, object]:
+    """One ``abbe-run/1`` object."""
+    track = run.track
+    columns: dict[str, object] = {"t_s": _short(track.t_s, 4)}
+    for a, name in enumerate(("x_mm", "y_mm", "z_mm")):
+        columns[name] = _short(track.q_mm[:, a], 5)
+    columns["feed_mm_min"] = [run.feed] * track.n
+    columns["direction"] = [int(d) for d in run.direction]
+    columns["deviation_mm"] = None if run.role == "sealed" else _short(reading_mm, 6)
+    if case.setting.sensors:
+        rng = np.random.default_rng([53, case.setting.seed, track.number])
+        for name, true_c in temperatures(case.effects, case.setting.seed, track.t_s).items():
+            columns[f"temp_{name}_C"] = _short(true_c + rng.normal(scale=SENSOR_NOISE_C, size=track.n), 2)
+    return {
+        "format": "abbe-run/1", "campaign": case.name, "run_id": run.run_id, "test": run.test, "role": run.role, "setup": run.setup,
+        "machine": case.setting.document, "columns": columns,
+    }  # fmt: skip
+
+
+def _short(values: F, digits: int) -> list[float]:
+    return [round(v, digits) for v in values.tolist()]
+
+
+def sealed(case: Case, readings: dict[str, F]) -> dict[str, object]:
+    """The truth of a case, by which an answer is judged."""
+    noise = case.setting.noise
+    seen = {r.track.setup for r in case.runs if r.role == "identify"}
+    runs = {}
+    for run in (r for r in case.runs if r.role == "sealed"):
+        sigma = noise.bar_mm if run.track.kind == "bar" else noise.laser_mm
+        runs[run.run_id] = {
+            "test": run.test, "setup_id": run.track.setup, "sigma_um": 1e3 * sigma, "deviation_mm": _short(readings[run.run_id], 6),
+            "clean_mm": _short(case.clean_mm[run.run_id], 7), "without_effect_mm": _short(case.without_mm[run.run_id], 7),
+            "xyz_mm": [_short(q, 4) for q in run.track.q_mm], "setup_seen": run.track.setup in seen,
+            "info": {k: v for k, v in run.setup.items() if k not in ("setup_id", "t_set_s")},
+        }  # fmt: skip
+    verdict = {"null": "none", "unknown": "unknown"}.get(case.setting.kind, "named")
+    return {
+        "format": "blind-truth/1", "case": case.name, "kind": case.setting.kind, "forms": "wild" if _wild(case.effects) else "textbook",
+        "plan": case.setting.plan, "level": case.setting.model.level, "verdict": verdict, "effects": case.facts,
+        "noise": {"sigma_bar_um": 1e3 * noise.bar_mm, "sigma_laser_um": 1e3 * noise.laser_mm},
+        "known_setup": [{"label": e.label, "parameters": dict(e.parameters)} for e in case.setting.setup],
+        "gap": {"identify_effect_rms_um": case.gap_um}, "sealed_runs": runs,
+    }  # fmt: skip
+
+
+def _wild(effects: tuple[Hidden, ...]) -> bool:
+    return not effects or any(e.wild for e in effects)
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command line of a suite; gives the exit code."""
+    parser = argparse.ArgumentParser(prog="simulators hidden-suite", description="Sealed cases: campaigns in which effects are hidden.")
+    parser.add_argument("--first", type=int, required=True, help="seed of the first case")
+    parser.add_argument("--cases", type=int, required=True, help="how many")
+    parser.add_argument("--kinds", default=",".join(KINDS), help="kinds, separated by commas, in practice's proportions")
+    parser.add_argument("--textbook", action="store_true", help="effects that follow the textbook exactly")
+    parser.add_argument("--out", type=Path, required=True, help="directory to write public/ and sealed/ into")
+    options = parser.parse_args(argv)
+    kinds = options.kinds.split(",")
+    wrong = [k for k in kinds if k not in KINDS]
+    if wrong or options.cases < 1 or options.first < 0:
+        parser.error(f"unknown kind {wrong[0]!r}" if wrong else "--cases must be at least 1 and --first not negative")
+    for case in make_suite(options.first, options.cases, kinds, wild=not options.textbook):
+        write_case(case, options.out)
+    return 0

@@ -1,0 +1,215 @@
+"""The search on small campaigns whose readings this file makes by formulas of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from models.arrays import F1, F2
+from models.discovery.answer import Discovery
+from models.discovery.case import Case, CaseRun, Role
+from models.discovery.discover import discover
+from models.discovery.noise import Colour, unscaled
+from models.discovery.space import Space
+from models.effects.catalogue import CATALOGUE
+from models.effects.path import Path, driven, standing
+from models.machine import Machine
+from service.workflows.discovery_answer import answer_doc
+
+R, N = 100.0, 109
+MACHINE = Machine("w-X-b-Y-Z-t", np.array([[0.0, 400.0]] * 3))
+CUPS = {"A": np.array([150.0, 150.0, 150.0]), "B": np.array([250.0, 240.0, 220.0])}
+OFFSETS = {"A": np.array([0.012, -0.02, 0.007]), "B": np.array([-0.015, 0.01, 0.02])}
+SCALES = np.array([2e-5, -3e-5, 1e-5])
+
+
+RUN_IN = 9
+
+
+def circle(plane: int, direction: int) -> F2:
+    """One turn around a cup after some run-in, shape (RUN_IN + N, 3); all turning points are readings."""
+    angle = direction * np.arange(-RUN_IN, N) * 2.0 * np.pi / (N - 1)
+    around = np.zeros((len(angle), 3))
+    around[:, (plane + 1) % 3], around[:, (plane + 2) % 3] = R * np.cos(angle), R * np.sin(angle)
+    return around
+
+
+def left_behind(x_mm: F1, width_mm: float) -> F1:
+    """How far an axis with play stays behind, half the width to either side: carried along at the end of its play, standing within it."""
+    if np.ptp(x_mm) < 1e-9:
+        return np.zeros(len(x_mm))
+    carried = x_mm[0] - 0.5 * width_mm * np.sign(x_mm[1] - x_mm[0])
+    out = np.zeros(len(x_mm))
+    for k, x in enumerate(x_mm):
+        carried = min(max(carried, x - 0.5 * width_mm), x + 0.5 * width_mm)
+        out[k] = carried - x
+    return out
+
+
+def memory_noise(rng: np.random.Generator, sd_mm: float) -> F1:
+    """White noise and a tenth of slowly forgetting noise."""
+    slow = np.zeros(N)
+    for k, shock in enumerate(rng.normal(size=N) * np.sqrt(1.0 - 0.75**2)):
+        slow[k] = 0.75 * slow[k - 1] + shock if k else shock / np.sqrt(1.0 - 0.75**2)
+    return np.asarray(sd_mm * (np.sqrt(0.9) * rng.normal(size=N) + np.sqrt(0.1) * slow))
+
+
+def campaign(backlash_um: float = 0.0, step_um: float = 0.0, seed: int = 1) -> Case:
+    """Two cups, three planes, both directions, two feeds; lost motion of X; or X steps at 900 s."""
+    rng, t0 = np.random.default_rng(seed), 60.0
+    runs: list[CaseRun] = []
+    for setup, cup in CUPS.items():
+        t_set = t0
+        for feed in (1000.0, 2500.0):
+            for plane in range(3):
+                for direction in (1, -1):
+                    whole = circle(plane, direction)
+                    behind = left_behind(whole[:, 0], 1e-3 * backlash_um)[RUN_IN:]
+                    around = whole[RUN_IN:]
+                    q = cup + around
+                    t = t0 + np.arange(N) * 2.0 * np.pi * R / N / (feed / 60.0)
+                    t0 = float(t[-1]) + 20.0
+                    u = around / R
+                    moved = SCALES * (q - cup) - OFFSETS[setup]
+                    moved[:, 0] += behind
+                    moved[:, 0] += 1e-3 * step_um * ((t > 900.0).astype(float) - float(t_set > 900.0))
+                    reading = np.linalg.norm(around + moved, axis=1) - R + 0.002 + memory_noise(rng, 2e-4)
+                    runs.append(run(f"r{len(runs):02d}", setup, cup, q, t, feed, direction, t_set, u, np.round(reading, 4)))
+    return Case(
+        "small", MACHINE, frozenset({"rigid6", "setup_centre_offset", "bar_length_error"}), tuple(runs), {"bar": 1e-4, "laser": 1e-5}
+    )
+
+
+def run(label: str, setup: str, cup: F1, q: F2, t: F1, feed: float, direction: int, t_set: float, u: F2, reading: F1) -> CaseRun:
+    """Every seventh run is held out, every eleventh sealed."""
+    speed, number = np.full(N, feed), int(label[1:])
+    role: Role = "sealed" if number % 11 == 5 else "holdout" if number % 7 == 3 else "identify"
+    path = Path(
+        label, setup, "ballbar_circle", "bar", MACHINE, 2, driven(q, t, speed, dwelling=False, temp_c={}), standing(cup, t_set, {}), u,
+        speed, np.full(N, float(direction)), np.zeros(N), t_set, 0.0, R, cup,
+    )  # fmt: skip
+    return CaseRun(path, role, None if role == "sealed" else reading, np.ones(N, dtype=bool))
+
+
+@cache
+def of_backlash() -> tuple[Case, Discovery]:
+    case = campaign(backlash_um=4.0)
+    return case, discover(case, CATALOGUE)
+
+
+def test_nothing_missing_is_none() -> None:
+    found = discover(campaign(), CATALOGUE)
+    assert found.verdict == "none"
+    assert found.effects == ()
+    assert found.gaps["identify"].after_mm == pytest.approx(2e-4, rel=0.1)
+
+
+def test_lost_motion_is_named_with_its_size_and_the_gap_closes_on_runs_never_used() -> None:
+    _, found = of_backlash()
+    assert found.verdict == "named"
+    assert [e.label for e in found.effects] == ["backlash:X"]
+    effect = found.effects[0]
+    assert abs(effect.strength - 4.0) < 3.0 * effect.u_strength
+    assert effect.u_strength < 0.3
+    held = found.gaps["holdout"]
+    assert held.before_mm > 3.0 * held.floor_mm
+    assert held.after_mm < 1.1 * held.floor_mm
+    assert found.p_value < 1e-6
+    assert effect.needed is not None
+    assert effect.needed > 2.5  # without it the runs that judge are as bad as before
+
+
+def test_where_nobody_judges_nothing_is_needed_or_not() -> None:
+    case, _ = of_backlash()
+    alone = replace(case, runs=tuple(r for r in case.runs if r.role != "holdout"))
+    assert [e.needed for e in discover(alone, CATALOGUE).effects] == [None]
+
+
+def test_sealed_runs_are_predicted() -> None:
+    case, found = of_backlash()
+    sealed = [r.path for r in case.of("sealed")]
+    assert {p.label for p in sealed} <= set(found.predicted_mm)
+    for p in sealed:
+        moved = SCALES * (p.at.q_mm - p.centre_mm) - OFFSETS[p.setup]
+        moved[:, 0] += left_behind(p.at.q_mm[:, 0], 4e-3)
+        truth = np.linalg.norm(p.at.q_mm - p.centre_mm + moved, axis=1) - R + 0.002
+        error = (found.predicted_mm[p.label] - truth)[1:]  # the first reading depends on the run-in
+        assert np.sqrt(np.mean(error**2)) < 1e-4
+
+
+def test_order_of_runs_does_not_matter_and_nothing_is_random() -> None:
+    case, found = of_backlash()
+    again = discover(replace(case, runs=case.runs[::-1]), CATALOGUE)
+    assert [e.label for e in again.effects] == [e.label for e in found.effects]
+    assert again.effects[0].strength == found.effects[0].strength
+    assert again.p_value == found.p_value
+    for label, value in found.predicted_mm.items():
+        assert np.array_equal(value, again.predicted_mm[label])
+
+
+def test_a_step_in_time_is_unknown_and_located() -> None:
+    found = discover(campaign(step_um=6.0), CATALOGUE)
+    assert found.verdict == "unknown"
+    assert found.effects == ()
+    assert found.where.time_s is not None
+    low, high = found.where.time_s
+    assert low <= 900.0 + 60.0
+    assert high >= 900.0 - 60.0
+
+
+def test_a_step_beside_a_name_is_not_credited_to_the_name() -> None:
+    case = campaign(backlash_um=4.0, step_um=1.5)
+    found = discover(case, CATALOGUE)
+    assert found.verdict == "named"
+    assert [e.label for e in found.effects] == ["backlash:X"]
+    labels = [label for label, _ in found.beside]
+    assert any(label.startswith("unnamed_") for label in labels)
+    evidence = [value for _, value in found.beside]
+    assert evidence == sorted(evidence, reverse=True)
+    assert evidence[0] < found.effects[0].evidence
+    told = dict(found.rejected)
+    for label, value in found.beside:
+        assert told[label].startswith(f"{value:.0f} nats, without a name: ")
+    assert answer_doc(found, case)["beside"] == [{"label": label, "evidence": value} for label, value in found.beside]
+
+
+def test_nothing_stands_beside_a_lone_name_or_an_unknown() -> None:
+    assert of_backlash()[1].beside == ()
+    unknown = discover(campaign(backlash_um=0.8, step_um=6.0), CATALOGUE)
+    assert unknown.verdict == "unknown"
+    assert unknown.effects == unknown.beside == ()
+    assert "less than what has no name" in dict(unknown.rejected)["backlash:X"]
+
+
+def test_a_role_whose_readings_are_all_flagged_has_no_gap() -> None:
+    case = campaign(backlash_um=4.0)
+    runs = tuple(replace(r, valid=r.valid & (r.role != "holdout")) for r in case.runs)
+    found = discover(replace(case, runs=runs), CATALOGUE)
+    assert set(found.gaps) == {"identify"}
+    assert "holdout_rms_um" not in answer_doc(found, case)
+
+
+def test_whitened_noise_has_unit_variance_and_no_memory() -> None:
+    colour = Colour(3e-4)
+    rng = np.random.default_rng(3)
+    runs = 400
+    noise = np.concatenate([memory_noise(rng, 3e-4) for _ in range(runs)])
+    white = unscaled(noise[:, None], [N] * runs, ["bar"] * runs, {"bar": colour})[:, 0] / colour.sd_mm
+    assert np.mean(white**2) == pytest.approx(1.0, abs=0.02)
+    parts = white.reshape(runs, N)
+    for lag in (1, 2, 5):
+        assert abs(np.mean(parts[:, lag:] * parts[:, :-lag])) < 0.02
+
+
+def test_what_is_left_of_readings_is_orthogonal_to_what_was_taken_out() -> None:
+    rng = np.random.default_rng(5)
+    columns, more, y = rng.normal(size=(80, 5)), rng.normal(size=(80, 2)), rng.normal(size=80)
+    space = Space.of(y, columns, columns.T @ columns, np.full(5, 1e6)).without(more, np.full(2, 1e6))
+    every = np.column_stack([columns, more])
+    left = y - every @ np.linalg.lstsq(every, y, rcond=None)[0]
+    assert space.residual == pytest.approx(left, abs=1e-8)
+    assert space.chi2 == pytest.approx(float(left @ left), abs=1e-8)
+    assert space.leverage.sum() == pytest.approx(7.0, abs=1e-8)
