@@ -76,6 +76,24 @@ class CampaignRefused(AbbeError):
     code = "SOL-003"
 
 
+class ModelUnknown(AbbeError):
+    """The model book of a machine does not hold what was asked for, or holds what this version cannot compute."""
+
+    code = "DIS-001"
+
+
+class EffectUnknown(AbbeError):
+    """The catalogue of effects has no entry of this name."""
+
+    code = "DIS-002"
+
+
+class EffectPluginBroken(AbbeError):
+    """An effect of another package cannot be used. It was left out; all else works."""
+
+    code = "DIS-003"
+
+
 class TableRefused(AbbeError):
     """A table breaks a limit (value, step, change). Nothing was written."""
 

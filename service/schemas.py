@@ -8,6 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from service.config_schema import MachineFile
+from service.runs.discovery_file import DiscoveryFile
 from service.runs.formats import CampaignFile, ErrorsFile, RunFile
 from service.runs.machine_object import MachineObject
 from service.runs.solution_file import SolutionFile
@@ -19,6 +20,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "campaign": CampaignFile,
     "errors": ErrorsFile,
     "solution": SolutionFile,
+    "discovery": DiscoveryFile,
 }
 
 

@@ -6,13 +6,17 @@ import typer
 
 from service.cli.configuration import check_config, schema
 from service.cli.demo import demo
+from service.cli.discover import discover
+from service.cli.effects import effects
 from service.cli.errors import errors
 from service.cli.exchange import export_campaign, import_campaign
 from service.cli.measure import correct, measure
+from service.cli.model import model
 from service.cli.papers import papers
 from service.cli.plan import plan
 from service.cli.serve import serve
 from service.cli.show import runs, show
+from service.cli.simulate import simulate
 from service.cli.solve import solve
 from service.cli.system import SIM_SETTINGS, sim, version
 from service.cli.table import accept_table
@@ -31,6 +35,10 @@ app.command("demo")(demo)
 app.command("plan")(plan)
 app.command("measure")(measure)
 app.command("solve")(solve)
+app.command("simulate")(simulate)
+app.command("discover")(discover)
+app.add_typer(model, name="model")
+app.command("effects")(effects)
 app.command("errors")(errors)
 app.command("correct")(correct)
 app.command("serve")(serve)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from service.workflows.demo import DemoResult
+    from service.workflows.demo_hidden import HiddenDemo
 
 DEFAULT_FOLDER = "abbe-demo"
 
@@ -26,8 +27,18 @@ def demo(
     speed: Annotated[float, typer.Option(min=1.0, max=200.0, help="Machine seconds per wall second.")] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")] = False,
     keep: Annotated[Path | None, typer.Option(help="Folder for database, machine file, tables and report.")] = None,
+    hidden: Annotated[
+        int | None,
+        typer.Option("--hidden", metavar="SEED", min=0, help="Find what this machine hides, if anything.", show_default=False),
+    ] = None,
 ) -> None:
-    """Measure a simulated machine tool over real wires, correct it, and prove that it became better."""
+    """Measure a simulated machine tool over real wires, correct it, and prove that it became better.
+
+    With --hidden: find the physical effect that the simulation of the machine lacks, prove it on a new measurement, and open the truth.
+    """
+    if hidden is not None:
+        hidden_demo(hidden, speed, as_json, keep)
+        return
     from rich.console import Console
 
     from service.cli.progress import display
@@ -48,6 +59,41 @@ def demo(
     else:
         print_result(Console(), result)
     log.print(f"report: {report}")
+
+
+def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> None:
+    """Play a discovery; only the simulator knows what the seed stands for."""
+    from rich.console import Console
+
+    from service.cli.progress import display
+    from service.cli.running import run_job
+    from service.report.page_file import write_page
+    from service.workflows.demo_hidden import run_hidden_demo
+    from service.workflows.demo_hidden_words import hidden_json, story
+
+    folder = keep or Path(DEFAULT_FOLDER)
+    folder.mkdir(parents=True, exist_ok=True)
+    with display() as sink, work_folder(folder, keep) as work:
+        result = run_job(run_hidden_demo(["--hidden", str(seed)], speed, work, sink))
+    report = folder / "discovery.html"
+    write_page(hidden_page(result), report)
+    if as_json:
+        sys.stdout.write(json.dumps({"seed": seed, "speed": speed} | hidden_json(result), indent=2) + "\n")
+    else:
+        for line in story(result):
+            typer.echo(line)
+    Console(stderr=True).print(f"report: {report}")
+
+
+def hidden_page(result: HiddenDemo) -> str:
+    """The report of what was found, as HTML; the truth is not in it, nobody at a real machine has one."""
+    from service.report.discovery_page import render_discovery
+    from service.workflows.discovery_pages import discovery_page, page_facts
+
+    assert result.job is not None
+    assert result.journal is not None
+    facts = page_facts(result.job, result.journal, result.started_utc)
+    return render_discovery(discovery_page(result.finding, result.job.runs, *facts))
 
 
 @contextmanager

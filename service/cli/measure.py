@@ -97,6 +97,8 @@ def correct(
     with Store.open(loaded.database_url) as store:
         found = run_job(work(store))
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
+    for line in found.not_for_tables:
+        typer.echo(f"not in the tables: {line}")
     raise typer.Exit(0 if found.decision.keep else 1)
 
 

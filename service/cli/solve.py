@@ -62,6 +62,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     A folder's result is stored only if --db or --machine names a database. A run that cannot be what it says is refused (exit code 2).
     """
     from service.workflows.campaign_folder import from_folder, is_folder, keep
+    from service.workflows.taken_out import taken_out
 
     wanted = _Wanted(model, tables, grid, nodes, unit_um * 1e-3, trials)
     if is_folder(campaign):
@@ -71,8 +72,10 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
             with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: what is refused leaves no database
                 doc |= keep(store, found, doc)
     else:
-        with _stored(campaign, database_url(db, machine)) as (store, found):
-            told, doc = _solved(found.without(without or []), wanted)
+        with stored_campaign(campaign, database_url(db, machine)) as (store, found):
+            known = taken_out(store, found.without(without or []))
+            told, doc = _solved(known.campaign, wanted)
+            doc |= known.doc
             doc |= keep(store, found, doc)
     if report is not None:
         _write_report(told, doc, found, report)
@@ -98,7 +101,7 @@ class _Wanted:
 
 
 @contextmanager
-def _stored(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
+def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
     """The store and its campaign of that name; what is neither a folder nor in the store is said in one line."""
     from service.errors import StoreError
     from service.workflows.campaign_folder import from_store
@@ -177,6 +180,8 @@ def _print(told: Account, doc: dict[str, Any]) -> None:
     typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.seen.effective_rank} of them well.")
     typer.echo(worst_line(told))
     _tables(doc)
+    if "machine_model" in doc:
+        _lines("model book, not for tables (taken out of the readings where it lasts):", doc["machine_model"]["not_for_tables"])
     _lines("noise found:", noise_lines(told.joint))
     _lines("outliers:", outlier_lines(told.solved))
     _lines("residuals that are not noise:", residual_lines(told.joint))

@@ -13,7 +13,7 @@ from service.errors import FileFormatError
 from service.runs.checks import check, check_run, read_json
 from service.runs.codec import JSON_CODEC, encode_json
 from service.runs.columns import pack_columns, run_document
-from service.runs.formats import CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
+from service.runs.formats import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
 from service.storage.records import CampaignRecord, Doc, ImportedRun, RunRecord
 from service.storage.store import Store
 
@@ -180,7 +180,7 @@ def _campaign_document(store: Store, record: CampaignRecord, entries: list[Doc],
             "setups": setups | imported["setups"] if set(setups) - set(imported["setups"]) else imported["setups"],
         }
     base = {"format": CAMPAIGN_FORMAT, "campaign": record.name, "machine": store.machine(record.machine_id).doc}
-    assumed = {"current_model": {"includes": [], "errors": None}, "instruments": {}, "temperature_sensors": False}
+    assumed = {"current_model": {"includes": list(ASSUMED_MODEL), "errors": None}, "instruments": {}, "temperature_sensors": False}
     return base | assumed | record.doc | {"setups": setups, "runs": entries}
 
 

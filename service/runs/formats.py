@@ -14,6 +14,10 @@ ERRORS_FORMAT = "abbe-errors/1"
 
 Test = Literal["ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear"]
 Role = Literal["identify", "holdout", "sealed"]
+Known = Literal["rigid6", "rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"]
+"""What the present simulation of a machine may know (run-format.md 4)."""
+ASSUMED_MODEL: tuple[Known, ...] = ("rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt")
+"""What it is taken to know where a campaign does not say; an empty list does say: nothing beyond linear errors and squareness."""
 Numbers = list[float]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 FileName = Annotated[str, Field(pattern=r"^[^/\\\x00]+\.json$")]
@@ -101,7 +105,7 @@ class RunFile(FileObject):
 class CurrentModel(FileObject):
     """What the present simulation of the machine knows."""
 
-    includes: list[str]
+    includes: list[Known]
     errors: FileName | None = None
 
 

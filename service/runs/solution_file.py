@@ -206,6 +206,14 @@ class MonteCarloCheck(FileObject):
     text: str
 
 
+class MachineModel(FileObject):
+    """Version of the machine's model, its effects that were taken out of the readings, and those that are no matter for tables."""
+
+    version: int
+    taken_out: list[str]
+    not_for_tables: list[str]
+
+
 class SolutionFile(FileObject):
     """A solved campaign (``abbe-solution/1``). Every ``u`` is a standard uncertainty (k = 1); ``expanded_um`` has 95 % coverage.
 
@@ -243,6 +251,7 @@ class SolutionFile(FileObject):
     ten_parameter_helix_note: str
     step_diagonals: dict[str, dict[str, float]]
     step_diagonals_note: str
+    machine_model: MachineModel | None = None
     campaign: str | None = None
     machine: MachineObject | None = None
     solution_id: int | None = None

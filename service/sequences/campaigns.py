@@ -15,7 +15,7 @@ from service.sequences.recipes import Diagonal, Helix, Linear, Recipe, as_point
 from service.sequences.steps import CampaignPlan, Point
 
 
-def _hemisphere(machine: Machine, rel: tuple[float, float, float], share: float) -> tuple[Point, float]:
+def hemisphere(machine: Machine, rel: tuple[float, float, float], share: float) -> tuple[Point, float]:
     """Centre at relative place ``rel`` and the largest radius (whole mm, times ``share``) whose upper hemisphere stays inside."""
     centre = machine.stroke_mm[:, 0] + np.array(rel) * machine.length_mm
     below = centre - machine.stroke_mm[:, 0]
@@ -29,7 +29,7 @@ def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identif
     recipes: list[Recipe] = []
     places = [(0.5, 0.5, 0.3), (0.32, 0.36, 0.2), (0.68, 0.64, 0.2), (0.32, 0.64, 0.25), (0.68, 0.36, 0.25)]
     for k, rel in enumerate(places):
-        centre, radius = _hemisphere(machine, rel, 0.85 if k == 0 else 0.95)
+        centre, radius = hemisphere(machine, rel, 0.85 if k == 0 else 0.95)
         recipes.append(Helix(f"helix{k + 1}", f"B{k + 1}", "identify", centre, radius, rate_hz=rate_hz))
     for a in range(3):
         for k, at in enumerate((0.15, 0.85)):
@@ -41,7 +41,7 @@ def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identif
 
 def verification(machine: Machine, *, rate_hz: int = 100, name: str = "verify", role: str = "holdout") -> CampaignPlan:
     """One helix (another centre and radius than any used to identify) and the four plain body diagonals."""
-    centre, radius = _hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
+    centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
     recipes: list[Recipe] = [Helix("check-helix", "VB", role, centre, radius, turns=4, rate_hz=rate_hz)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", role, d, 20, "") for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
@@ -49,7 +49,7 @@ def verification(machine: Machine, *, rate_hz: int = 100, name: str = "verify", 
 
 def quick_check(machine: Machine, *, rate_hz: int = 100, name: str = "quick-check") -> CampaignPlan:
     """The unattended check: the same figures as the verification with half the positions, a few minutes of machine time."""
-    centre, radius = _hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
+    centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
     recipes: list[Recipe] = [Helix("check-helix", "VB", "holdout", centre, radius, turns=3, rate_hz=rate_hz)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 10, "") for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))

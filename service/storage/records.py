@@ -129,6 +129,41 @@ class VerificationRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class DiscoveryRecord:
+    """One search for what a campaign's model lacks. ``digest``: of readings, model and program; the same search has the same."""
+
+    id: int
+    campaign_id: int
+    digest: str
+    doc: Doc
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """One state that a discovery reached, with what was known then. Never changed after writing; ``seq`` counts from 0."""
+
+    id: int
+    discovery_id: int
+    seq: int
+    state: str
+    doc: Doc
+    utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class ModelRecord:
+    """One version of a machine's model. Never changed; ``version`` counts from 1. ``discovery_id``: what brought it, None for a person."""
+
+    id: int
+    machine: str
+    version: int
+    discovery_id: int | None
+    doc: Doc
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
 class OutboxRecord:
     """A message that must reach the broker some day."""
 

@@ -8,13 +8,16 @@ from sqlalchemy import Connection
 
 from service.storage.records import Doc, ImportedRun
 from service.storage.store_campaigns import insert_campaign, machine_id_of
+from service.storage.store_discoveries import DiscoveryStore
 from service.storage.store_queues import QueueStore
 from service.storage.store_results import ResultStore
 from service.storage.store_runs import RunStore, insert_imported
 
 
-class Store(RunStore, ResultStore, QueueStore):
-    """A database of machines, campaigns, runs, results and queues. Any thread may call; writes happen one after the other in one thread.
+class Store(RunStore, ResultStore, DiscoveryStore, QueueStore):
+    """A database of machines, campaigns, runs, results, model books and queues.
+
+    Any thread may call; writes happen one after the other in one thread.
 
     Open it with ``Store.open(url)``; in coroutines use ``await store.write(store.method, ...)``.
     """

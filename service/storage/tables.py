@@ -123,6 +123,41 @@ verifications = Table(
     Index(None, "machine_id"),
 )
 
+discoveries = Table(
+    "discoveries",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("campaign_id", ForeignKey("campaigns.id"), nullable=False),
+    Column("digest", String(64), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    Index(None, "campaign_id"),
+)
+
+discovery_steps = Table(
+    "discovery_steps",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("discovery_id", ForeignKey("discoveries.id"), nullable=False),
+    Column("seq", Integer, nullable=False),
+    Column("state", String(30), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("utc", String(32), nullable=False),
+    UniqueConstraint("discovery_id", "seq"),
+)
+
+machine_models = Table(
+    "machine_models",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine", String(200), nullable=False),
+    Column("version", Integer, nullable=False),
+    Column("discovery_id", ForeignKey("discoveries.id")),
+    Column("doc", JSON, nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    UniqueConstraint("machine", "version"),
+)
+
 slots = Table(
     "slots",
     metadata,

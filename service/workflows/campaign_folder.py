@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,13 @@ from service.workflows.provenance import machine_digest, run_digest
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign as a solver takes it. ``folder``: where it was read from; None for one of the store."""
+    """A campaign as a solver takes it. ``folder``: where it was read from; None for one of the store. ``doc``: its campaign object."""
 
     name: str
     site: Site
     runs: list[dict[str, Any]]
     folder: Path | None
+    doc: dict[str, Any] = field(default_factory=dict)
 
     def without(self, labels: list[str]) -> Campaign:
         """The campaign without some of its runs.
@@ -36,7 +37,7 @@ class Campaign:
         missing = [n for n in labels if n not in names]
         if missing:
             raise CampaignRefused(f"campaign {self.name} has no run {missing[0]}", f"it has {', '.join(names)}")
-        return Campaign(self.name, self.site, [r for r in self.runs if r["run_id"] not in labels], self.folder)
+        return Campaign(self.name, self.site, [r for r in self.runs if r["run_id"] not in labels], self.folder, self.doc)
 
 
 def is_folder(campaign: str) -> bool:
@@ -53,7 +54,7 @@ def from_folder(folder: Path) -> Campaign:
         For the first mistake in any file.
     """
     content = read_folder(folder)
-    return _campaign(content.campaign["campaign"], content.campaign["machine"], content.runs, folder)
+    return _campaign(content.campaign["campaign"], content.campaign, content.runs, folder)
 
 
 def from_store(store: Store, name: str) -> Campaign:
@@ -66,12 +67,15 @@ def from_store(store: Store, name: str) -> Campaign:
     """
     record = store.campaign(name)
     runs = [load_run(store, r.id) for r in store.runs(record.id) if r.visible_status == "complete"]
-    return _campaign(record.name, store.machine(record.machine_id).doc, runs, None)
+    known = record.doc.get("imported") or record.doc
+    doc = known | {"campaign": record.name, "machine": store.machine(record.machine_id).doc}
+    return _campaign(record.name, doc, runs, None)
 
 
-def _campaign(name: str, machine: dict[str, Any], runs: list[dict[str, Any]], folder: Path | None) -> Campaign:
+def _campaign(name: str, doc: dict[str, Any], runs: list[dict[str, Any]], folder: Path | None) -> Campaign:
+    machine = doc["machine"]
     site = Site(str(machine.get("name") or name), machine_from_doc(machine), machine, DeviceUrls())
-    return Campaign(name, site, runs, folder)
+    return Campaign(name, site, runs, folder, doc)
 
 
 def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any]:
@@ -89,16 +93,31 @@ def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any
     CampaignRefused
         Another campaign of this name is in the store.
     """
+    ids = ensure_stored(store, campaign)
+    record = store.campaign(campaign.name)
+    used = [ids[label] for label in doc["inputs"]["runs"]]
+    same = [s.id for s in store.solutions(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
+    told = {"run_ids": used, "same_as": same}
+    return told | {"solution_id": store.add_solution(record.id, "joint", used, doc | told)}
+
+
+def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
+    """Have a campaign in the store: a folder is imported, unless it is there already. Returns the numbers of its runs by their labels.
+
+    Raises
+    ------
+    StoreError
+        It cannot be written.
+    CampaignRefused
+        Another campaign of this name is in the store.
+    """
     if campaign.folder is not None and all(c.name != campaign.name for c in store.campaigns()):
         import_folder(store, campaign.folder)
     record = store.campaign(campaign.name)
     ids = {r.label: r.id for r in store.runs(record.id) if r.visible_status == "complete"}
     if campaign.folder is not None:
         _check_same(store, campaign, store.machine(record.machine_id).doc, ids)
-    used = [ids[label] for label in doc["inputs"]["runs"]]
-    same = [s.id for s in store.solutions(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
-    told = {"run_ids": used, "same_as": same}
-    return told | {"solution_id": store.add_solution(record.id, "joint", used, doc | told)}
+    return ids
 
 
 def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: dict[str, int]) -> None:

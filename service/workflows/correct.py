@@ -25,6 +25,7 @@ from service.workflows.recover import recover
 from service.workflows.solve import Solved, helix_misfit, solve_runs
 from service.workflows.solve_report import solution_doc
 from service.workflows.tables import added
+from service.workflows.taken_out import stored_without
 from service.workflows.verify import Decision, Figures, decide, figure_rows, figures
 
 GRID = (25, 21, 19)
@@ -34,7 +35,10 @@ MIN_GAIN = 0.1
 
 @dataclass(frozen=True)
 class Correction:
-    """What was solved, pushed and found. ``bank`` and ``image`` are what the controller holds active at the end."""
+    """What was solved, pushed and found. ``bank`` and ``image`` are what the controller holds active at the end.
+
+    ``not_for_tables``: effects that the machine's model knows and that no table takes out, each with its remedy.
+    """
 
     solved: Solved
     tables: NineTables
@@ -47,6 +51,7 @@ class Correction:
     decision: Decision
     bank: int
     image: bytes
+    not_for_tables: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +112,9 @@ async def correct(
     old = figures(before)  # before anything is written: runs that are no verification are refused now
     lsb_nm = (await session.controller.table_format()).lsb_nm
     progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
-    proposal = await asyncio.to_thread(propose, site, runs, base, lsb_nm)
-    doc = solution_doc(proposal.solved)
+    known = await asyncio.to_thread(stored_without, store, record.name)
+    proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, lsb_nm)
+    doc = solution_doc(proposal.solved) | known.doc
     solution_id = await store.write(store.add_solution, record.id, "joint", run_ids, doc)
     bench = _Bench(session, store, site, rate_hz, progress)
     pushed, after, decision = await _push_and_verify(bench, proposal, base, solution_id, old)
@@ -116,7 +122,9 @@ async def correct(
     helix = next((r for r in before if r["test"] == "ballbar_helix"), None)
     misfit = helix_misfit(proposal.solved, helix) * 1e3 if helix is not None else None
     image = await session.controller.read_bank(bank)
-    return Correction(proposal.solved, proposal.tables, lsb_nm, proposal.predicted, misfit, old, after, pushed, decision, bank, image)
+    return Correction(
+        proposal.solved, proposal.tables, lsb_nm, proposal.predicted, misfit, old, after, pushed, decision, bank, image, known.lines
+    )
 
 
 def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:

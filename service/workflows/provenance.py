@@ -6,6 +6,8 @@ import hashlib
 import json
 import shutil
 import subprocess
+import sys
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,23 @@ def run_digest(run: dict[str, Any]) -> str:
         out.update(name.encode())
         out.update(b"-" if values is None else np.asarray(values, dtype="<f8").tobytes())
     return out.hexdigest()
+
+
+def whole_run_digest(run: dict[str, Any]) -> str:
+    """SHA-256 of everything that a search can take from a run: `run_digest`, name, role, its machine, and all columns."""
+    out = hashlib.sha256(json.dumps([run[k] for k in ("run_id", "test", "role", "machine", "setup")], sort_keys=True).encode())
+    for name, values in sorted(run["columns"].items()):
+        if values is not None:
+            out.update(name.encode() + np.asarray(values, dtype="<f8").tobytes())
+    return out.hexdigest()
+
+
+def code_digest(function: Callable[..., Any]) -> str:
+    """SHA-256 of the file a function stands in: an edited plug-in is another one. Of its name alone where there is no file."""
+    inner = getattr(function, "func", function)  # functools.partial
+    name = str(getattr(inner, "__module__", type(inner).__module__))
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return hashlib.sha256(name.encode() if file is None else Path(file).read_bytes()).hexdigest()
 
 
 def machine_digest(machine: Machine) -> str:

@@ -258,5 +258,8 @@ def _where(rows: list[int]) -> str:
 
 
 def residual_lines(joint: JointSolution) -> list[str]:
-    """What the tests of the residuals found, most significant first."""
-    return [t.text for t in sorted((t for t in joint.residual_tests if t.flagged), key=lambda t: t.p_adjusted)]
+    """What the tests of the residuals found, one line per run, most significant run first."""
+    found: dict[str, list[str]] = {}
+    for test in sorted((t for t in joint.residual_tests if t.flagged), key=lambda t: t.p_adjusted):
+        found.setdefault(test.run, []).append(test.text.removeprefix(f"{test.run}: "))
+    return [f"{run}: " + "; ".join(texts) for run, texts in found.items()]

@@ -1,4 +1,4 @@
-"""Speed and memory of the fast paths against what a user would take instead: ``make bench``.
+"""Speed, memory and, in the discovery, names against what a user would take instead: ``make bench``.
 
 Every contestant runs in a process of its own, in rounds, so that a busy moment of the computer hits all of them. Times never make it fail:
 the exit code is 1 when results differ, and only then.
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from models.geometry.chain import deviation_mm, exact_deviation_mm
-from tests.bench import report
+from tests.bench import discovery, discovery_case, report
 from tests.bench.case import CASES, make
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS, contestants
 from tests.bench.facts import facts
@@ -24,6 +24,7 @@ from tests.bench.trials_contestants import TRIAL_CASES
 from tests.bench.trials_judge import judged
 from tests.bench.worker import NO_RESULT
 
+PARTS = ("map", "trials", "discovery")
 ROUNDING_MM = 1e-12
 SECOND_ORDER_MM = 1e-5
 """What exact kinematics may add to rule G on this machine: measured 1.6e-6. Leaving out any one of the 18 tables changes 5.6e-4 or more
@@ -35,11 +36,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make bench ARGS=...", description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3, help="how often each contestant's process is run (default 3)")
     parser.add_argument("--json", type=Path, help="write all figures to this file as well")
-    parser.add_argument("--only", choices=("map", "trials"), help="the error map alone, or trials, propagation and joint solution alone")
+    parser.add_argument("--only", choices=PARTS, help="error map; or trials, propagation, joint solution; or naming of effects")
+    parser.add_argument("--cases", type=int, default=discovery_case.CASES, help=f"campaigns to name (default {discovery_case.CASES})")
     given = parser.parse_args()
-    found = {"facts": facts(), "cases": {}, "trials": {}}
+    parts = [given.only] if given.only else PARTS
+    found = {"facts": facts(), "cases": {}, "trials": {}, "discovery": {}}
     with tempfile.TemporaryDirectory() as folder:
-        for name in CASES if given.only != "trials" else ():
+        for name in CASES if "map" in parts else ():
             names = list(contestants(name))
             runs = {k: [] for k in names}
             for n in range(given.rounds):
@@ -48,8 +51,10 @@ def main() -> int:
                     runs[k].append(_run(name, k, Path(folder) / f"{name}-{k}.npy"))
             _progress("")
             found["cases"][name] = {"contestants": {k: _summary(v) for k, v in runs.items()}, "agreement": _agreement(name, Path(folder))}
-        for name, names in TRIAL_CASES.items() if given.only != "map" else ():
+        for name, names in TRIAL_CASES.items() if "trials" in parts else ():
             found["trials"][name] = _trials(name, list(names), given.rounds, Path(folder))
+        if "discovery" in parts:
+            found["discovery"] = discovery.compared(Path(folder), max(1, given.cases), _progress)
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(report.text(found))  # noqa: T201

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tests.bench.contestants import cpu_count
 
-LIBRARIES = ("numpy", "scipy", "numba", "sympy", "pytransform3d", "lmfit", "GTC", "uncertainties")
+LIBRARIES = ("numpy", "scipy", "numba", "sympy", "pytransform3d", "lmfit", "GTC", "uncertainties", "scikit-learn", "statsmodels")
 
 
 def facts() -> dict:

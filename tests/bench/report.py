@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.bench import trials_report
+from tests.bench import discovery_report, trials_report
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS
 from tests.bench.facts import LIBRARIES
 
@@ -45,6 +45,8 @@ def text(found: dict) -> str:
         lines += MAP_NOTES
     if found["trials"]:
         lines += trials_report.lines(found["trials"])
+    if found["discovery"]:
+        lines += discovery_report.lines(found["discovery"])
     return "\n".join([*lines, "", "Times never fail this run, differing results do."])
 
 

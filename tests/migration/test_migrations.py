@@ -59,14 +59,28 @@ def test_database_of_a_newer_version_is_refused(engine: Engine) -> None:
         upgrade(engine)
 
 
-def test_old_sqlite_file_is_copied_before_an_upgrade(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_sqlite_file_is_copied_before_an_upgrade_and_keeps_what_it_holds(tmp_path: Path) -> None:
     path = tmp_path / "abbe.sqlite3"
-    Store.open(f"sqlite:///{path}").close()
     engine = make_engine(f"sqlite:///{path}")
-    monkeypatch.setattr("alembic.script.ScriptDirectory.get_current_head", lambda _self: "0002")
-    upgrade(engine)
+    upgrade(engine, "0001")
+    with engine.begin() as connection:
+        connection.exec_driver_sql("INSERT INTO machines VALUES (1, 'VMC-1', '{}', 'h', 'then')")
+    assert "machine_models" not in inspect(engine).get_table_names()
     engine.dispose()
-    copy = tmp_path / "abbe.sqlite3.before-0001"
-    assert copy.exists()
-    with Store.open(f"sqlite:///{copy}") as store:
-        assert store.runs() == []
+    with Store.open(f"sqlite:///{path}") as store:
+        assert [one.name for one in store.machines()] == ["VMC-1"]
+        assert (store.discoveries(), store.models()) == ([], [])
+    old = make_engine(f"sqlite:///{path}.before-0001")
+    assert current_revision(old) == "0001"
+    assert "machines" in inspect(old).get_table_names()
+    old.dispose()
+
+
+def test_discoveries_are_taken_back_and_the_rest_stays(engine: Engine) -> None:
+    upgrade(engine)
+    downgrade(engine, "0001")
+    tables = set(inspect(engine).get_table_names())
+    assert not tables & {"discoveries", "discovery_steps", "machine_models"}
+    assert {"machines", "campaigns", "runs", "solutions"} <= tables
+    upgrade(engine)
+    assert current_revision(engine) == head_revision()

@@ -15,17 +15,17 @@ from tests.scenarios.world import interrupt, simulators_of, wait_for
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
 
 
-def bar_run_under_way(folder: Path, chunks: int = 1) -> str | None:
-    """Label of the running ball-bar run of the identification, once it has stored so many chunks. Reads beside the writer."""
+def bar_run_under_way(folder: Path, chunks: int = 1, name: str = "identify") -> str | None:
+    """Label of the running ball-bar run of a campaign, once it has stored so many chunks. Reads beside the writer."""
     path = folder / "abbe.sqlite3"
     if not path.exists():
         return None
     query = """SELECT runs.label FROM runs JOIN campaigns ON campaigns.id = runs.campaign_id JOIN chunks ON chunks.run_id = runs.id
-               WHERE campaigns.name = 'identify' AND runs.status = 'running' AND chunks.channel = 'bar'
+               WHERE campaigns.name = ? AND runs.status = 'running' AND chunks.channel = 'bar'
                GROUP BY runs.label HAVING COUNT(*) >= ?"""
     try:
         with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
-            row = connection.execute(query, (chunks,)).fetchone()
+            row = connection.execute(query, (name, chunks)).fetchone()
     except sqlite3.OperationalError:  # tables not yet made, or locked for an instant
         return None
     return row[0] if row else None

@@ -102,6 +102,56 @@ def test_json_keeps_to_its_schema_and_holds_the_truth(abbe, folder):
     assert np.sqrt(np.diag(field_at @ covariance @ field_at.T)) * 1e3 == pytest.approx(worst["u_um"], rel=0.01)
 
 
+def test_grid_tables_and_trials_on_request(abbe, folder, tmp_path):
+    code, out, err = abbe("solve", folder, "--grid", "grid.csv", "--nodes", 4, "--tables", "--monte-carlo")
+    assert code == 0, err
+    text = " ".join(out.split())
+    trials_agree(text)
+    rows = np.loadtxt(tmp_path / "grid.csv", delimiter=",", skiprows=1)
+    assert (tmp_path / "grid.csv").read_text().splitlines()[0].startswith("x_mm,y_mm,z_mm,dx_um")
+    assert rows.shape == (64, 10)
+    used = rows[:, 9] == 1
+    assert used.any()
+    assert (rows[~used, 3:6] == rows[~used, 3:6][:1]).all()  # no distance between two nodes that are left alone changes
+    assert np.allclose(rows[:, 3:6] / 0.1, np.round(rows[:, 3:6] / 0.1), atol=1e-6)  # the machine's unit
+    kinds = text.split("left of errors of distances")[1].split("Monte Carlo")[0]
+    assert len(re.findall(r"\d ± \d", kinds)) >= 9
+
+
+def trials_agree(text):
+    """The stated interval against the trials': limits count as rectangular, so theirs is a little narrower than a normal one's."""
+    told = re.search(r"Monte Carlo \(GUM Supplement 1, (\d+) trials\).*?in µm: (.*?): the stated uncertainty is", text)
+    assert told is not None
+    assert int(told[1]) >= 10_000
+    pairs = re.findall(r"stated ± ([\d.]+), found ± ([\d.]+)", told[2])
+    assert len(pairs) == 3
+    for half, found in pairs:
+        assert float(found) == pytest.approx(float(half), rel=0.15)
+
+
+def test_six_parameters_are_tried_too_but_give_no_grid_where_they_do_not_fit(abbe, folder, tmp_path):
+    code, out, err = abbe("solve", folder, "--model", "rigid6", "--monte-carlo")
+    assert code == 0, err
+    trials_agree(" ".join(out.split()))
+    code, out, err = abbe("solve", folder, "--model", "rigid6", "--grid", "grid.csv")
+    assert (code, out) == (2, "")
+    assert "error CMP-001: no grid from a solution with open flags" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_residuals_are_one_line_per_run(abbe, folder, tmp_path):
+    site, runs = measured(SEED, "one_tool")
+    wave = next(r for r in runs if r["test"] == "ballbar_helix")
+    columns = wave["columns"]
+    columns["deviation_mm"] = [v + 2e-3 * np.sin(x / 9.0) for v, x in zip(columns["deviation_mm"], columns["x_mm"], strict=True)]
+    code, out, _ = abbe("solve", write_folder(tmp_path / "wave", site.doc, runs))
+    assert code == 0
+    lines = out.split("residuals that are not noise:")[1].split("these runs cannot tell")[0].splitlines()
+    named = [line.split(":")[0] for line in lines if line.startswith("- ")]
+    assert f"- {wave['run_id']}" in named
+    assert len(named) == len(set(named))
+
+
 def test_a_stored_campaign_is_solved_twice_and_recognised(abbe, folder, tmp_path):
     with Store.open("sqlite:///a.sqlite3") as store:
         import_folder(store, folder)

@@ -150,6 +150,11 @@ BAD_CAMPAIGNS = [
     (set_at("runs", 1, "run_id", value="r01"), "run_id 'r01' stands there twice"),
     (set_at("runs", 1, "file", value="campaign.json"), "a file is named 'campaign.json'"),
     (set_at("current_model", "errors", value="none.json"), "none.json: no such file"),
+    (
+        set_at("current_model", "includes", value=["rigid_21"]),
+        r"current_model.includes\[1\]: expected 'rigid6', 'rigid21', .*got 'rigid_21'",
+    ),
+    (set_at("current_model", "includes", value="rigid21"), "current_model.includes: expected a.* got 'rigid21'"),
     (set_at("setups", "A", value={"kind": "ballbar"}), "key 'setups.A.t_set_s' is missing"),
     (set_at("instruments", "ballbar", "resolution_mm", value=math.nan), "finite number"),
 ]

@@ -1,0 +1,184 @@
+"""`abbe discover`: what the simulation of a machine lacks, named, sized and proved; nothing is written to the machine."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import DbOption, MachineOption, database_url, open_store
+from service.cli.solve import stored_campaign
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from service.sequences.steps import CampaignPlan
+    from service.site import Site
+    from service.storage.store import Store
+    from service.workflows.campaign_folder import Campaign
+    from service.workflows.discover import Job, Journal
+
+
+def discover(
+    campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
+    json_file: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Also write the answer (abbe-discovery/1); - is stdout.", show_default=False),
+    ] = None,
+    report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine of --machine, and go on.")] = False,
+) -> None:
+    """Find where measurement and simulation disagree, and name the missing effect: size, what to do, what else it could be, what next.
+
+    Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
+    only if --db or --machine names a database. Stopped with Ctrl-C, the same command goes on where it was.
+    """
+    if live:
+        _live_needs(campaign, machine)
+    with opened(campaign, db, machine, without or []) as (found, store):
+        job, journal = _started(found, store)
+        finding = _searched(job, journal)
+        if live and store is not None and machine is not None:
+            job, journal, finding = _gone_on(store, machine, (job, journal, finding))
+        _written(job, journal, finding, json_file, report)
+    if json_file is not None and str(json_file) == "-":
+        return
+    _print(job, journal, finding)
+    for name, target in (("answer", json_file), ("report", report)):
+        if target is not None:
+            typer.echo(f"{name}: {target}")
+
+
+@contextmanager
+def opened(campaign: str, db: str | None, machine: Path | None, without: list[str]) -> Iterator[tuple[Campaign, Store | None]]:
+    """A campaign and the store it belongs to; a folder's is None where no database is named."""
+    from service.workflows.campaign_folder import from_folder, is_folder
+
+    if is_folder(campaign):
+        found = from_folder(Path(campaign)).without(without)
+        with ExitStack() as stack:
+            named = db is not None or machine is not None
+            yield found, stack.enter_context(open_store(database_url(db, machine), must_exist=False)) if named else None
+    else:
+        with stored_campaign(campaign, database_url(db, machine)) as (store, found):
+            yield found.without(without), store
+
+
+def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
+    """The job and where it stands."""
+    from service.workflows.discover import Journal, prepare
+    from service.workflows.discovery_engine import catalogue
+    from service.workflows.discovery_store import journal_of
+    from service.workflows.model_book import current
+
+    base = None if store is None else current(store, campaign.site.name)
+    job = prepare(campaign, catalogue(), base)
+    return job, Journal() if store is None else journal_of(store, job)
+
+
+def _live_needs(campaign: str, machine: Path | None) -> None:
+    """Before anything is read: --live needs a machine and a campaign that was measured on it."""
+    from service.errors import ConfigError
+    from service.workflows.campaign_folder import is_folder
+
+    if machine is None:
+        raise ConfigError("--live needs the machine", "give --machine FILE")
+    if is_folder(campaign):
+        raise ConfigError("--live goes on with a campaign of the store, not with a folder", "measure it with `abbe measure`")
+
+
+def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]]) -> tuple[Job, Journal, dict[str, Any]]:
+    """Measure what was proposed and search again, until nothing is proposed or a person has to look."""
+    from service.clock import SystemClock
+    from service.config import load_machine
+    from service.site import site_of
+    from service.workflows.discover import prepare
+    from service.workflows.discover_live import ROUNDS
+    from service.workflows.discovery_store import journal_of
+    from service.workflows.next_recipes import next_plan
+
+    site = site_of(load_machine(machine).machine)
+    job, journal, finding = at
+    for number in range(1, ROUNDS + 1):
+        if finding["next_test"] is None:
+            break
+        _print(job, journal, finding)
+        name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
+        wanted = next_plan(finding["next_test"]["adds"], site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min)
+        if wanted.plan is None:
+            typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe can run on this machine")
+            break
+        campaign = _measured(store, site, job.campaign, wanted.plan)
+        job = prepare(campaign, job.effects, job.base)
+        journal = journal_of(store, job)
+        finding = _searched(job, journal)
+    return job, journal, finding
+
+
+def _measured(store: Store, site: Site, campaign: Campaign, plan: CampaignPlan) -> Campaign:
+    """The plan, run on the machine; its runs beside those of the campaign."""
+    from service.cli.measure import ready_session
+    from service.cli.progress import display
+    from service.cli.running import run_job
+    from service.workflows.discover_live import measured_next
+
+    async def work() -> Campaign:
+        with display() as sink:
+            async with ready_session(store, site) as session:
+                return await measured_next(session, store, site, campaign, plan, sink)
+
+    return run_job(work())
+
+
+def _searched(job: Job, journal: Journal) -> dict[str, Any]:
+    """The finding, with progress on stderr; Ctrl-C says what is kept."""
+    from service.cli.progress import display
+    from service.workflows.discover import discover as work
+    from service.workflows.discovery_engine import search
+
+    with display() as sink:
+        try:
+            return work(job, journal, search, sink)
+        except KeyboardInterrupt:
+            state = journal.states[-1][0] if journal.states else "nothing"
+            kept = (
+                f"discovery {journal.id} stands at {state}; the same command goes on there"
+                if journal.id
+                else "nothing is kept of a folder without --db"
+            )
+            typer.echo(f"stopped: {kept}", err=True)
+            raise
+
+
+def _written(job: Job, journal: Journal, finding: dict[str, Any], json_file: Path | None, report: Path | None) -> None:
+    """Files that were asked for, each whole or not at all."""
+    from service.clock import SystemClock
+    from service.report.discovery_page import render_discovery
+    from service.report.page_file import write_page
+    from service.workflows.discovery_pages import discovery_page, page_facts
+
+    if json_file is not None:
+        text = json.dumps(finding["answer"], ensure_ascii=False) + "\n"
+        typer.echo(text, nl=False) if str(json_file) == "-" else write_page(text, json_file)
+    if report is not None:
+        made = SystemClock().utc().isoformat(timespec="seconds")
+        write_page(render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, made))), report)
+
+
+def _print(job: Job, journal: Journal, finding: dict[str, Any]) -> None:
+    from service.workflows.discovery_words import lines_of
+
+    typer.echo(f"campaign {job.campaign.name}: {len(finding['runs'])} runs, {len(job.effects)} effects in the catalogue")
+    for line in job.flags:
+        typer.echo(f"look at this: {line}")
+    for line in lines_of(finding):
+        typer.echo(line)
+    if journal.id is not None:
+        brought = f", model version {journal.version} of {job.campaign.site.name}" if journal.version else ""
+        typer.echo(f"stored: discovery {journal.id}, {journal.states[-1][0]}{brought}")

@@ -1,0 +1,86 @@
+"""`abbe simulate`: what the present model says every run should read, beside what was measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import DbOption, JsonOption, MachineOption, print_json, print_table
+from service.cli.discover import opened
+
+if TYPE_CHECKING:
+    from service.workflows.discover import Job
+    from service.workflows.simulate import Simulation
+
+
+def simulate(
+    campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
+    as_json: JsonOption = False,
+    report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+) -> None:
+    """Predict every run with the present model, fitted to the identify runs, and show measured against simulated. Nothing is stored.
+
+    The present model is what the campaign says, with the effects of the machine's model book.
+    """
+    from service.cli.progress import display
+    from service.events import Progress
+    from service.workflows.discover import prepare
+    from service.workflows.discovery_engine import catalogue
+    from service.workflows.model_book import current
+    from service.workflows.simulate import simulate as work
+    from service.workflows.simulate import simulation_doc
+
+    with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
+        sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
+        job = prepare(found, catalogue(), None if store is None else current(store, found.site.name))
+        sink(Progress("simulate", 1.0, 2.0, None, "present model fitted to the identify runs"))
+        told = work(job)
+        sink(Progress("simulate", 2.0, 2.0, 0.0, "done"))
+    doc = simulation_doc(job, told)
+    if report is not None:
+        _write_report(job, told, report)
+    if as_json:
+        print_json(doc)
+        return
+    _print(doc)
+    if report is not None:
+        typer.echo(f"report: {report}")
+
+
+def _write_report(job: Job, told: Simulation, target: Path) -> None:
+    from service.clock import SystemClock
+    from service.report.discovery_page import render_discovery
+    from service.report.page_file import write_page
+    from service.workflows.discover import Journal
+    from service.workflows.discovery_pages import discovery_page, page_facts
+    from service.workflows.simulate import simulated_finding, verdict_line
+
+    facts, said = page_facts(job, Journal(), SystemClock().utc().isoformat(timespec="seconds"))
+    finding = simulated_finding(job, told)
+    said |= {"title": f"Campaign {job.campaign.name} - measured against simulated", "verdict": verdict_line(finding)}
+    write_page(render_discovery(discovery_page(finding, job.runs, facts, said)), target)
+
+
+def _print(doc: dict[str, Any]) -> None:
+    from service.report.numbers import plain
+    from service.workflows.simulate import verdict_line
+
+    version = (
+        "" if doc["model_version"] is None else f", model version {doc['model_version']} ({', '.join(doc['known_effects']) or 'no effect'})"
+    )
+    typer.echo(f"campaign {doc['campaign']}: present model {', '.join(doc['present_model'])}{version}")
+    for line in doc["flags"]:
+        typer.echo(f"look at this: {line}")
+    rows = []
+    for label, r in doc["runs"].items():
+        gap = r.get("rms_before_um")
+        times = "sealed" if gap is None else f"{gap / r['floor_um']:.2f}"
+        rows.append((label, r["test"], r["role"], str(r["readings"]), plain(gap), plain(r["floor_um"]), times))
+    headings = ("run", "test", "role", "readings", "measured - simulated, rms (µm)", "noise (µm)", "times the noise")
+    print_table(headings, rows)
+    typer.echo(" ".join(verdict_line(doc)[1:]))

@@ -1,0 +1,82 @@
+"""The answer of a discovery (``abbe-discovery/1``, run-format.md 5) as pydantic models: what `abbe discover --json` writes."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from service.runs.machine_object import FileObject
+
+Adds = Literal[
+    "second_feed",
+    "opposite_direction",
+    "second_radius",
+    "planar_circles",
+    "laser_diagonals",
+    "ballbar",
+    "single_axis_laser",
+    "angular_interferometer",
+    "second_tool_length",
+    "longer_session",
+    "reference_length",
+]
+
+
+class FoundEffect(FileObject):
+    """One named effect. ``parameters``: ``strength`` and ``u_strength`` in the unit of its name, and further ones with theirs."""
+
+    name: str
+    key: str
+    parameters: dict[str, float]
+    evidence: float
+    alternatives: list[str]
+
+
+class FoundBeside(FileObject):
+    """A structure without a name beside named effects, ``unnamed_step:Z``."""
+
+    label: str
+    evidence: float
+
+
+class FoundWhere(FileObject):
+    """Where what is missing lives; what was not located is left out."""
+
+    tests: list[str] = Field(default_factory=list)
+    axes: list[str] = Field(default_factory=list)
+    directions: list[int] = Field(default_factory=list)
+    time_s: tuple[float, float] | None = None
+    position_mm: tuple[float, float, float] | None = None
+    radius_mm: float | None = None
+    period_s: float | None = None
+    period_mm: float | None = None
+    angular_lobes: int | None = None
+    depends_on: list[str] = Field(default_factory=list)
+
+
+class FoundTest(FileObject):
+    """What to measure next."""
+
+    adds: list[Adds]
+    plan: dict[str, object] | None = None
+    minutes: float | None = None
+    expected_separation_sigma: float | None = None
+
+
+class DiscoveryFile(FileObject):
+    """What a campaign's simulation lacks, and the prediction of every sealed run, mm."""
+
+    format: Literal["abbe-discovery/1"]
+    case: str
+    verdict: Literal["named", "none", "unknown"]
+    effects: list[FoundEffect]
+    confounded_with: list[str] = Field(default_factory=list)
+    beside: list[FoundBeside] = Field(default_factory=list)
+    where: FoundWhere
+    next_test: FoundTest | None = None
+    rms_before_um: float | None = Field(None, ge=0)
+    rms_after_um: float | None = Field(None, ge=0)
+    holdout_rms_um: float | None = Field(None, ge=0)
+    noise_floor_um: float | None = Field(None, ge=0)
+    predictions: dict[str, list[float]]

@@ -1,0 +1,149 @@
+"""A positioning test of one axis alone: its repeats tell a slow drift, and which of several things drifts they cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Significance, Where
+from models.discovery.case import Case, CaseRun
+from models.discovery.repeats import RepeatDrift, repeat_drift
+from models.effects.effect import Effect, Values
+from models.effects.path import Path
+
+AXES = "XYZ"
+NEAR_MM = 0.05
+"""Positions closer than this are the same one, approached again."""
+
+
+def _no_columns(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
+    """It is judged by repeats alone and brings nothing into other campaigns."""
+    return [np.zeros((p.n, 0)) for p in paths]
+
+
+def _no_strength(coefficients: F1, values: Values) -> float:
+    return 0.0
+
+
+SLOW_DRIFT = Effect(
+    name="slow_drift",
+    title="slow drift, alike at all positions, of axis",
+    family="thermal",
+    keys=tuple(AXES),
+    unit="um",
+    per_unit=1.0,
+    typical=(1.0, 100.0),
+    shape=(),
+    signal=_no_columns,
+    strength=_no_strength,
+    needs="a positioning test of one axis with each position visited three times or more from the same side",
+    signature="every position reads a little less (or more) at each visit, all alike, whatever the direction",
+    remedy="warm up or sensor",
+    remedy_text="warm up axis and sensor until repeats stay, mount the sensor short and stiff, then test again; no table can hold it",
+    source="ISO 230-2 (repeatability); ISO 230-3 (thermal drift)",
+    separated_by={"dead_path": ("reference_length",), "axis_thermal_growth": ("longer_session",)},
+)
+
+
+def is_axis_test(case: Case) -> bool:
+    """Whether a campaign is a positioning test of one axis in one set-up, and nothing else."""
+    paths = [r.path for r in case.runs]
+    beams = {tuple(np.round(np.abs(p.look[0]), 9)) for p in paths}
+    return {p.test for p in paths} == {"laser_linear"} and len({p.setup for p in paths}) == 1 and len(beams) == 1
+
+
+def drift_found(case: Case) -> Discovery | None:
+    """What the repeats of an axis test say; None if no position was visited often enough.
+
+    Fitted to the identify runs; the holdout runs are predicted from their positions' means and the drift gone on.
+    """
+    fitted = sorted(case.of("identify"), key=lambda r: float(r.path.at.t_s[0]))
+    place, t, reading = (np.concatenate(v) for v in zip(*(_valid(r) for r in fitted), strict=True))
+    drift = repeat_drift(place, t, reading)
+    if drift is None:
+        return None
+    span = _drift_at(drift, t)
+    judged = [r for r in case.runs if r.deviation_mm is not None]
+    before = {r.path.label: _left(r, place, reading, None) for r in judged}
+    after = {r.path.label: _left(r, place, reading - drift.drift_mm, span) for r in judged} if drift.named else before
+    axis = AXES[int(np.argmax(np.abs(case.runs[0].path.look[0])))]
+    where = Where(tests=("laser_linear",), axes=(axis,), depends_on=("time",))
+    table = (Significance("time", f"drift alike at all positions explains {drift.share:.0%} of the repeat variance", drift.share, drift.p),)
+    predicted = {
+        r.path.label: _predicted(r, place, reading - drift.drift_mm * drift.named, span if drift.named else None) for r in case.runs
+    }
+    return Discovery(
+        verdict="named" if drift.named else "none",
+        effects=(_named(drift, axis, where),) if drift.named else (),
+        where=Where(tests=("laser_linear",), axes=(axis,) if drift.named else (), table=table),
+        next_test=_next(axis) if drift.named else None,
+        gaps={role: _gap(role, judged, before, after, drift) for role in sorted({r.role for r in judged})},
+        residual_before_mm=before,
+        residual_after_mm=after,
+        predicted_mm=predicted,
+        predicted_before_mm={r.path.label: _predicted(r, place, reading, None) for r in case.runs},
+        noise_mm={"laser": drift.after_mm if drift.named else drift.before_mm},
+        p_value=drift.p,
+        theta_names=(),
+        theta=np.zeros(0),
+        theta_covariance=np.zeros((0, 0)),
+        confounded_with=(f"spindle_thermal_drift:{axis}", "dead_path", f"axis_thermal_growth:{axis}") if drift.named else (),
+    )
+
+
+def _named(drift: RepeatDrift, axis: str, where: Where) -> NamedEffect:
+    tau = {} if drift.tau_s is None else {"tau_s": (drift.tau_s, drift.tau_s)}  # from a coarse list: known to a factor
+    evidence = -0.5 * np.log(max(1.0 - drift.share, 1e-12)) * drift.drift_mm.size
+    rivals = tuple((label, 0.0) for label in (f"spindle_thermal_drift:{axis}", "dead_path", f"axis_thermal_growth:{axis}"))
+    size, u = drift.change_mm * 1e3, drift.u_change_mm * 1e3
+    return NamedEffect("slow_drift", axis, size, u, tau, np.zeros(0), np.zeros((0, 0)), float(evidence), rivals, where)
+
+
+def _next(axis: str) -> NextTest:
+    why = "a fixed reference read by the same sensor tells whether sensor or axis drifts; a late repeat, whether it has come to an end"
+    return NextTest(("reference_length", "longer_session"), (f"spindle_thermal_drift:{axis}", "dead_path"), None, 30.0, why)
+
+
+def _valid(run: CaseRun) -> tuple[F1, F1, F1]:
+    """Place, time and reading of the readings that count."""
+    assert run.deviation_mm is not None
+    return _places(run)[run.valid], run.path.at.t_s[run.valid], run.deviation_mm[run.valid]
+
+
+def _places(run: CaseRun) -> F1:
+    """A number for position and side of every reading."""
+    position = np.round(run.path.at.q_mm @ run.path.look[0] / NEAR_MM) * NEAR_MM
+    return np.asarray(position + 1e6 * run.path.direction)
+
+
+def _drift_at(drift: RepeatDrift, t_s: F1) -> tuple[F1, F1]:
+    """Times and drift of the fitted readings, in the order of time."""
+    order = np.argsort(t_s, kind="stable")
+    return t_s[order], drift.drift_mm[order]
+
+
+def _predicted(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1:
+    """Mean of the same place in the fitted runs, with the drift where there is one; beyond them it goes on as it went last."""
+    means = {p: float(level[place == p].mean()) for p in np.unique(place)}
+    fallback = float(level.mean())
+    out = np.array([means.get(p, fallback) for p in _places(run)])
+    return out if drift is None else out + _gone_on(drift, run.path.at.t_s)
+
+
+def _gone_on(drift: tuple[F1, F1], t_s: F1) -> F1:
+    t, d = drift
+    slope = (d[-1] - d[-2]) / (t[-1] - t[-2]) if t[-1] > t[-2] else 0.0
+    return np.asarray(np.interp(t_s, t, d) + slope * np.maximum(t_s - t[-1], 0.0))
+
+
+def _left(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1:
+    assert run.deviation_mm is not None
+    return np.asarray(np.where(run.valid, run.deviation_mm - _predicted(run, place, level, drift), np.nan))
+
+
+def _gap(role: str, judged: Sequence[CaseRun], before: dict[str, F1], after: dict[str, F1], drift: RepeatDrift) -> Gap:
+    labels = [r.path.label for r in judged if r.role == role]
+    rms = [float(np.sqrt(np.nanmean(np.concatenate([v[label] for label in labels]) ** 2))) for v in (before, after)]
+    return Gap(rms[0], rms[1], min(rms[1], drift.after_mm))

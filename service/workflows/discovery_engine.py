@@ -1,0 +1,67 @@
+"""What a discovery computes with: the catalogue with its plug-ins, and the search. The one place that knows both by name."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from functools import cache
+
+from models.discovery.answer import Discovery
+from models.discovery.case import Case
+from models.effects.catalogue import CATALOGUE
+from models.effects.effect import Effect
+from service.clock import SystemClock
+from service.errors import EffectUnknown
+from service.events import Progress, ProgressSink
+from service.workflows.axis_test import SLOW_DRIFT, drift_found, is_axis_test
+from service.workflows.effect_plugins import Plugins, installed
+
+
+def catalogue() -> tuple[Effect, ...]:
+    """All effects that are known by name: ours, then those of other packages that passed the self-test."""
+    return CATALOGUE + plugins().effects
+
+
+@cache
+def plugins() -> Plugins:
+    """Effects of other packages, looked up once per process, and why some were left out."""
+    return installed(e.name for e in CATALOGUE)
+
+
+def effect_named(name: str) -> Effect:
+    """One effect of the catalogue.
+
+    Raises
+    ------
+    EffectUnknown
+        There is none; what is spelt alike is told.
+    """
+    found = {e.name: e for e in (*catalogue(), SLOW_DRIFT)}
+    if name not in found:
+        close = get_close_matches(name, found, n=3, cutoff=0.4)
+        raise EffectUnknown(
+            f"the catalogue has no effect {name!r}", f"did you mean {', '.join(close)}?" if close else "`abbe effects` lists all"
+        )
+    return found[name]
+
+
+def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:
+    """Find what a case's present model lacks (`models.discovery.discover`), and tell how far it is and how long it will take.
+
+    A positioning test of one axis alone cannot carry the model of a machine: its repeats are asked instead (`models.discovery.repeats`).
+    """
+    from models.discovery.discover import discover
+
+    if is_axis_test(case):
+        told = drift_found(case)
+        if told is not None:
+            return told
+    clock = SystemClock()
+    begun = clock.monotonic_s()
+
+    def tell(text: str, share: float) -> None:
+        spent = clock.monotonic_s() - begun
+        sink(Progress("discover", share, 1.0, spent * (1.0 - share) / share if share > 0.0 else None, text))
+
+    found = discover(case, effects, progress=tell)
+    sink(Progress("discover", 1.0, 1.0, 0.0, "done"))
+    return found

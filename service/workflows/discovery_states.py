@@ -1,0 +1,132 @@
+"""States of a discovery and how one follows from the other: FITTED, SUSPICIOUS, PROPOSED, TESTING, EXPLAINED or UNEXPLAINED.
+
+Pure: from a finding (`service.workflows.discovery_doc`) to the documents of its states. Every document says who decided and by which rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Literal
+
+State = Literal["FITTED", "SUSPICIOUS", "PROPOSED", "TESTING", "EXPLAINED", "UNEXPLAINED"]
+FOLLOWS: dict[str | None, frozenset[str]] = {
+    None: frozenset({"FITTED"}),
+    "FITTED": frozenset({"SUSPICIOUS", "EXPLAINED"}),
+    "SUSPICIOUS": frozenset({"PROPOSED", "UNEXPLAINED"}),
+    "PROPOSED": frozenset({"TESTING"}),
+    "TESTING": frozenset({"EXPLAINED", "UNEXPLAINED"}),
+    "EXPLAINED": frozenset(),
+    "UNEXPLAINED": frozenset(),
+}
+ENDS = frozenset({"EXPLAINED", "UNEXPLAINED"})
+VISIBLE = 1.05
+"""Runs that judge must miss the floor by this factor before, else the effect does not show in them and they cannot judge."""
+CLOSED = 0.5
+"""Share of the gap (`closed`) that must close on runs that judge. A wrong name closes it where it was fitted, not elsewhere."""
+WORSE = 1.05
+"""No runs may have a larger gap after than before by this factor: a solution that has run away is no finding."""
+NEAR = 3.0
+"""Evidence (natural logarithm) by which a name must be ahead of every rival to enter the model book: twenty times as likely."""
+OFF = 1.1
+"""Runs that were never fitted and miss the noise by this factor disagree with a model that explains the fitted ones."""
+PROGRAM = "abbe discover"
+
+
+def after_fit(finding: dict[str, Any]) -> Iterator[tuple[State, dict[str, Any]]]:
+    """The states that follow FITTED, each with its document, to the end."""
+    if finding["verdict"] == "none":
+        yield "EXPLAINED", _decided(nothing_missing(finding), p_value=finding["p_value"], gaps=finding["gaps"])
+        return
+    yield (
+        "SUSPICIOUS",
+        _decided(
+            "readings disagree with the present model by more than noise", p_value=finding["p_value"], gaps=finding["gaps"],
+            where=finding["where"],
+        ),
+    )  # fmt: skip
+    if not finding["effects"]:
+        yield "UNEXPLAINED", _decided("nothing in the catalogue explains the gap", where=finding["where"], rejected=finding["rejected"])
+        return
+    proposed = {k: finding[k] for k in ("rejected", "confounded_with", "next_test")}
+    names = [{k: e[k] for k in ("label", "strength", "u_strength", "unit", "evidence", "alternatives")} for e in finding["effects"]]
+    yield "PROPOSED", _decided("best evidence after its price, rivals refitted", effects=names, **proposed)
+    judged = judge(finding)
+    yield "TESTING", _decided(judged["rule"], **{k: v for k, v in judged.items() if k != "rule"})
+    yield ending(finding, judged)
+
+
+def nothing_missing(finding: dict[str, Any]) -> str:
+    """What is explained where nothing is missing in the fitted runs: the runs that were never fitted too, or not."""
+    times = off_by(finding)
+    if times is None:
+        return "the present model explains all runs to their noise"
+    return f"the present model explains the fitted runs to their noise; runs that were never fitted are off by {times:.2g} times the noise"
+
+
+def off_by(finding: dict[str, Any]) -> float | None:
+    """Rms of the runs that were never fitted over their noise, under the present model; None where they agree or there are none."""
+    gap = finding["gaps"].get("holdout")
+    if gap is None or gap["before_um"] <= OFF * gap["floor_um"] or gap["floor_um"] <= 0.0:
+        return None
+    return float(gap["before_um"] / gap["floor_um"])
+
+
+def ending(finding: dict[str, Any], judged: dict[str, Any]) -> tuple[State, dict[str, Any]]:
+    """Whether names that were judged so explain the gap."""
+    if judged["proved"] is False:
+        return "UNEXPLAINED", _decided("runs that judge do not agree better with the effect than without it", judged=judged)
+    if finding["verdict"] == "unknown":
+        return "UNEXPLAINED", _decided("the named effects leave a gap that the catalogue does not explain", where=finding["where"])
+    closes = "the gap closes" + (" on runs that were never fitted" if judged["proved"] else ", judged by evidence alone")
+    kept_out = not_entered(finding, judged)
+    return "EXPLAINED", _decided(closes if kept_out is None else f"{closes}; not added to the model book: {kept_out}", not_added=kept_out)
+
+
+def not_entered(finding: dict[str, Any], judged: dict[str, Any]) -> str | None:
+    """Why nothing of a finding enters the model book. None: it was proved, and no rival is nearly as likely; then `entering` does."""
+    if judged["proved"] is not True:
+        return f"it is not proved, {judged['rule']}"
+    unnamed = finding.get("answer", {}).get("beside", [])
+    if unnamed:
+        return f"what closes the gap is in part a structure without a name ({unnamed[0]['label'].replace('_', ' ')})"
+    for e in entering(finding):
+        if e.get("needed") is not None and e["needed"] <= 1.0:
+            return f"the runs that judge do not need {e['label']}"
+        near = next((a for a in e["alternatives"] if a["less_evidence"] < NEAR), None)
+        if near is not None:
+            return f"these runs hardly tell {e['label']} from {near['label']}"
+    return None
+
+
+def entering(finding: dict[str, Any]) -> list[dict[str, Any]]:
+    """Effects that a proof is about: those that move readings. What makes them noisier closes no gap, here or in the next campaign."""
+    return [e for e in finding["effects"] if e["kind"] == "mean"]
+
+
+def judge(finding: dict[str, Any]) -> dict[str, Any]:
+    """What the runs say that only judge: how much of the gap closes on them, and whether that proves the finding (None: they cannot)."""
+    worse = [role for role, g in finding["gaps"].items() if g["after_um"] > WORSE * max(g["before_um"], g["floor_um"])]
+    if worse:
+        return {"rule": f"the {worse[0]} runs agree worse with the effect than without it", "proved": False, "closed": None}
+    gap = finding["gaps"].get("holdout")
+    if gap is None:
+        return {"rule": "no run of this campaign only judges", "proved": None, "closed": None}
+    share = closed(gap)
+    if gap["before_um"] <= VISIBLE * gap["floor_um"] or share is None:
+        return {"rule": "the gap does not show in the runs that judge", "proved": None, "closed": share, "gap": gap}
+    if not entering(finding):
+        return {"rule": "what makes readings noisier closes no gap: judged by evidence alone", "proved": None, "closed": share, "gap": gap}
+    rule = f"at least {CLOSED:.0%} of the gap closes on the runs that judge"
+    return {"rule": rule, "proved": share >= CLOSED, "closed": share, "gap": gap}
+
+
+def closed(gap: dict[str, float]) -> float | None:
+    """Share of the gap above the noise that is gone, of rms: 1 to the noise, 0 nothing, below 0 worse; None where there was no gap."""
+    before, after, floor = gap["before_um"], gap["after_um"], gap["floor_um"]
+    if before <= floor:
+        return None
+    return float(1.0 - max(after - floor, 0.0) / (before - floor)) if after > floor else 1.0
+
+
+def _decided(why: str, **numbers: Any) -> dict[str, Any]:
+    return {"decided_by": PROGRAM, "why": why} | numbers

@@ -1,0 +1,87 @@
+"""A user's own effects: other packages offer them under the entry-point group ``abbe.effects`` (docs/how-to/own-effect.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import numpy as np
+
+from models.effects.effect import Effect
+from models.effects.probe_paths import probe_paths
+from models.effects.self_test import declaration_faults, signal_faults
+from service.errors import EffectPluginBroken
+
+GROUP = "abbe.effects"
+
+
+@dataclass(frozen=True)
+class Plugins:
+    """Effects of other packages that passed the self-test, and why others were left out."""
+
+    effects: tuple[Effect, ...]
+    broken: tuple[EffectPluginBroken, ...]
+
+
+def installed(known: Iterable[str]) -> Plugins:
+    """All effects that installed packages offer.
+
+    Parameters
+    ----------
+    known : names that are taken: the catalogue's.
+
+    Returns
+    -------
+    Plugins
+        Never raises for what a plug-in does: one that cannot be imported, is no effect, has a name that is taken or fails the self-test of
+        the catalogue (`models.effects.self_test`) is left out, with one error that names it.
+    """
+    taken, effects, broken = set(known), [], []
+    for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value)):
+        try:
+            found = _load(entry)
+            _check(entry, found, taken)
+        except EffectPluginBroken as fault:
+            broken.append(fault)
+            continue
+        effects += found
+        taken |= {e.name for e in found}
+    return Plugins(tuple(effects), tuple(broken))
+
+
+def _load(entry: EntryPoint) -> list[Effect]:
+    try:
+        thing: Any = entry.load()
+    except Exception as fault:  # whatever a stranger's module does on import, it must not take the product down
+        raise _left_out(entry, f"{type(fault).__name__}: {fault}") from fault
+    found = list(thing) if isinstance(thing, tuple | list) else [thing]
+    for effect in found:
+        if not isinstance(effect, Effect):
+            raise _left_out(entry, f"an Effect or a tuple of them expected, got {type(effect).__name__}")
+    if not found:
+        raise _left_out(entry, "it offers no effect")
+    return found
+
+
+def _check(entry: EntryPoint, found: list[Effect], taken: set[str]) -> None:
+    names = [e.name for e in found]
+    for effect in found:
+        if effect.name in taken or names.count(effect.name) > 1:
+            raise _left_out(entry, f"the name {effect.name!r} is taken")
+        try:
+            with np.errstate(all="ignore"):
+                faults = declaration_faults(effect) or signal_faults(effect, probe_paths())
+        except Exception as fault:  # its own code runs here
+            raise _left_out(entry, f"{effect.name}: {type(fault).__name__}: {fault}") from fault
+        if faults:
+            raise _left_out(entry, f"{effect.name}: {faults[0]}" + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""))
+
+
+def _left_out(entry: EntryPoint, why: str) -> EffectPluginBroken:
+    package = entry.dist.name if entry.dist is not None else entry.module
+    return EffectPluginBroken(
+        f"plug-in {entry.name} of {package} ({entry.value}) is left out: {why}",
+        "repair or uninstall the package; docs/how-to/own-effect.md",
+    )

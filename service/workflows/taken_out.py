@@ -1,0 +1,74 @@
+"""What a table cannot take out is taken out of the readings before tables are made from them, and named with its remedy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from models.effects.effect import Effect
+from service.runs.cases import case_of
+from service.storage.store import Store
+from service.workflows.campaign_folder import Campaign, from_store
+from service.workflows.discovery_engine import catalogue
+from service.workflows.known_effects import applies, readings_of
+from service.workflows.model_book import current, no_table_lines
+from service.workflows.provenance import machine_digest
+
+
+@dataclass(frozen=True)
+class TakenOut:
+    """Runs without what the model book says is no matter for tables.
+
+    ``labels``: the effects that were taken out of the readings; ``lines``: every effect that a table cannot take out, with its remedy, or
+    why the book was not used; ``version``: of the model, None without a book.
+    """
+
+    campaign: Campaign
+    labels: tuple[str, ...]
+    lines: tuple[str, ...]
+    version: int | None
+
+    @property
+    def doc(self) -> dict[str, Any]:
+        """For the document of a solution; empty without a book."""
+        if self.version is None:
+            return {}
+        return {"machine_model": {"version": self.version, "taken_out": list(self.labels), "not_for_tables": list(self.lines)}}
+
+
+def taken_out(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | None = None) -> TakenOut:
+    """Take lasting effects whose remedy is no table out of a campaign's readings, as the machine's current model has them.
+
+    Raises
+    ------
+    ModelUnknown
+        The book knows an effect that this catalogue does not.
+    """
+    record = current(store, campaign.site.name)
+    if record is None:
+        return TakenOut(campaign, (), (), None)
+    if record.doc["machine_digest"] != machine_digest(campaign.site.machine):
+        line = f"model version {record.version} of {campaign.site.name} is of another geometry and was not used"
+        return TakenOut(campaign, (), (line,), record.version)
+    chosen = [e for e in record.doc["effects"] if e["remedy"] != "table" and applies(e, campaign.name)]
+    lines = tuple(no_table_lines(record))
+    if not chosen:
+        return TakenOut(campaign, (), lines, record.version)
+    case = case_of(campaign.doc, campaign.site.machine, campaign.runs)
+    known_mm = readings_of(chosen, effects or catalogue(), case)
+    runs = [_less(run, known_mm[run["run_id"]]) for run in campaign.runs]
+    return TakenOut(replace(campaign, runs=runs), tuple(e["label"] for e in chosen), lines, record.version)
+
+
+def stored_without(store: Store, name: str) -> TakenOut:
+    """The same for a campaign of the store."""
+    return taken_out(store, from_store(store, name))
+
+
+def _less(run: dict[str, Any], known_mm: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
+    reading = run["columns"]["deviation_mm"]
+    if reading is None:
+        return run
+    return run | {"columns": run["columns"] | {"deviation_mm": (np.asarray(reading, dtype=np.float64) - known_mm).tolist()}}

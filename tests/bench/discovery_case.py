@@ -1,0 +1,45 @@
+"""The bench's campaigns with sealed truths: always the same seeds, every kind, made by the simulators' own formulas."""
+
+from __future__ import annotations
+
+import json
+from itertools import cycle, islice
+from pathlib import Path
+
+from models.discovery.case import Case
+from service.runs.cases import case_of
+from service.runs.exchange import read_folder
+from service.site import machine_from_doc
+from simulators.hidden.cases import make_case
+from simulators.hidden.suite import write_case
+
+FIRST_SEED = 5_200_000
+"""Chosen before anything was run, and used for nothing else: nobody tunes on the bench's cases."""
+CASES = 16
+KINDS = ("single", "double", "null", "unknown", "single", "double", "single", "null")
+"""One round of cases; 16 are 6 with one effect, 4 with two, 4 with none, 2 with one that no catalogue knows."""
+
+
+def kinds_of(count: int) -> list[str]:
+    """Kinds of the first ``count`` cases: the first four are one of each."""
+    return list(islice(cycle(KINDS), count))
+
+
+def write_cases(folder: Path, count: int) -> list[str]:
+    """Write ``public/<case>/`` and ``sealed/<case>.json``; gives the names."""
+    names = []
+    for i, kind in enumerate(kinds_of(count)):
+        names.append(f"case{i:04d}")
+        write_case(make_case(names[-1], FIRST_SEED + i, kind), folder)
+    return names
+
+
+def read_case(folder: Path, name: str) -> Case:
+    """A campaign as `abbe discover` reads it; its truth is not looked at."""
+    campaign = read_folder(folder / "public" / name)
+    return case_of(campaign.campaign, machine_from_doc(campaign.campaign["machine"]), campaign.runs)
+
+
+def truth(folder: Path, name: str) -> dict:
+    """What is sealed of a case."""
+    return json.loads((folder / "sealed" / f"{name}.json").read_text(encoding="utf-8"))

@@ -1,0 +1,64 @@
+"""`abbe discover --live`: what is proposed is measured on the machine over its wires, put beside the old runs, and searched again."""
+
+import dataclasses
+
+import pytest
+
+from service import cli
+from service.storage.store import Store
+from tests.unit.service.discovery_bench import Search
+
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
+
+
+class Asks(Search):
+    """Proposes a second feed until it is there."""
+
+    def __init__(self):
+        super().__init__(width_um=1.0)
+        self.seen = []
+
+    def __call__(self, case, effects, progress):
+        found = super().__call__(case, effects, progress)
+        self.seen.append({r.path.label: (r.path.feed_mm_min[0], r.path.at.t_s[0], r.path.t_set_s) for r in case.runs})
+        return found if len(case.runs) == 1 else dataclasses.replace(found, next_test=None)
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words):
+        code = cli.run([str(w) for w in words])
+        out, err = capsys.readouterr()
+        return code, " ".join(out.split()), err
+
+    return call
+
+
+def test_the_proposed_run_is_measured_and_the_search_goes_on(run, start_sims, monkeypatch, tmp_path):
+    sims = start_sims("--speed", "60")
+    assert run("measure", sims.machine_file, "--helix", "300,250,100,60", "--name", "june")[0] == 0
+    search = Asks()
+    monkeypatch.setattr("service.workflows.discovery_engine.search", search)
+    code, out, err = run("discover", "june", "--machine", sims.machine_file, "--live", "--report", "live.html")
+    assert code == 0, err
+    assert out.count("measure next: the same path at a second feed") == 1
+    assert [len(seen) for seen in search.seen] == [1, 2]
+    (old, (feed, first_s, set_s)), (new, (slow, later_s, later_set_s)) = search.seen[1].items()
+    assert (old, new) == ("helix", "n1-feed")
+    assert slow == pytest.approx(0.4 * feed)
+    assert later_s > first_s + 10.0  # one clock for both campaigns
+    assert set_s <= first_s < later_set_s <= later_s
+    assert "n1-feed" in (tmp_path / "live.html").read_text()
+    with Store.open(f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}") as store:
+        assert len(store.discoveries()) == 2
+        assert [c.name.split()[0] for c in store.campaigns()] == ["june", "next1"]
+        assert [s.state for s in store.discovery_steps(store.discoveries()[-1].id)][-1] == "EXPLAINED"
+
+
+def test_what_cannot_go_on_live_is_refused_before_anything_moves(run, tmp_path):
+    assert run("discover", "june", "--live")[2].startswith("error CFG-001: --live needs the machine")
+    (tmp_path / "c1").mkdir()
+    (tmp_path / "m.toml").write_text("")
+    assert "not with a folder" in run("discover", tmp_path / "c1", "--live", "--machine", tmp_path / "m.toml")[2]

@@ -1,0 +1,84 @@
+"""The demonstration of a discovery judges itself against the sealed truth, and says so when it was wrong."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from service.workflows.demo_hidden import HiddenDemo
+from service.workflows.demo_hidden_words import hidden_json, judged, truth_lines
+from service.workflows.known_effects import _usual
+from service.workflows.new_measurement import NewGap, NewMeasurement
+from service.workflows.thinned import picked
+
+PLAY = {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 6.0}, "wild": 7}
+SURGE = {"name": "counterbalance_surge", "key": "", "parameters": {"strength": 4.0}, "wild": 0}
+
+
+def demo(hidden, verdict, *labels):
+    told = {"strength": 6.0, "u_strength": 0.1, "unit": "um", "remedy": "mechanics", "remedy_text": "adjust"}
+    effects = [told | {"label": n, "name": n.split(":")[0], "key": n.split(":")[1]} for n in labels]
+    finding = {"verdict": verdict, "effects": effects, "where": {"axes": ["X"], "table": [1]}, "gaps": {}}
+    gap = NewGap(2.0, 0.5, 0.5)
+    return HiddenDemo(
+        [], None, Path(), "", finding, None, SimpleNamespace(version=1), NewMeasurement(gap, {"a": gap}),
+        truth={} if hidden is None else {"hidden": hidden},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("hidden", "answer", "right"),
+    [
+        (None, ("none",), True),
+        (None, ("unknown",), False),
+        (None, ("named", "lateral_play:EYX"), False),
+        (PLAY, ("named", "lateral_play:EYX"), True),
+        (PLAY, ("named", "lateral_play:EZX"), False),
+        (PLAY, ("named", "lateral_play:EYX", "vibration:Y"), False),
+        (PLAY, ("unknown",), False),
+        (PLAY, ("none",), False),
+        (SURGE, ("unknown",), True),
+        (SURGE, ("named", "vibration:Z"), False),
+        (SURGE, ("unknown", "vibration:Z"), False),
+    ],
+)
+def test_only_the_hidden_name_and_no_other_is_right(hidden, answer, right):
+    found = demo(hidden, *answer)
+    assert judged(found)[0] is right
+    assert truth_lines(found)[0].endswith(" RIGHT." if right else " WRONG.")
+
+
+def test_the_truth_is_told_with_its_size_and_shape():
+    assert truth_lines(demo(PLAY, "none"))[1] == "  it was made with strength 6, bent away from its formula"
+    assert truth_lines(demo(SURGE, "unknown"))[1] == "  it was made with strength 4"
+    assert "beside it vibration:Y, which is not there" in judged(demo(PLAY, "named", "lateral_play:EYX", "vibration:Y"))[1]
+
+
+def test_json_has_the_answer_and_the_truth_apart():
+    doc = hidden_json(demo(PLAY, "named", "lateral_play:EYX"))
+    assert (doc["hidden"], doc["right"], doc["effects"][0]["label"]) == (PLAY, True, "lateral_play:EYX")
+    assert doc["where"] == {"axes": ["X"]}
+    assert doc["anew"]["gap"] == {"before_um": 2.0, "after_um": 0.5, "floor_um": 0.5}
+
+
+def test_picked_readings_are_real_ones_and_lasers_stay():
+    def run(test, n, deviation=True):
+        t = [float(k) for k in range(n)]
+        return {"test": test, "columns": {"t_s": t, "deviation_mm": t if deviation else None, "valid": [1] * n}}
+
+    runs = [run("ballbar_helix", 70), run("ballbar_circle", 30), run("laser_diagonal", 9), run("ballbar_helix", 50, deviation=False)]
+    first, second, laser, sealed = picked(runs, 25)
+    assert first["columns"]["t_s"] == [2.0 + 4.0 * k for k in range(17)]
+    assert first["columns"]["deviation_mm"] == first["columns"]["t_s"]
+    assert len(second["columns"]["valid"]) == 7
+    assert (laser, sealed) == (runs[2], runs[3])
+    assert picked(runs, 100) is runs
+
+
+def test_a_new_set_up_of_an_instrument_is_expected_to_be_like_the_others_where_these_agree():
+    entry = {"family": "instrument", "forms": []}
+    assert _usual(entry, np.array([2.0, 4.0])) == 3.0
+    assert _usual(entry, np.array([2.0, -4.0])) == 0.0
+    assert _usual(entry | {"family": "drive"}, np.array([2.0, 4.0])) == 0.0
+    assert _usual(entry, np.array([2.0])) == 0.0

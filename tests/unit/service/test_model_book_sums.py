@@ -1,0 +1,65 @@
+"""What adds up to nothing in the book of a machine's model, and what only looks unsure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models.effects.catalogue import CATALOGUE
+from service.workflows.model_book import grown
+from service.workflows.model_sums import total
+from service.workflows.packed import packed_covariance
+
+SOURCE = {"campaign": "c1", "discovery": "d1", "machine_digest": "m", "runs": [], "versions": {}}
+
+
+@pytest.mark.parametrize(
+    ("strengths", "gone"),
+    [((5.0, -4.9), True), ((5.0, -2.0), False), ((10.0, 2.5), False)],
+    ids=["repaired", "half of it repaired", "a size without a sign, more of it"],
+)
+def test_only_strengths_of_opposite_sign_cancel(strengths: tuple[float, float], gone: bool) -> None:
+    """A straightness is known to 60 %; more of it found later is no repair."""
+    u = (0.1, 0.1) if min(strengths) < 0 else (6.2, 1.6)
+    effects = [{"label": "a", "strength": s, "u_strength": v, "alternatives": []} for s, v in zip(strengths, u, strict=True)]
+    doc = grown(None, {"effects": effects, "model": None}, SOURCE)
+    assert doc["gone"] == (["a"] if gone else [])
+    assert len(doc["effects"]) == (0 if gone else 2)
+
+
+def straight(coefficients: tuple[float, ...], noise: float = 0.05) -> dict[str, Any]:
+    """A straightness of two bends: an rms, so without a sign; stated whole, known to 60 %."""
+    effect = next(e for e in CATALOGUE if e.name == "straightness")
+    c = np.array(coefficients)
+    strength = effect.unseen[0] * effect.strength(c, {}) / effect.per_unit
+    shape = {"coefficients": list(coefficients), "covariance": packed_covariance(noise**2 * np.eye(c.size)), "parameters": {}, "forms": []}
+    return shape | {
+        "label": "straightness:EYX",
+        "name": "straightness",
+        "strength": strength,
+        "u_strength": 0.6 * strength,
+        "alternatives": [],
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "gone", "share"),
+    [
+        ((-3.0, -4.0), True, 0.0),
+        ((-2.9, -4.1), True, 0.02),
+        ((-1.5, -2.0), False, 0.5),
+        ((3.0, 4.0), False, 2.0),
+        ((4.0, -3.0), False, 1.4),
+    ],
+    ids=["repaired", "repaired but for noise", "half of it repaired", "twice as much", "another bend"],
+)
+def test_sizes_without_a_sign_add_up_as_their_coefficients_do(change: tuple[float, ...], gone: bool, share: float) -> None:
+    first, second = straight((3.0, 4.0)), straight(change)
+    doc = grown(None, {"effects": [first, second], "model": None}, SOURCE, CATALOGUE)
+    assert doc["gone"] == (["straightness:EYX"] if gone else [])
+    effect = next(e for e in CATALOGUE if e.name == "straightness")
+    assert total([first, second], effect)[0] == pytest.approx(share * first["strength"], abs=0.05 * first["strength"])
+    bent = second | {"forms": ["another form"]}
+    assert total([first, bent], effect)[0] == pytest.approx(first["strength"] + second["strength"])

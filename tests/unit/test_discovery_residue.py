@@ -1,0 +1,69 @@
+"""Which weak names are only what a strong effect's formula leaves, and that an answer of them stays plain JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.discovery.answer import NamedEffect
+from models.discovery.finding import _confounded, _of_scatter
+from models.discovery.residue import residues
+from models.discovery.variance import VarianceFinding
+from models.discovery.where import Where
+from service.workflows.discovery_answer import _effect
+
+SCATTER = frozenset({"vibration:Z", "stick_slip:X", "beam_outliers"})
+
+
+def effect(label: str, evidence: float) -> NamedEffect:
+    name, _, key = label.partition(":")
+    return NamedEffect(name, key, 1.0, 0.1, {}, np.ones(1), np.ones((1, 1)), evidence)
+
+
+@pytest.mark.parametrize(
+    ("strong", "weak", "share", "residue"),
+    [
+        ("backlash:Z", "reversal_spike:Z", 0.014, True),
+        ("backlash:Z", "reversal_spike:Z", 0.03, False),
+        ("backlash:Z", "reversal_spike:X", 0.009, False),
+        ("reversal_spike:X", "lateral_play:EYX", 0.015, True),
+        ("reversal_spike:X", "lateral_play:EXY", 0.015, False),
+        ("cyclic_error:Y", "stick_slip:X", 0.007, True),
+        ("backlash:X", "vibration:Z", 0.003, True),
+        ("backlash:X", "vibration:Z", 0.02, False),
+        ("backlash:X", "beam_outliers", 0.005, False),
+        ("backlash:X", "ram_sag", 0.009, False),
+        ("backlash:X", "ram_sag", 0.0009, True),
+        ("vibration:Z", "stick_slip:X", 0.007, False),  # the rule compares with effects of the mean
+    ],
+)
+def test_a_residue_is_weak_and_of_the_same_form(strong: str, weak: str, share: float, residue: bool) -> None:
+    told = residues([effect(strong, 1e4), effect(weak, share * 1e4)], SCATTER)
+    assert set(told) == ({weak} if residue else set())
+    assert all(strong in why for why in told.values())
+
+
+def test_the_strongest_name_is_never_a_residue() -> None:
+    labels = ("backlash:X", "reversal_spike:X", "vibration:Z", "servo_mismatch:X")
+    for evidence in np.random.default_rng(4).lognormal(3.0, 4.0, (50, 4)):
+        told = residues([effect(n, float(v)) for n, v in zip(labels, evidence, strict=True)], SCATTER)
+        assert labels[int(np.argmax(evidence))] not in told
+
+
+def test_a_parameter_of_the_scatter_claims_no_certainty() -> None:
+    named = _of_scatter(VarianceFinding("vibration", "Z", 1.0, 0.1, {"frequency_hz": 7.0}, 50.0, Where()))
+    assert math.isnan(named.parameters["frequency_hz"][1])
+    answer = _effect(named)["parameters"]
+    assert answer["frequency_hz"] == 7.0
+    assert "u_frequency_hz" not in answer
+    assert json.loads(json.dumps(answer, allow_nan=False)) == answer
+
+
+def test_only_rivals_that_the_price_rule_does_not_exclude_are_confounded() -> None:
+    named = replace(effect("backlash:X", 900.0), alternatives=(("lateral_play:EYX", 5.9), ("servo_mismatch:X", 6.1), ("ram_sag", 800.0)))
+    assert _confounded([named, named]) == ("lateral_play:EYX",)
+    assert _effect(named)["alternatives"] == ["lateral_play:EYX", "servo_mismatch:X", "ram_sag"]
