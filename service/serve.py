@@ -141,20 +141,32 @@ class Service:
             work = parts.create_task(self._once() if once else self._timetable(), name="scheduler")
             beat = parts.create_task(self._heartbeat(), name="heartbeat")
             stopped = parts.create_task(stop.wait(), name="stop")
-            await asyncio.wait({work, stopped}, return_when=asyncio.FIRST_COMPLETED)
+            try:
+                await asyncio.wait({work, stopped}, return_when=asyncio.FIRST_COMPLETED)
+            except asyncio.CancelledError:  # a part failed, and the group has cancelled us and all others
+                self._ask_to_end()
+                raise
             notify("STOPPING=1")
             if work.done() and not work.cancelled() and work.exception() is None:
                 passed = work.result()
             work.cancel()
             await asyncio.wait({work}, timeout=HOLD_S)
-            self._server.should_exit = True
-            if self._publisher is not None:
-                self._publisher.stop()
+            self._ask_to_end()
             await asyncio.wait({mqtt}, timeout=GOODBYE_S)
             mqtt.cancel()  # a broker that accepts connections and then says nothing would hold us up
             beat.cancel()
             stopped.cancel()
         return passed
+
+    def _ask_to_end(self) -> None:
+        """Page and broker end by themselves now.
+
+        A cancellation alone can get lost: ``asyncio.wait_for`` of Python 3.11 swallows one that comes together with what it waits for, such
+        as the broker's acknowledgement, and the service would stay half dead for ever.
+        """
+        self._server.should_exit = True
+        if self._publisher is not None:
+            self._publisher.stop()
 
     async def _timetable(self) -> bool:
         for schedule, slot in self._scheduler.next_due():

@@ -94,13 +94,17 @@ def test_the_broker_says_offline_when_the_service_is_killed(tmp_path: Path, endi
     assert payload(receiver.expect('"state":"offline"'))["machine"] == "mill-7"
 
 
-def test_a_defect_ends_the_service_with_a_traceback_and_a_farewell(tmp_path: Path, ending: ExitStack) -> None:
-    """systemd starts it again; the slot is claimed, so that the defect is not met a second time at once."""
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_defect_ends_the_service_with_a_traceback_and_a_farewell(tmp_path: Path, ending: ExitStack, lost: bool) -> None:
+    """systemd starts it again; the slot is claimed, so that the defect is not met a second time at once.
+
+    ``lost``: the broker's acknowledgement swallows the cancellation, as it rarely does.
+    """
     broker = Broker(tmp_path)
     ending.callback(lambda: broker.process.close())
     receiver = ending.enter_context(closing(broker.subscriber()))
     running = ending.enter_context(
-        closing(service(tmp_path, schedules=[["x", "*/5 * * * * *", "defect"]], mqtt=broker.url, port=free_port()))
+        closing(service(tmp_path, schedules=[["x", "*/5 * * * * *", "defect"]], mqtt=broker.url, port=free_port(), lose_cancellations=lost))
     )
     receiver.expect('"state":"online"')
     running.expect("KeyError: 'a defect'")
