@@ -12,10 +12,10 @@ from models.discovery.candidates import Pick
 from models.discovery.case import Case
 from models.discovery.finding import finding
 from models.discovery.prediction import predictions, solve
-from models.discovery.rivals import rivals_of
+from models.discovery.rivals import Rival, rivals_of
 from models.discovery.scatter import scattered, without
 from models.discovery.scene import Scene, linearised, quieted, scene_of
-from models.discovery.selection import Contest, Found, selected
+from models.discovery.selection import Contest, Found, selected, weighed
 from models.discovery.variance import VarianceFinding
 from models.effects.effect import Effect
 
@@ -47,7 +47,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     before = predictions(plain, solve(plain, ()))
     tell("comparing effects", 0.2)
     scene, contest, found, loud = searched(plain, effects, tell)
-    rivals = [[] if f.pick.unnamed else rivals_of(contest, found, i) for i, f in enumerate(found)]
+    found, rivals = fairly(contest, found)
     tell("predicting", 0.9)
     picks = [f.pick for f in found]
     solved = solve(scene, picks)
@@ -73,6 +73,22 @@ def searched(scene: Scene, effects: tuple[Effect, ...], tell: Progress) -> Searc
         if _labels(found, loud) == labels:
             break
     return scene, contest, sorted(found, key=lambda f: -f.score), loud
+
+
+def fairly(contest: Contest, found: list[Found]) -> tuple[list[Found], list[list[Rival]]]:
+    """The names with their rivals; a rival that explains more once both have their freedoms of form takes the name's place.
+
+    The search compares names before their forms, so that a bent effect may have let the wrong one of two near kin in.
+    """
+    rivals: list[list[Rival]] = []
+    for i in range(len(found)):
+        rivals.append([] if found[i].pick.unnamed else rivals_of(contest, found, i))
+        if rivals[i] and rivals[i][0].less < 0.0:
+            picks = [f.pick for f in found]
+            picks[i] = rivals[i][0].pick
+            found = weighed(contest, picks)
+            rivals[i] = rivals_of(contest, found, i)
+    return found, rivals
 
 
 def _labels(found: list[Found], loud: tuple[VarianceFinding, ...]) -> set[str]:

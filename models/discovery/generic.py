@@ -146,7 +146,8 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
     kinds = {p.kind for p in paths}
     out = [
         _effect("smooth", "smooth function of one axis", COMPONENTS, (), absorbed_by=("rigid21",)),
-        _effect("odd", "function of one axis that turns its sign with the direction", COMPONENTS, ()),
+        # along the axis itself this has a name: backlash that depends on the position, with its forms
+        _effect("odd", "function of one axis that turns its sign with the direction", CROSS, ()),
         _effect("lobes", "ball out of round", tuple(f"{a}{n}" for a in AXES for n in LOBES), (), forms=(Form("latitude", lobe_latitude),)),
     ]
     clock, tau = (0.0, end), Parameter("tau_s", "s", 20.0, 900.0, 120.0, SOURCE, (120.0,))

@@ -34,9 +34,11 @@ def nonrigid_bed(e: Hidden, track: Track, out: Bend) -> None:
 def ram_sag(e: Hidden, track: Track, out: Bend) -> None:
     """The ram (axis Z) sinks as it comes out, strength um over the full stroke, more or less with the height: -A z^2 (1 + beta y).
 
-    It sinks along gravity (a vertical machine's ram yields along Y) and tilts by the slope of its own curve; wild: a cubic part.
+    It sinks along gravity and tilts by the slope of its own curve; wild: a cubic part. Not on a machine whose Z is vertical.
     """
-    down = 1 if track.vertical == 2 else track.vertical
+    if track.vertical == 2:
+        return
+    down = track.vertical
     span = track.high_mm[2] - track.low_mm[2]
     z = (track.q_mm[:, 2] - track.low_mm[2]) / span
     height = middle(track, down) * e["beta"]

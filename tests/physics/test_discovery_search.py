@@ -10,9 +10,13 @@ import pytest
 
 from models.arrays import F1, F2
 from models.discovery.answer import Discovery
+from models.discovery.baseline import baseline_of
+from models.discovery.candidates import rows_for
 from models.discovery.case import Case, CaseRun, Role
-from models.discovery.discover import discover
+from models.discovery.discover import discover, fairly
 from models.discovery.noise import Colour, unscaled
+from models.discovery.scene import scene_of
+from models.discovery.selection import Contest, weighed
 from models.discovery.space import Space
 from models.effects.catalogue import CATALOGUE
 from models.effects.path import Path, driven, standing
@@ -120,6 +124,17 @@ def test_lost_motion_is_named_with_its_size_and_the_gap_closes_on_runs_never_use
     assert found.p_value < 1e-6
     assert effect.needed is not None
     assert effect.needed > 2.5  # without it the runs that judge are as bad as before
+
+
+def test_the_better_of_two_names_stands_once_both_may_bend() -> None:
+    """A search that let servo mismatch in where the axis has lost motion gives the name back."""
+    case, _ = of_backlash()
+    scene = scene_of(case, baseline_of(case))
+    contest = Contest.of(scene, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(scene, []), [], 12)}
+    found, rivals = fairly(contest, weighed(contest, [by["servo_mismatch:X"]]))
+    assert [f.pick.label for f in found] == ["backlash:X"]
+    assert all(r.less > 0.0 for r in rivals[0])
 
 
 def test_where_nobody_judges_nothing_is_needed_or_not() -> None:

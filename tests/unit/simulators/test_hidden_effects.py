@@ -18,11 +18,11 @@ from simulators.truth.draws import draw_machine
 from simulators.truth.machine import Geometry, Machine
 
 assert cases.ALL_EFFECTS
-CHAIN = "w-X-Y-b-Z-t"
+CHAIN = "w-X-b-Y-Z-t"
 CONFIG = config_of(CHAIN)[0]
 GEOMETRY = Geometry(CONFIG)
 PERFECT = PerfectMachine(Machine(GEOMETRY, draw_machine(Scenario(machine=CONFIG))))
-RUNS = runs_of("full", Machinery(GEOMETRY.low_mm, GEOMETRY.high_mm, 2, np.array([1.0, -1.0, 1.0])))
+RUNS = runs_of("full", Machinery(GEOMETRY.low_mm, GEOMETRY.high_mm, 1, np.array([1.0, -1.0, 1.0])))
 HELIX, CIRCLE, LASER = RUNS[3], RUNS[5], RUNS[17]
 MORE = {
     "backlash_position_dependent": {"k": 0.7}, "reversal_spike": {"d0_mm": 0.5, "p": 0.4}, "stick_slip": {"period_mm": 0.2, "v_c": 3.0},
