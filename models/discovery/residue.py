@@ -15,6 +15,12 @@ AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "latera
 """What a drive shows at the turns of its axis is told from another such effect of the same axis by its form only: below this share it is
 that one's form."""
 
+KIN_SHARE = 0.03
+CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
+SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
+"""Effects that live on the same clock, or are curves over the same positions: what one's formula leaves, off by a sixth, is shaped like
+another."""
+
 
 def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
     """Names that a stronger one's form explains.
@@ -24,7 +30,9 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
     - 0.1 % of the strongest name's;
     - 1 % of the strongest effect of the mean's, where it is stick-slip or vibration, whatever the axis;
     - 2 % of a stronger effect's of the same drive (lost motion, its change along the axis, spikes, play across, servo mismatch: keys that
-      end with the same axis).
+      end with the same axis);
+    - 3 % of a stronger one's of its kin: what warms up on the same clock, or is a curve over the same positions (and positioning beside
+      thermal growth of the same axis).
 
     What is weak but at another axis, or of another instrument (lost beams), stays: it is no form of the strong one.
 
@@ -52,4 +60,7 @@ def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
     """Share of the bigger one's evidence below which the smaller one is its residue."""
     if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
         return AXIS_SHARE
+    grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
+    if grown or any(small.name in kin and big.name in kin for kin in (CLOCK, SHAPE)):
+        return KIN_SHARE
     return SCATTER_SHARE if small.name in SCATTER and not big_is_scatter else RESIDUE_SHARE

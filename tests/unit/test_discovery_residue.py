@@ -38,6 +38,12 @@ def effect(label: str, evidence: float) -> NamedEffect:
         ("backlash:X", "beam_outliers", 0.005, False),
         ("backlash:X", "ram_sag", 0.009, False),
         ("backlash:X", "ram_sag", 0.0009, True),
+        ("bar_thermal", "axis_thermal_growth:Y", 0.025, True),
+        ("bar_thermal", "axis_thermal_growth:Y", 0.035, False),
+        ("nonrigid_bed:EYZ", "straightness:EXZ", 0.01, True),
+        ("axis_thermal_growth:X", "positioning_nonlinear:X", 0.022, True),
+        ("axis_thermal_growth:X", "positioning_nonlinear:Y", 0.022, False),
+        ("straightness:EYX", "spindle_thermal_drift:Z", 0.022, False),
         ("vibration:Z", "stick_slip:X", 0.007, False),  # the rule compares with effects of the mean
     ],
 )
