@@ -46,7 +46,7 @@ def rivals_of(contest: Contest, found: Sequence[Found], i: int) -> list[Rival]:
 
 def _nested(a: Pick, b: Pick) -> bool:
     """Whether one is a variant of the other: backlash and position-dependent backlash of one axis."""
-    return a.key == b.key and (a.effect.name.startswith(b.effect.name) or b.effect.name.startswith(a.effect.name))
+    return a.key == b.key and (a.effect.name == b.effect.variant_of or b.effect.name == a.effect.variant_of)
 
 
 def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, float, float]:

@@ -19,6 +19,8 @@ SHORTLIST = 6
 THRESHOLD = 4.0
 """Paid by every new name on top of its parameters and of how many names were tried."""
 UNNAMED_PRICE = 6.0
+VARIANT_PRICE = 4.0
+"""Paid by a name that holds a simpler one beside its own freedom (`models.effects.effect.Effect.variant_of`)."""
 FORM_LEAST = 0.0002
 """... and explains at least this share of what the effect itself does; less would change its strength more than it is worth."""
 NEARLY = 0.93
@@ -50,7 +52,7 @@ def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
         + len(pick.effect.shape) * float(np.log(readings))
         + 2.0 * float(np.log(max(labels, 1)))
         + THRESHOLD
-        + (UNNAMED_PRICE if pick.unnamed else 0.0)
+        + (UNNAMED_PRICE if pick.unnamed else VARIANT_PRICE if pick.effect.variant_of else 0.0)
     )
 
 

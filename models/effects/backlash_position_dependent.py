@@ -59,6 +59,7 @@ EFFECT = Effect(
     remedy="mechanics",
     remedy_text="the screw is worn where it works most: replace or regrind it; a table of backlash over position helps meanwhile",
     source="effects.md 1: B (1 + k x), unequal backlash",
+    variant_of="backlash",
     separated_by={
         "backlash": ("second_radius",),
         "servo_mismatch": ("second_feed", "laser_diagonals"),

@@ -79,6 +79,8 @@ class Effect:
     needs : what a campaign must hold to show it, for people. blind : tests that cannot see it.
     signature, remedy_text : for people: how it looks, what to do at the machine.
     remedy : who can take it out.
+    variant_of : str
+        Name of a simpler effect that this one holds beside a freedom of its own; it has to earn being preferred.
     separated_by : dict
         Rival (name, or name:key) -> what to add (``next_test.adds`` of run-format.md 5) to tell the two apart.
     source : paper, standard or effects.md section.
@@ -104,6 +106,7 @@ class Effect:
     kind: Literal["mean", "variance"] = "mean"
     absorbed_by: tuple[str, ...] = ()
     blind: tuple[str, ...] = ()
+    variant_of: str = ""
     separated_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def label(self, key: str) -> str:
