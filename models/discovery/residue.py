@@ -8,13 +8,15 @@ from models.discovery.answer import NamedEffect
 
 RESIDUE_SHARE = 0.001
 """A name with less evidence than this share of the largest is nothing that can be told from what the largest one's formula leaves."""
-SCATTER_SHARE, SCATTER = 0.01, ("stick_slip", "vibration")
-"""Scatter of readings that move along with the axes: below this share of the strongest effect of the mean, at any axis, it is its rest."""
+SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
+"""Scatter of readings that move along with the axes: below this share of the strongest effect of the mean, at any axis, it is its rest; a
+smooth effect leaves less that looks like scatter than one with corners or waves."""
 AXIS_SHARE = 0.02
 AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
 """What a drive shows at the turns of its axis is told from another such effect of the same axis by its form only: below this share it is
 that one's form."""
-
+ROUGH = (*AT_TURNS, "cyclic_error")
+"""Effects with corners or waves."""
 KIN_SHARE = 0.03
 CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
 SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
@@ -28,7 +30,7 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
     A name is a residue with evidence below
 
     - 0.1 % of the strongest name's;
-    - 1 % of the strongest effect of the mean's, where it is stick-slip or vibration, whatever the axis;
+    - 1 % of the strongest effect of the mean's, where it is stick-slip or vibration, whatever the axis (0.3 % where that effect is smooth);
     - 2 % of a stronger effect's of the same drive (lost motion, its change along the axis, spikes, play across, servo mismatch: keys that
       end with the same axis);
     - 3 % of a stronger one's of its kin: what warms up on the same clock, or is a curve over the same positions (and positioning beside
@@ -63,4 +65,6 @@ def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
     grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
     if grown or any(small.name in kin and big.name in kin for kin in (CLOCK, SHAPE)):
         return KIN_SHARE
-    return SCATTER_SHARE if small.name in SCATTER and not big_is_scatter else RESIDUE_SHARE
+    if small.name in SCATTER and not big_is_scatter:
+        return SCATTER_SHARE if big.name in ROUGH else SMOOTH_SHARE
+    return RESIDUE_SHARE

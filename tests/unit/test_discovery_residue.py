@@ -35,6 +35,8 @@ def effect(label: str, evidence: float) -> NamedEffect:
         ("cyclic_error:Y", "stick_slip:X", 0.007, True),
         ("backlash:X", "vibration:Z", 0.003, True),
         ("backlash:X", "vibration:Z", 0.02, False),
+        ("angular_error:EBX", "stick_slip:Z", 0.0099, False),  # a smooth effect leaves no scatter
+        ("angular_error:EBX", "stick_slip:Z", 0.002, True),
         ("backlash:X", "beam_outliers", 0.005, False),
         ("backlash:X", "ram_sag", 0.009, False),
         ("backlash:X", "ram_sag", 0.0009, True),
