@@ -94,6 +94,12 @@ class EffectPluginBroken(AbbeError):
     code = "DIS-003"
 
 
+class ModelMovedOn(AbbeError):
+    """The model of a machine has a newer version than the one that an addition was made on. Nothing was added."""
+
+    code = "DIS-004"
+
+
 class TableRefused(AbbeError):
     """A table breaks a limit (value, step, change). Nothing was written."""
 

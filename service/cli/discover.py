@@ -15,11 +15,11 @@ from service.cli.solve import stored_campaign
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from service.sequences.steps import CampaignPlan
     from service.site import Site
     from service.storage.store import Store
     from service.workflows.campaign_folder import Campaign
     from service.workflows.discover import Job, Journal
+    from service.workflows.discover_live import Added
 
 
 def discover(
@@ -94,19 +94,18 @@ def _live_needs(campaign: str, machine: Path | None) -> None:
 
 
 def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]]) -> tuple[Job, Journal, dict[str, Any]]:
-    """Measure what was proposed and search again, until nothing is proposed or a person has to look."""
+    """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is done twice."""
     from service.clock import SystemClock
     from service.config import load_machine
     from service.site import site_of
-    from service.workflows.discover import prepare
-    from service.workflows.discover_live import ROUNDS
-    from service.workflows.discovery_store import journal_of
+    from service.workflows.discover_live import ROUNDS, added, next_search
+    from service.workflows.discovery_store import StoredJournal
     from service.workflows.next_recipes import next_plan
 
     site = site_of(load_machine(machine).machine)
     job, journal, finding = at
     for number in range(1, ROUNDS + 1):
-        if finding["next_test"] is None:
+        if finding["next_test"] is None or not isinstance(journal, StoredJournal):
             break
         _print(job, journal, finding)
         name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
@@ -114,26 +113,36 @@ def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]
         if wanted.plan is None:
             typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe can run on this machine")
             break
-        campaign = _measured(store, site, job.campaign, wanted.plan)
-        job = prepare(campaign, job.effects, job.base)
-        journal = journal_of(store, job)
+        what = added(store, job.campaign, wanted.plan)
+        _measured(store, site, job.campaign, what)
+        job, journal = next_search(store, job, journal, what.plan.name)
         finding = _searched(job, journal)
     return job, journal, finding
 
 
-def _measured(store: Store, site: Site, campaign: Campaign, plan: CampaignPlan) -> Campaign:
-    """The plan, run on the machine; its runs beside those of the campaign."""
+def _measured(store: Store, site: Site, campaign: Campaign, what: Added) -> None:
+    """What is left of an added measurement, run on the machine; stopped, it says what is kept."""
     from service.cli.measure import ready_session
     from service.cli.progress import display
     from service.cli.running import run_job
-    from service.workflows.discover_live import measured_next
+    from service.workflows.discover_live import measure_added
 
-    async def work() -> Campaign:
+    if what.begun is not None:
+        done = len(what.plan.tests) - (0 if what.left is None else len(what.left.tests))
+        typer.echo(f"going on with campaign {what.plan.name!r}: {done} of {len(what.plan.tests)} runs are measured")
+    if what.left is None:
+        return
+
+    async def work() -> None:
         with display() as sink:
             async with ready_session(store, site) as session:
-                return await measured_next(session, store, site, campaign, plan, sink)
+                await measure_added(session, store, site, campaign, what, sink)
 
-    return run_job(work())
+    try:
+        run_job(work())
+    except SystemExit:
+        typer.echo("stopped: runs that were measured completely are kept; the same command goes on there", err=True)
+        raise
 
 
 def _searched(job: Job, journal: Journal) -> dict[str, Any]:

@@ -164,6 +164,15 @@ class ModelRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class NewVersion:
+    """A version of a machine's model on its way in. ``after``: the version that has to be the current one then; None: none at all."""
+
+    machine: str
+    after: int | None
+    doc: Doc
+
+
+@dataclass(frozen=True, slots=True)
 class OutboxRecord:
     """A message that must reach the broker some day."""
 

@@ -9,9 +9,9 @@ from sqlalchemy import Connection, func, insert, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql import Select
 
-from service.errors import StoreError
+from service.errors import ModelMovedOn, StoreError
 from service.storage.base import StoreBase
-from service.storage.records import DiscoveryRecord, Doc, ModelRecord, StepRecord
+from service.storage.records import DiscoveryRecord, Doc, ModelRecord, NewVersion, StepRecord
 from service.storage.store_campaigns import new_id
 from service.storage.tables import discoveries, discovery_steps, machine_models
 
@@ -46,12 +46,25 @@ class DiscoveryStore(StoreBase):
             query = query.where(discoveries.c.campaign_id == campaign_id)
         return [DiscoveryRecord(*row) for row in self._rows(query)]
 
+    def discovery(self, discovery_id: int) -> DiscoveryRecord:
+        """Read one discovery.
+
+        Raises
+        ------
+        StoreError
+            If there is none.
+        """
+        found = self._rows(select(discoveries).where(discoveries.c.id == discovery_id))
+        if not found:
+            raise StoreError(f"no discovery {discovery_id} in {self.url}")
+        return DiscoveryRecord(*found[0])
+
     def discovery_steps(self, discovery_id: int) -> list[StepRecord]:
         """List the states that a discovery has reached, first to last."""
         query = select(discovery_steps).where(discovery_steps.c.discovery_id == discovery_id).order_by(discovery_steps.c.seq)
         return [StepRecord(*row) for row in self._rows(query)]
 
-    def add_discovery_step(self, discovery_id: int, seq: int, state: str, doc: Doc, model: tuple[str, Doc] | None = None) -> int | None:
+    def add_discovery_step(self, discovery_id: int, seq: int, state: str, doc: Doc, model: NewVersion | None = None) -> int | None:
         """Write the next state of a discovery and, together with it or not at all, the version of a model that it brings.
 
         Parameters
@@ -64,8 +77,8 @@ class DiscoveryStore(StoreBase):
             The state.
         doc : dict
             Evidence, numbers, who decided.
-        model : tuple of str and dict, optional
-            Machine and document of a new version of its model.
+        model : NewVersion, optional
+            New version of a machine's model.
 
         Returns
         -------
@@ -76,6 +89,8 @@ class DiscoveryStore(StoreBase):
         ------
         StoreError
             If this state was written already: another process works on the same discovery.
+        ModelMovedOn
+            If the version that the new one was made on is not the current one any more. The state is not written either.
         """
 
         def work(connection: Connection) -> int | None:
@@ -86,19 +101,17 @@ class DiscoveryStore(StoreBase):
                 raise StoreError(
                     f"discovery {discovery_id} has step {seq} already: another process works on it", "wait for it, then run this again"
                 ) from None
-            return None if model is None else _add_version(connection, model[0], model[1], discovery_id, self._now())
+            return None if model is None else _add_version(connection, model, discovery_id, self._now())
 
         return self._write(work)
 
-    def add_model(self, machine: str, doc: Doc, discovery_id: int | None = None) -> int:
+    def add_model(self, model: NewVersion, discovery_id: int | None = None) -> int:
         """Append a version to the model book of a machine.
 
         Parameters
         ----------
-        machine : str
-            Its name.
-        doc : dict
-            The model.
+        model : NewVersion
+            Machine, document, and the version that it was made on.
         discovery_id : int, optional
             Which discovery brought it; None for a person's doing.
 
@@ -106,8 +119,13 @@ class DiscoveryStore(StoreBase):
         -------
         int
             Number of the version, from 1.
+
+        Raises
+        ------
+        ModelMovedOn
+            If the version that it was made on is not the current one any more.
         """
-        return self._write(lambda connection: _add_version(connection, machine, doc, discovery_id, self._now()))
+        return self._write(lambda connection: _add_version(connection, model, discovery_id, self._now()))
 
     def models(self, machine: str | None = None) -> list[ModelRecord]:
         """List versions of models (of one machine), oldest first."""
@@ -120,9 +138,29 @@ class DiscoveryStore(StoreBase):
         return self._read(lambda connection: connection.execute(query).all())
 
 
-def _add_version(connection: Connection, machine: str, doc: Doc, discovery_id: int | None, now: str) -> int:
-    last = connection.execute(select(func.max(machine_models.c.version)).where(machine_models.c.machine == machine)).scalar()
-    version = int(last or 0) + 1
-    values = {"machine": machine, "version": version, "discovery_id": discovery_id, "doc": doc, "created_utc": now}
-    new_id(connection, insert(machine_models).values(values))
+def _add_version(connection: Connection, model: NewVersion, discovery_id: int | None, now: str) -> int:
+    """Compare and swap: the version is appended only to the one that it was made on.
+
+    SQLite lets one writer in at a time, so the look decides. On PostgreSQL two may look at once; there the second one to insert
+    the number waits for the first and meets the constraint.
+    """
+    table = machine_models.c
+    last = connection.execute(select(func.max(table.version)).where(table.machine == model.machine)).scalar()
+    if last != model.after:
+        raise _moved_on(model, last)
+    version = (model.after or 0) + 1
+    values = {"machine": model.machine, "version": version, "discovery_id": discovery_id, "doc": model.doc, "created_utc": now}
+    try:
+        connection.execute(insert(machine_models).values(values))
+    except IntegrityError:
+        raise _moved_on(model, version) from None
     return version
+
+
+def _moved_on(model: NewVersion, last: int | None) -> ModelMovedOn:
+    made_on = "without any" if model.after is None else f"on version {model.after}"
+    have = "no model" if last is None else f"model version {last}"
+    return ModelMovedOn(
+        f"machine {model.machine!r} has {have} now, and this was made {made_on}: nothing was added",
+        f"look at it (`abbe model show {model.machine}`), then run this again",
+    )

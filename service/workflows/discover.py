@@ -45,7 +45,8 @@ class Job:
 
     ``runs``: the campaign's, long ones as means (`service.workflows.thinned`); ``case``: the same with effects that the model book knows
     taken out of the readings; ``known_mm``: these, per run; ``known``: their labels; ``base``: the version of the book they are from;
-    ``flags``: what is odd about single runs.
+    ``flags``: what is odd about single runs; ``seen``: the version that has to be the current one when a new one is added - ``base``,
+    unless that is of another geometry, or the discovery goes on with one that has added a version of the same readings itself.
     """
 
     campaign: Campaign
@@ -56,6 +57,7 @@ class Job:
     known_mm: dict[str, F1]
     known: tuple[str, ...]
     flags: tuple[str, ...]
+    seen: int | None = None
 
     @property
     def source(self) -> dict[str, Any]:
@@ -95,12 +97,14 @@ def prepare(campaign: Campaign, effects: tuple[Effect, ...], base: ModelRecord |
     flags = _checked(campaign)
     runs = thin(campaign.runs)
     case = case_of(campaign.doc, campaign.site.machine, runs)
+    seen = None if base is None else base.version
     if base is not None and base.doc["machine_digest"] != machine_digest(case.machine):
         flags.append(f"model version {base.version} of {base.machine} is of another geometry and was not used")
         base = None
     known = [] if base is None else [e for e in base.doc["effects"] if applies(e, campaign.name)]
     known_mm = readings_of(known, effects, case)
-    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, tuple(e["label"] for e in known), tuple(flags))
+    labels = tuple(e["label"] for e in known)
+    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), seen)
 
 
 def _checked(campaign: Campaign) -> list[str]:
@@ -167,6 +171,8 @@ def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink)
     ------
     StoreError
         Another process works on the same discovery.
+    ModelMovedOn
+        The model has a version that this search has not known. Nothing was added; the finding is kept in the journal.
     """
     if not journal.states:
         base = None if job.base is None else job.base.version

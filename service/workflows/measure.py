@@ -49,8 +49,8 @@ class Meter:
         self.sink(Progress(self.stage, done_s, self.total_s, eta, message))
 
 
-async def start_campaign(session: Session, store: Store, site: Site, name: str) -> tuple[int, int]:
-    """A new campaign in the store and its clock zero (controller time, us)."""
+async def start_campaign(session: Session, store: Store, site: Site, name: str, more: dict[str, Any] | None = None) -> tuple[int, int]:
+    """A new campaign in the store and its clock zero (controller time, us). ``more``: what else its document shall say."""
     machine_id = await store.write(store.add_machine, site.name, site.doc)
     status = await session.controller.status()
     comp = await session.controller.comp_status()
@@ -62,7 +62,7 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str) 
         "current_model": {"includes": ["rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"], "errors": None},
         "instruments": {"ballbar": {"resolution_mm": 1e-6}, "laser": {"resolution_mm": 1e-7}},
         "temperature_sensors": False,
-    }
+    } | (more or {})
     return await store.write(store.add_campaign, machine_id, name, doc), status.ctrl_us
 
 
@@ -74,8 +74,14 @@ async def measure(
     *,
     progress: ProgressSink = ignore_progress,
     clock: Clock | None = None,
+    campaign: tuple[int, int] | None = None,
 ) -> list[int]:
     """Run all tests of a plan; returns the run numbers in the store.
+
+    Parameters
+    ----------
+    campaign : tuple of int, optional
+        A campaign that was begun, as `start_campaign` gives it; default: a new one of the plan's name.
 
     Raises
     ------
@@ -86,7 +92,7 @@ async def measure(
     """
     clock = clock or SystemClock()
     dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
-    campaign_id, ctrl0_us = await start_campaign(session, store, site, plan.name)
+    campaign = campaign or await start_campaign(session, store, site, plan.name)
     meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock)
     run_ids = []
     for test, expected in zip(plan.tests, dry, strict=True):
@@ -95,7 +101,7 @@ async def measure(
         def tick(seconds: float, waited_s: float, base: float = base, label: str = test.label) -> None:
             meter.at(base + seconds, label, waited_s)
 
-        run_ids.append(await measure_test(session, store, site, (campaign_id, ctrl0_us), test, tick, clock))
+        run_ids.append(await measure_test(session, store, site, campaign, test, tick, clock))
         meter.done_s = base + expected.duration_s
         meter.at(meter.done_s, test.label)
     return run_ids

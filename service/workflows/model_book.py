@@ -6,7 +6,7 @@ from typing import Any
 
 from models.effects.effect import Effect
 from service.errors import ModelUnknown
-from service.storage.records import ModelRecord
+from service.storage.records import ModelRecord, NewVersion
 from service.storage.store import Store
 from service.workflows.known_effects import applies
 from service.workflows.model_sums import cancels, total
@@ -95,12 +95,14 @@ def revert(store: Store, machine: str, number: int) -> int:
     ------
     ModelUnknown
         There is no such version, or it is the current one.
+    ModelMovedOn
+        A newer version was added meanwhile; nothing is written.
     """
     old, newest = version(store, machine, number), current(store, machine)
     if newest is None or newest.version == number:
         raise ModelUnknown(f"version {number} of machine {machine!r} is the current one", LOOK)
     doc = old.doc | {"parent": newest.version, "why": f"back to version {number}, by hand"}
-    return store.add_model(machine, doc)
+    return store.add_model(NewVersion(machine, newest.version, doc))
 
 
 def differences(first: ModelRecord, second: ModelRecord, effects: tuple[Effect, ...] = ()) -> list[dict[str, Any]]:

@@ -1,11 +1,15 @@
 """`abbe discover --live`: what is proposed is measured on the machine over its wires, put beside the old runs, and searched again."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import pytest
 
 from service import cli
 from service.storage.store import Store
+from tests.scenarios.world import axes_at_rest, wait_for
 from tests.unit.service.discovery_bench import Search
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
@@ -55,6 +59,48 @@ def test_the_proposed_run_is_measured_and_the_search_goes_on(run, start_sims, mo
         assert len(store.discoveries()) == 2
         assert [c.name.split()[0] for c in store.campaigns()] == ["june", "next1"]
         assert [s.state for s in store.discovery_steps(store.discoveries()[-1].id)][-1] == "EXPLAINED"
+
+
+LIVE = """
+import sys
+from service import cli
+from service.workflows import discovery_engine
+from tests.scenarios.test_discover_live import Asks
+
+discovery_engine.search = Asks()
+sys.exit(cli.run(["discover", "june", "--machine", sys.argv[1], "--live"]))
+"""
+
+
+def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monkeypatch, tmp_path):
+    sims = start_sims("--speed", "40")
+    url = f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}"
+    assert run("measure", sims.machine_file, "--helix", "300,250,100,60", "--name", "june")[0] == 0
+
+    def added():
+        with Store.open(url) as store:
+            return [(r.label, r.visible_status, len(store.chunks(r.id)) > 0) for c in store.campaigns()[1:] for r in store.runs(c.id)]
+
+    words = [sys.executable, "-c", LIVE, str(sims.machine_file)]
+    first = subprocess.Popen(words, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, stdin=subprocess.DEVNULL)
+    try:
+        wait_for(lambda: added() == [("n1-feed", "running", True)], 40, "the added run is being measured")
+    finally:
+        first.kill()
+        first.wait()
+    assert added() == [("n1-feed", "incomplete", True)]
+    wait_for(lambda: axes_at_rest(sims), 60, "the controller has run its path to the end")
+    search = Asks()
+    monkeypatch.setattr("service.workflows.discovery_engine.search", search)
+    for again in (False, True):
+        code, out, err = run("discover", "june", "--machine", sims.machine_file, "--live")
+        assert code == 0, err
+        assert f": {int(again)} of 1 runs are measured" in out
+        assert [list(seen) for seen in search.seen] == [["helix", "n1-feed-2"]]  # the first search was not done again
+        assert [state[:2] for state in added()] == [("n1-feed", "incomplete"), ("n1-feed-2", "complete")]
+    with Store.open(url) as store:
+        assert [c.name.split()[0] for c in store.campaigns()] == ["june", "next1"]
+        assert [[s.state for s in store.discovery_steps(d.id)][-1] for d in store.discoveries()] == ["EXPLAINED"] * 2
 
 
 def test_what_cannot_go_on_live_is_refused_before_anything_moves(run, tmp_path):
