@@ -79,13 +79,16 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class NextTest:
-    """What to measure next: ``adds`` of run-format.md 5, which suspects it separates, expected separation and time it takes."""
+    """What to measure next: ``adds`` of run-format.md 5, which suspects it separates (labels; of a structure without a name, what it may
+    be, in words), expected separation (None: not known) and time it takes; ``like``: the run that is measured again or varied, if one is
+    meant."""
 
     adds: tuple[str, ...]
     separates: tuple[str, ...]
     expected_separation_sigma: float | None
     minutes: float
     why: str
+    like: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,32 @@ class Gap:
     before_mm: float
     after_mm: float
     floor_mm: float
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """What a campaign cannot show: ``what`` it is, ``because`` of what, the addition of run-format.md 5 that would show it."""
+
+    what: str
+    because: str
+    adds: str
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How one run that was never fitted agrees with the simulation.
+
+    Attributes
+    ----------
+    run : its label.
+    times : rms of its residual, or of sums over its neighbouring readings where that tells more, over what noise and the prediction's own
+        uncertainty allow; about 1 is agreement.
+    p : how often runs that agree would give one that is as far off, over all such runs of the campaign together.
+    """
+
+    run: str
+    times: float
+    p: float
 
 
 @dataclass(frozen=True)
@@ -114,6 +143,8 @@ class Discovery:
     noise_mm : one reading of each run's instrument, by "bar", "laser".
     p_value : of the whole finding (how often noise alone gives as much).
     theta, theta_names, theta_covariance : the refitted model without the effects.
+    agreement : of runs that only judge, where nothing was found; the worst first.
+    unseen : where nothing was found: what these runs could not have shown.
     """
 
     verdict: Verdict
@@ -133,3 +164,5 @@ class Discovery:
     rejected: tuple[tuple[str, str], ...] = ()
     confounded_with: tuple[str, ...] = ()
     beside: tuple[tuple[str, float], ...] = ()
+    agreement: tuple[Agreement, ...] = ()
+    unseen: tuple[Unseen, ...] = ()

@@ -10,9 +10,11 @@ import numpy as np
 from scipy import stats
 
 from models.arrays import F1
+from models.discovery.agreement import agreements
 from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict
 from models.discovery.generic import is_unnamed
 from models.discovery.next_test import Suspect, propose
+from models.discovery.next_unnamed import propose_unnamed
 from models.discovery.prediction import Solved, left_over, predictions
 from models.discovery.residue import residues
 from models.discovery.rivals import EXCLUDED, Rival
@@ -20,6 +22,7 @@ from models.discovery.scene import Scene
 from models.discovery.selection import Found
 from models.discovery.strength import as_plain, shape_of, strength_of, true_to_form
 from models.discovery.unnamed import Structure, structures, told_of
+from models.discovery.unseen import unseen
 from models.discovery.variance import VarianceFinding
 from models.discovery.where import locate
 from models.discovery.where_signal import where_of_signal
@@ -65,7 +68,7 @@ def finding(
         verdict=told.verdict,
         effects=told.effects if is_named else (),
         where=where,
-        next_test=_next_test(scene, told.mean, solved, rivals) if is_named else None,
+        next_test=_next_test(scene, told.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
         gaps=_gaps(scene, residuals[0], residuals[1]),
         residual_before_mm=residuals[0],
         residual_after_mm=residuals[1],
@@ -79,6 +82,8 @@ def finding(
         rejected=told.rejected,
         confounded_with=_confounded(told.effects) if is_named else (),
         beside=tuple((u.label, u.evidence) for u in unnamed) if is_named else (),
+        agreement=agreements(scene, solved, predicted[0]) if told.verdict == "none" else (),
+        unseen=unseen(case) if told.verdict == "none" else (),
     )
 
 

@@ -109,7 +109,9 @@ def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]
             break
         _print(job, journal, finding)
         name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
-        wanted = next_plan(finding["next_test"]["adds"], site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min)
+        test = finding["next_test"]
+        about = finding["where"] | {"runs": [test["like"]]} if finding["verdict"] == "unknown" and test.get("like") else None
+        wanted = next_plan(test["adds"], site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
         if wanted.plan is None:
             typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe can run on this machine")
             break

@@ -62,6 +62,36 @@ class FoundTest(FileObject):
     plan: dict[str, object] | None = None
     minutes: float | None = None
     expected_separation_sigma: float | None = None
+    like: str | None = None
+
+
+class FoundAgreement(FileObject):
+    """How a run that was never fitted agrees where nothing is missing: rms over what is allowed, and how often chance gives as much."""
+
+    run: str
+    times: float = Field(ge=0)
+    p: float = Field(ge=0, le=1)
+
+
+class FoundUnseen(FileObject):
+    """What the campaign could not have shown where nothing is missing, because of what, and what would show it."""
+
+    what: str
+    because: str
+    adds: Adds
+
+
+class FoundThinning(FileObject):
+    """Long ball-bar runs were searched with fewer values than they have readings; what that hides is not known to be absent."""
+
+    readings: int
+    kept: int
+    readings_per_value: int
+    how: Literal["means", "picked"]
+    interval_s: float
+    highest_hz: float
+    values_with_reversal: int
+    not_seen: list[str]
 
 
 class DiscoveryFile(FileObject):
@@ -75,6 +105,9 @@ class DiscoveryFile(FileObject):
     beside: list[FoundBeside] = Field(default_factory=list)
     where: FoundWhere
     next_test: FoundTest | None = None
+    agreement: list[FoundAgreement] = Field(default_factory=list)
+    unseen: list[FoundUnseen] = Field(default_factory=list)
+    thinning: FoundThinning | None = None
     rms_before_um: float | None = Field(None, ge=0)
     rms_after_um: float | None = Field(None, ge=0)
     holdout_rms_um: float | None = Field(None, ge=0)

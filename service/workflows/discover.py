@@ -28,9 +28,10 @@ from service.workflows.discovery_doc import finding_doc
 from service.workflows.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering
 from service.workflows.known_effects import applies, readings_of, without
 from service.workflows.model_book import grown
+from service.workflows.never_fitted import told_missing
 from service.workflows.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
 from service.workflows.solve import ALL_READINGS
-from service.workflows.thinned import thinned
+from service.workflows.thinned import Thinning, thinned, thinning
 
 Search = Callable[[Case, tuple[Effect, ...], ProgressSink], Discovery]
 """The computation: case, catalogue, whom to tell how far it is."""
@@ -45,7 +46,8 @@ class Job:
 
     ``runs``: the campaign's, long ones as means (`service.workflows.thinned`); ``case``: the same with effects that the model book knows
     taken out of the readings; ``known_mm``: these, per run; ``known``: their labels; ``base``: the version of the book they are from;
-    ``flags``: what is odd about single runs; ``seen``: the version that has to be the current one when a new one is added - ``base``,
+    ``flags``: what is odd about single runs, and what thinning hides; ``thinning``: that in figures, None where nothing was thinned;
+    ``seen``: the version that has to be the current one when a new one is added - ``base``,
     unless that is of another geometry, or the discovery goes on with one that has added a version of the same readings itself.
     """
 
@@ -57,6 +59,7 @@ class Job:
     known_mm: dict[str, F1]
     known: tuple[str, ...]
     flags: tuple[str, ...]
+    thinning: Thinning | None = None
     seen: int | None = None
 
     @property
@@ -96,6 +99,8 @@ def prepare(campaign: Campaign, effects: tuple[Effect, ...], base: ModelRecord |
     """
     flags = _checked(campaign)
     runs = thin(campaign.runs)
+    hidden = thinning(campaign.runs, runs)
+    flags += hidden.lines if hidden is not None else ()
     case = case_of(campaign.doc, campaign.site.machine, runs)
     seen = None if base is None else base.version
     if base is not None and base.doc["machine_digest"] != machine_digest(case.machine):
@@ -104,7 +109,7 @@ def prepare(campaign: Campaign, effects: tuple[Effect, ...], base: ModelRecord |
     known = [] if base is None else [e for e in base.doc["effects"] if applies(e, campaign.name)]
     known_mm = readings_of(known, effects, case)
     labels = tuple(e["label"] for e in known)
-    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), seen)
+    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen)
 
 
 def _checked(campaign: Campaign) -> list[str]:
@@ -185,11 +190,13 @@ def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink)
         journal.write("FITTED", {"decided_by": PROGRAM, "why": "runs checked, present model stated"} | fitted | job.source)
     finding = journal.finding
     if finding is None:
-        finding = finding_doc(search(job.case, job.effects, progress), job.case, (*job.effects, SLOW_DRIFT), job.known_mm)
+        found = search(job.case, job.effects, progress)
+        finding = finding_doc(found, job.case, (*job.effects, SLOW_DRIFT), job.known_mm, job.thinning)
     for seq, (state, doc) in enumerate(after_fit(finding), start=1):
         if seq < len(journal.states):
             continue
-        kept = doc | ({"finding": finding} if seq == 1 else {})
+        told = {"why": told_missing(finding)} if finding["verdict"] == "none" else {}
+        kept = doc | told | ({"finding": finding} if seq == 1 else {})
         journal.write(state, kept, _version(job, journal, finding) if state == "EXPLAINED" and _enters(doc, finding) else None)
     return finding
 

@@ -8,12 +8,13 @@ from typing import Any
 
 from models.discovery.answer import Discovery, NamedEffect, Where
 from models.discovery.case import Case
+from service.workflows.thinned import Thinning
 
 FORMAT = "abbe-discovery/1"
 
 
-def answer_doc(found: Discovery, case: Case) -> dict[str, Any]:
-    """Plain JSON, lengths of gaps in um, predictions of every sealed run in mm."""
+def answer_doc(found: Discovery, case: Case, thinning: Thinning | None = None) -> dict[str, Any]:
+    """Plain JSON, lengths of gaps in um, predictions of every sealed run in mm; ``thinning``: what became of long runs before."""
     held, fitted = found.gaps.get("holdout"), found.gaps.get("identify")
     doc: dict[str, Any] = {
         "format": FORMAT,
@@ -27,6 +28,12 @@ def answer_doc(found: Discovery, case: Case) -> dict[str, Any]:
     }
     if found.beside:
         doc["beside"] = [{"label": label, "evidence": evidence} for label, evidence in found.beside]
+    if found.agreement:
+        doc["agreement"] = [asdict(a) for a in found.agreement]
+    if found.unseen:
+        doc["unseen"] = [asdict(u) for u in found.unseen]
+    if thinning is not None:
+        doc["thinning"] = thinning.doc()
     if found.next_test is not None:
         t = found.next_test
         doc["next_test"] = {
@@ -34,7 +41,7 @@ def answer_doc(found: Discovery, case: Case) -> dict[str, Any]:
             "minutes": t.minutes,
             "expected_separation_sigma": t.expected_separation_sigma,
             "why": t.why,
-        }
+        } | ({"like": t.like} if t.like else {})
     if fitted is not None:
         doc |= {"rms_before_um": 1e3 * fitted.before_mm, "rms_after_um": 1e3 * fitted.after_mm, "noise_floor_um": 1e3 * fitted.floor_mm}
     if held is not None:

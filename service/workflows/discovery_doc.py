@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -15,17 +15,21 @@ from models.discovery.case import Case, CaseRun
 from models.effects.effect import Effect
 from service.workflows.discovery_answer import answer_doc
 from service.workflows.packed import packed, packed_covariance
+from service.workflows.thinned import Thinning
 
 FORMAT = "abbe-finding/1"
 INSTRUMENT = {"bar": "ball-bar", "laser": "laser"}
 
 
-def finding_doc(found: Discovery, case: Case, effects: tuple[Effect, ...], known_mm: dict[str, F1]) -> dict[str, Any]:
+def finding_doc(
+    found: Discovery, case: Case, effects: tuple[Effect, ...], known_mm: dict[str, F1], thinning: Thinning | None = None
+) -> dict[str, Any]:
     """Everything that is kept of a discovery; ``answer`` is its exchange form (run-format.md 5).
 
     Parameters
     ----------
     known_mm : what the model book knew already, taken out before; it is added to the predictions again.
+    thinning : what became of long runs before the search; None: they were searched as they were read.
     """
     by_name = {e.name: e for e in effects}
     found = replace(found, predicted_mm={label: v + known_mm[label] for label, v in found.predicted_mm.items()})
@@ -41,7 +45,10 @@ def finding_doc(found: Discovery, case: Case, effects: tuple[Effect, ...], known
         "next_test": None if found.next_test is None else _next_test(found.next_test),
         "rejected": [list(pair) for pair in found.rejected],
         "confounded_with": list(found.confounded_with),
-        "answer": answer_doc(found, case),
+        "agreement": [{"run": a.run, "times": a.times, "p": a.p} for a in found.agreement],
+        "unseen": [asdict(u) for u in found.unseen],
+        "thinning": None if thinning is None else thinning.doc(),
+        "answer": answer_doc(found, case, thinning),
         "series": {r.path.label: _series(found, r) for r in case.runs},
         "model": {
             "names": list(found.theta_names),
@@ -122,6 +129,7 @@ def _next_test(test: NextTest) -> dict[str, Any]:
         "expected_separation_sigma": test.expected_separation_sigma,
         "minutes": test.minutes,
         "why": test.why,
+        "like": test.like,
     }
 
 

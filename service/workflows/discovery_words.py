@@ -6,8 +6,9 @@ import math
 from typing import Any
 
 from service.report.numbers import NOT_AVAILABLE, plain, with_uncertainty
-from service.workflows.discovery_states import closed, entering, judge, not_entered, nothing_missing, off_by
+from service.workflows.discovery_states import closed, entering, judge, not_entered
 from service.workflows.model_book import REMEDIES, name_of
+from service.workflows.never_fitted import disagreeing, told_missing
 
 UNITS = {"um": "µm", "urad": "µrad", "": "", "1": "", "um/m": "µm/m"}
 ADDS = {
@@ -26,7 +27,7 @@ ADDS = {
 AXES = "XYZ"
 MANY = 6
 CLEAR = 7.0
-"""Evidence (natural logarithm) from which on a rival's chances are no longer told as a number: one in a thousand."""
+"""Evidence (natural logarithm) from which on a rival's chances are told as a power of ten: one in a thousand."""
 ROLES = {
     "identify": "fitted",
     "holdout": "never fitted, only judge",
@@ -56,11 +57,10 @@ def verdict_of(finding: dict[str, Any]) -> tuple[str, str, str]:
     judged = judge(finding)
     if finding["verdict"] == "none" and set(finding["where"]) == {"tests", "table"}:
         return "ok", "No common drift", _repeat_words(finding)
-    if finding["verdict"] == "none" and off_by(finding) is not None:
-        told = nothing_missing(finding)
-        return "open", "Nothing is missing in the fitted runs, but the others do not agree", f"{told[:1].upper()}{told[1:]}: {gap}."
     if finding["verdict"] == "none":
-        return "ok", "Nothing is missing", f"The present simulation explains all runs to their noise: {gap}."
+        told = told_missing(finding)
+        word = "Nothing is missing in the fitted runs, but the others do not agree" if disagreeing(finding) else "Nothing is missing"
+        return "open" if disagreeing(finding) else "ok", word, f"{told[:1].upper()}{told[1:]}: {gap}."
     names = " and ".join(f"{name_of(e)} {size_text(e)}" for e in finding["effects"])
     if finding["verdict"] == "unknown":
         beside = f" Beside it: {names}." if names else ""
@@ -148,7 +148,9 @@ def _times(less: float) -> str:
     """A rival's chances. Where evidence is large, one that explains nearly all of it is formally hopeless, and yet a bent form would do."""
     if less < 0.7:
         return "just as likely"
-    return f"{plain(math.exp(less), 2)} times less likely" if less < CLEAR else "less likely, but slightly bent it would look the same"
+    if less < CLEAR:
+        return f"{plain(math.exp(less), 2)} times less likely"
+    return f"10^{less / math.log(10.0):.0f} times less likely, but slightly bent it would look the same"
 
 
 def next_lines(test: dict[str, Any] | None) -> list[str]:
@@ -172,8 +174,16 @@ def next_of(finding: dict[str, Any]) -> list[str]:
         return [f"measure next: {what}, and once more later: what comes back belongs to the machine, what does not to that session"]
     if finding["verdict"] == "none":
         again = "measure next: repeat the runs that were never fitted and do not agree, some of them with the role identify"
-        return [again] if off_by(finding) is not None else []
+        return ([again] if disagreeing(finding) else []) + unseen_lines(finding)
     return [f"no test on offer tells it from {', '.join(finding['confounded_with'])}"] if finding["confounded_with"] else []
+
+
+def unseen_lines(finding: dict[str, Any]) -> list[str]:
+    """What these runs could not have shown, whether it is there or not, and what would; empty: nothing of the kind is known."""
+    return [
+        f"could not be seen: {u['what']}, because {u['because']}; what would show it: {ADDS.get(u['adds'], u['adds'])}"
+        for u in finding.get("unseen", [])
+    ]
 
 
 def where_lines(where: dict[str, Any]) -> list[str]:

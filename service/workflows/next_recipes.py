@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
+
+import numpy as np
 
 from models.machine import AXES, Machine
 from models.paths.lines import DIAGONALS
@@ -17,6 +20,10 @@ from service.sequences.steps import CampaignPlan
 SHORTER = 0.6
 SLOW = 0.4
 """The second feed is slower: no machine is asked for more than it was asked before."""
+DENSER = 2.0
+"""A path through a place has this many times the turns."""
+EQUATOR = 0.05
+"""A place that is lower than the cup by less than this share of the radius is still on the upper half."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,15 @@ class NextPlan:
     by_hand: tuple[str, ...]
 
 
-def next_plan(adds: list[str], machine: Machine, runs: list[dict[str, Any]], *, name: tuple[str, str], max_feed_mm_min: float) -> NextPlan:
+def next_plan(
+    adds: list[str],
+    machine: Machine,
+    runs: list[dict[str, Any]],
+    *,
+    name: tuple[str, str],
+    max_feed_mm_min: float,
+    about: dict[str, Any] | None = None,
+) -> NextPlan:
     """Recipes for what a discovery wants to have added (``next_test.adds``).
 
     Parameters
@@ -36,12 +51,17 @@ def next_plan(adds: list[str], machine: Machine, runs: list[dict[str, Any]], *, 
         What was measured so far: second feeds and late repeats are of the first helix of it.
     name : tuple of str
         Of the new campaign, and what its labels and set-ups begin with, so that they can stand beside the old ones.
+    about : dict, optional
+        Where something without a name lives (``where`` of a finding, ``runs`` the one that is to be measured again): a helix is repeated
+        several times in one set-up, any other run by hand; another radius passes through its place.
     """
     recipes: list[Recipe] = []
     by_hand = []
-    like = _first_helix(machine, runs)
+    like = _first_helix(machine, runs if about is None else _showing(runs, about))
+    place = (about or {}).get("position_mm")
+    makers = MAKERS if about is None else _makers_about(runs, about)
     for add in adds:
-        make = MAKERS.get(add)
+        make = makers.get(add)
         if make is None:
             by_hand.append(add)
         else:
@@ -53,10 +73,51 @@ def next_plan(adds: list[str], machine: Machine, runs: list[dict[str, Any]], *, 
     try:
         dry_run_campaign(machine, plan, max_feed_mm_min)
     except StrokeError:  # the old centre has no room for a whole hemisphere
-        smaller = [replace(r, radius_mm=0.5 * r.radius_mm) if isinstance(r, Helix) else r for r in recipes]
+        smaller = [_shrunk(r, 0.5, place) if isinstance(r, Helix) else r for r in recipes]
         plan = CampaignPlan(name[0], tuple(r.plan(machine) for r in smaller))
         dry_run_campaign(machine, plan, max_feed_mm_min)
     return NextPlan(plan, tuple(by_hand))
+
+
+def _makers_about(runs: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Callable[[Helix, str], list[Recipe]]]:
+    """What the sequencer can run to see again what has no name; a repeat only if it is a helix that is to be repeated."""
+    makers = MAKERS | {"longer_session": _repeats, "second_radius": partial(_through, about.get("position_mm"))}
+    again = [r["test"] for r in runs if r.get("run_id") in about.get("runs", [])]
+    return makers if "ballbar_helix" in again else {k: v for k, v in makers.items() if k not in ("longer_session", "ballbar")}
+
+
+def _showing(runs: list[dict[str, Any]], about: dict[str, Any]) -> list[dict[str, Any]]:
+    """Runs, first those that are to be measured again."""
+    return sorted(runs, key=lambda run: run.get("run_id") not in about.get("runs", []))
+
+
+def _shrunk(helix: Helix, scale: float, place: list[float] | None) -> Helix:
+    """A helix with a shorter bar about the same centre; about one nearer to a place, so that its sphere still passes there."""
+    if place is None:
+        return replace(helix, radius_mm=scale * helix.radius_mm)
+    at, centre = np.asarray(place, dtype=np.float64), np.asarray(helix.centre_mm, dtype=np.float64)
+    away = float(np.linalg.norm(centre - at))
+    radius = scale * helix.radius_mm
+    towards = (centre - at) / away if away > 0.0 else np.array([0.0, 0.0, -1.0])
+    return replace(helix, radius_mm=radius, centre_mm=as_point(at + radius * towards))
+
+
+def _through(place: list[float] | None, like: Helix, name: str) -> list[Recipe]:
+    """Twice the turns on another sphere through a place; without one, another radius as usual."""
+    if place is None:
+        return _named(like, name, "radius", radius_mm=SHORTER * like.radius_mm)
+    opens: Literal[1, -1] = 1 if place[2] >= like.centre_mm[2] - EQUATOR * like.radius_mm else -1
+    return _named(_shrunk(like, SHORTER, place), name, "radius", turns=DENSER * like.turns, opens=opens)
+
+
+def _repeats(like: Helix, name: str) -> list[Recipe]:
+    """There, back and there again in one set-up: each starts where the one before ends."""
+    ways: tuple[Literal[1, -1], ...] = (1, -1, 1) if like.direction > 0 else (-1, 1, -1)
+    last = len(ways) - 1
+    return [
+        replace(like, label=f"{name}-late{k + 1}", setup_id=f"{name}-late", direction=way, mount=k == 0, unmount=k == last)
+        for k, way in enumerate(ways)
+    ]
 
 
 def _first_helix(machine: Machine, runs: list[dict[str, Any]]) -> Helix:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,92 @@ MOST_READINGS = 20000
 """Ball-bar readings of a campaign that are searched one by one; more become means of so many neighbours that about as many are left."""
 GAP = 1.5
 """A block that takes this much longer than usual has lost readings."""
+STILL_MM = 1e-6
+"""An axis that moves less than this from reading to reading stands."""
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """What became of long ball-bar runs, and what the shorter ones cannot show.
+
+    ``readings``: ball-bar readings before; ``kept``: values after; ``each``: readings that one value stands for; ``means``: whether it is
+    their mean (else one of them, the rest are not looked at); ``interval_s``: usual time from value to value, and ``hertz``: the highest
+    frequency that such values can tell; ``turning``: values in whose readings an axis turns round.
+    """
+
+    readings: int
+    kept: int
+    each: int
+    means: bool
+    interval_s: float
+    turning: int
+
+    @property
+    def hertz(self) -> float:
+        """Half the rate of the values (Nyquist)."""
+        return 0.5 / self.interval_s
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """For people: what was done, what therefore could not be seen, what to do about it."""
+        became = f"every {self.each} of them became one mean" if self.means else f"of every {self.each} one was looked at, as it was read"
+        done = f"{self.readings} ball-bar readings are more than are searched one by one: {became}, {self.kept} values in all"
+        hidden = f"what that hides could not be seen, which does not say that it is absent: {'; '.join(self.not_seen)}"
+        return (done, hidden, REMEDY) if self.means else (done, hidden)
+
+    @property
+    def not_seen(self) -> tuple[str, ...]:
+        """What the shorter runs cannot show, one sentence each."""
+        if self.means:
+            spikes = (
+                f"a spike at a reversal keeps its height from {self.interval_s:.2g} s on, one of a single reading is 1/{self.each} as high"
+            )
+            sides = f"in {self.turning} means an axis turns round, and both sides of its lost motion are mixed there"
+            fast = f"vibration above {self.hertz:.2g} Hz is averaged down, or looks like a slower one"
+        else:
+            spikes = f"a spike at a reversal that lasts less than {self.interval_s:.2g} s may lie between two values"
+            sides = f"{self.turning} values stand for readings in which an axis turns round; how it loses motion there is not seen"
+            fast = f"vibration above {self.hertz:.2g} Hz looks like a slower one, or like noise"
+        return spikes, sides, fast
+
+    def doc(self) -> dict[str, Any]:
+        """As JSON."""
+        figures: dict[str, Any] = {"readings": self.readings, "kept": self.kept, "readings_per_value": self.each}
+        how = {"how": "means" if self.means else "picked", "interval_s": self.interval_s, "highest_hz": self.hertz}
+        return figures | how | {"values_with_reversal": self.turning, "not_seen": list(self.not_seen)}
+
+
+REMEDY = f"to see it, search fewer runs (--without RUN): up to {MOST_READINGS} ball-bar readings are searched as they were read"
+
+
+def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Thinning | None:
+    """What `thinned` or `picked` did to runs; None if nothing.
+
+    Parameters
+    ----------
+    before, after : list of dict
+        The same runs in the same order.
+    """
+    pairs = [(b, a) for b, a in zip(before, after, strict=True) if _measured_bar(b)]
+    changed = [(b, a) for b, a in pairs if len(a["columns"]["t_s"]) < len(b["columns"]["t_s"])]
+    if not changed:
+        return None
+    readings, kept = (sum(len(r["columns"]["t_s"]) for r in some) for some in zip(*pairs, strict=True))
+    each = max(round(len(b["columns"]["t_s"]) / len(a["columns"]["t_s"])) for b, a in changed)
+    interval = float(np.median(np.concatenate([np.diff(a["columns"]["t_s"]) for _, a in changed])))
+    means = any(not np.isin(a["columns"]["deviation_mm"], b["columns"]["deviation_mm"]).all() for b, a in changed)
+    return Thinning(readings, kept, each, means, interval, sum(_turning(b, each) for b, _ in changed))
+
+
+def _turning(run: dict[str, Any], each: int) -> int:
+    """Blocks of so many readings inside which an axis turns round."""
+    inside: set[int] = set()
+    for axis in "xyz":
+        step = np.diff(np.asarray(run["columns"][f"{axis}_mm"], dtype=np.float64))
+        moving = np.flatnonzero(np.abs(step) > STILL_MM)
+        turns = np.flatnonzero(np.diff(np.sign(step[moving])) != 0)
+        inside |= {int(k) // each for k in moving[turns + 1]}
+    return len(inside)
 
 
 def thinned(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Significance, Verdict, Where
+from models.discovery.answer import Agreement, Discovery, Gap, NamedEffect, NextTest, Significance, Verdict, Where
 from models.discovery.case import Case, CaseRun
 from models.effects.effect import Effect
 from service.events import ProgressSink
@@ -95,6 +95,7 @@ class Search:
             theta=np.array([1e-3, 2e-3]),
             theta_covariance=np.diag([1e-8, 2e-8]),
             rejected=(("contour_lag", "explains less than it costs"),),
+            agreement=tuple(Agreement(r.path.label, 1.0, 0.8) for r in case.of("holdout")) if self.verdict == "none" else (),
         )
 
 

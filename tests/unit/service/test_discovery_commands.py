@@ -88,7 +88,7 @@ def test_a_named_effect_is_told_written_drawn_and_stored(abbe: Call, finds: Call
 @pytest.mark.parametrize(
     ("verdict", "told", "sign"),
     [
-        ("none", "Nothing is missing. The present simulation explains all runs to their noise", "verdict ok"),
+        ("none", "Nothing is missing. The present model explains all runs to their noise", "verdict ok"),
         ("unknown", "Something is missing that the catalogue does not explain.", "verdict bad"),
     ],
 )

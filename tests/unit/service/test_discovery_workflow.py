@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from models.discovery.answer import Gap
+from models.discovery.answer import Agreement, Gap, NextTest, Unseen
 from service.errors import CampaignRefused, NotObservable, StoreError
 from service.events import ignore_progress
 from service.storage.store import Store
@@ -23,10 +23,10 @@ from service.workflows.campaign_folder import from_folder
 from service.workflows.discover import Job, Journal, discover, prepare
 from service.workflows.discovery_doc import finite
 from service.workflows.discovery_engine import catalogue
-from service.workflows.discovery_pages import gap_rows
+from service.workflows.discovery_pages import discovery_page, gap_rows
 from service.workflows.discovery_states import closed, entering, judge, not_entered
 from service.workflows.discovery_store import StoredJournal, journal_of
-from service.workflows.discovery_words import lines_of, rival_lines, verdict_of
+from service.workflows.discovery_words import lines_of, next_of, rival_lines, verdict_of
 from service.workflows.model_book import current
 from service.workflows.simulate import gap_doc, simulate
 from tests.unit.service.discovery_bench import Search, write_case
@@ -138,23 +138,68 @@ def gapped(search: Search, **gaps: Gap) -> Any:
     return lambda *words: replace(search(*words), gaps=gaps)
 
 
+def changed(search: Search, **changes: Any) -> Any:
+    """A search that finds something else besides."""
+    return lambda *words: replace(search(*words), **changes)
+
+
 @pytest.mark.parametrize(
-    ("judged_um", "sign", "words"),
+    ("agreement", "sign", "words"),
     [
-        (0.54, "open", "the fitted runs to their noise; runs that were never fitted are off by 1.8 times the noise"),
-        (0.32, "ok", "explains all runs to their noise"),
+        (
+            (Agreement("r03", 1.82, 3e-7),),
+            "open",
+            "the fitted runs to their noise; of the runs that were never fitted r03 1.8 times what noise",
+        ),
+        ((Agreement("r03", 1.12, 0.03),), "ok", "explains all runs to their noise"),
+        ((), "ok", "explains the fitted runs to their noise; not judged, for their noise is not known: r03"),
     ],
 )
 def test_runs_that_were_never_fitted_are_asked_before_nothing_is_said_to_be_missing(
-    folder: Path, judged_um: float, sign: str, words: str
+    folder: Path, agreement: tuple[Agreement, ...], sign: str, words: str
 ) -> None:
-    gaps = {"identify": Gap(3e-4, 3e-4, 3e-4), "holdout": Gap(judged_um * 1e-3, judged_um * 1e-3, 3e-4)}
     journal = Journal()
-    finding = discover(job_of(folder), journal, gapped(Search("none"), **gaps), ignore_progress)
+    finding = discover(job_of(folder), journal, changed(Search("none"), agreement=agreement), ignore_progress)
     told = verdict_of(finding)
     assert told[0] == sign
     assert words in told[2]
     assert words in journal.states[-1][1]["why"]
+    assert ("measure next: repeat the runs" in "\n".join(next_of(finding))) is (sign == "open")
+    assert [a["run"] for a in finding["answer"].get("agreement", [])] == [a.run for a in agreement]
+
+
+def test_what_could_not_be_seen_is_told_where_nothing_is_missing(folder: Path) -> None:
+    slow = Unseen("what grows with the feed looks like geometry", "all ball-bar runs have one feed", "second_feed")
+    finding = discover(job_of(folder), Journal(), changed(Search("none"), unseen=(slow,)), ignore_progress)
+    (line,) = next_of(finding)
+    assert line.startswith("could not be seen: what grows with the feed looks like geometry, because all ball-bar runs have one feed")
+    assert line.endswith("what would show it: the same path at a second feed")
+    assert line in lines_of(finding)
+    assert finding["answer"]["unseen"] == [{"what": slow.what, "because": slow.because, "adds": "second_feed"}]
+
+
+def test_what_has_no_name_gets_a_proposal_like_a_name(folder: Path) -> None:
+    test = NextTest(("longer_session",), ("something of the machine", "something of that session"), None, 150.0, "run r02 again, later")
+    finding = discover(job_of(folder), Journal(), changed(Search("unknown"), next_test=test), ignore_progress)
+    first, why = next_of(finding)
+    assert first == (
+        "measure next: a repeat late in the session to tell something of the machine from something of that session (about 150 min)"
+    )
+    assert why == "  run r02 again, later"
+    assert finding["answer"]["next_test"]["adds"] == ["longer_session"]
+
+
+def test_kin_that_explains_nearly_all_but_costs_more_is_listed_with_its_odds(folder: Path) -> None:
+    """It lies 25 behind by its price: no headline, but no reader may miss it."""
+    finding = discover(job_of(folder), Journal(), Search(ahead=25.0), ignore_progress)
+    assert finding["confounded_with"] == []
+    (line,) = rival_lines(finding["effects"][0])
+    assert line.endswith("(10^11 times less likely, but slightly bent it would look the same)")
+    assert any(line in told for told in lines_of(finding))
+    page = discovery_page(finding, from_folder(folder).runs, {}, {"title": "", "flags": [], "states": [], "provenance": {}})
+    assert page.effects[0].rivals == [line]
+    near = discover(job_of(folder), Journal(), Search(ahead=4.2), ignore_progress)
+    assert rival_lines(near["effects"][0])[0].endswith("(67 times less likely)")
 
 
 def test_runs_whose_readings_are_all_flagged_judge_nothing(folder: Path) -> None:

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from service.events import ignore_progress
+from service.report.discovery_page import render_discovery
+from service.runs.discovery_file import DiscoveryFile
 from service.workflows import thinned as module
-from service.workflows.thinned import thinned
-from tests.unit.service.discovery_bench import circle
+from service.workflows.campaign_folder import from_folder
+from service.workflows.discover import Journal, discover, prepare
+from service.workflows.discovery_engine import catalogue
+from service.workflows.discovery_pages import discovery_page, page_facts
+from service.workflows.thinned import picked, thinned, thinning
+from tests.unit.service.discovery_bench import Search, circle, write_case
 
 
 def test_short_campaigns_stay_as_they_are() -> None:
@@ -45,3 +55,58 @@ def test_a_block_over_lost_readings_is_left_out(monkeypatch: pytest.MonkeyPatch)
     whole = thinned([circle(1, "identify")])[0]["columns"]
     assert set(short["x_mm"]) <= set(run["columns"]["x_mm"])
     assert len(whole["t_s"]) == 20
+
+
+def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 100)
+    runs = [circle(1, "identify"), circle(2, "holdout"), circle(4, "sealed")]
+    assert thinning(runs, runs) is None
+    told = thinning(runs, thinned(runs))
+    assert told is not None
+    assert (told.readings, told.kept, told.each, told.means) == (240, 80, 3, True)
+    step = np.diff(runs[0]["columns"]["t_s"])[0]
+    assert told.interval_s == pytest.approx(3.0 * step)
+    assert told.hertz == pytest.approx(1.0 / (6.0 * step))
+    assert 4 <= told.turning <= 8  # X and Y turn round twice a turn each; one of these is where the circle begins
+    done, hidden, remedy = told.lines
+    assert "every 3 of them became one mean, 80 values in all" in done
+    assert "could not be seen, which does not say that it is absent" in hidden
+    assert f"in {told.turning} means an axis turns round" in hidden
+    assert f"vibration above {told.hertz:.2g} Hz" in hidden
+    assert "is 1/3 as high" in hidden
+    assert "--without RUN" in remedy
+
+
+def test_readings_that_were_left_out_are_told_too() -> None:
+    runs = [circle(1, "identify"), circle(2, "holdout")]
+    told = thinning(runs, picked(runs, 80))
+    assert told is not None
+    assert (told.means, told.each) == (False, 3)
+    assert "of every 3 one was looked at" in told.lines[0]
+    assert told.doc()["how"] == "picked"
+
+
+def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_case(tmp_path / "c1")
+    monkeypatch.setattr(module, "MOST_READINGS", 200)
+    job = prepare(from_folder(folder), catalogue())
+    journal = Journal()
+    finding = discover(job, journal, Search("none"), ignore_progress)
+    assert job.thinning is not None
+    assert set(job.thinning.lines) <= set(job.flags)  # `abbe discover` prints every flag
+    assert journal.states[0][1]["flags"] == list(job.flags)
+    answer = finding["answer"]
+    assert DiscoveryFile.model_validate_json(json.dumps(answer)).thinning is not None
+    assert (answer["thinning"]["readings"], answer["thinning"]["readings_per_value"]) == (360, 2)
+    assert len(answer["thinning"]["not_seen"]) == 3
+    page = render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, "now")))
+    assert "every 2 of them became one mean" in page
+    assert "could not be seen, which does not say that it is absent" in page
+
+
+def test_a_short_campaign_says_nothing_of_it(tmp_path: Path) -> None:
+    job = prepare(from_folder(write_case(tmp_path / "c1")), catalogue())
+    finding = discover(job, Journal(), Search("none"), ignore_progress)
+    assert job.thinning is None
+    assert "thinning" not in finding["answer"]
+    assert not any("readings are more than" in line for line in job.flags)
