@@ -27,7 +27,7 @@ from models.discovery.variance import VarianceFinding
 from models.discovery.where import locate
 from models.discovery.where_signal import where_of_signal
 
-COMPANION_SHARE, COMPANION_OVERLAP = 0.01, 0.6
+COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
 """A name with less evidence than this share of another's, at the same readings, is what the other's formula leaves of its true form."""
 STARTS = 2000.0
 """So many starts are compared in a campaign; bounds the p-value of the best."""

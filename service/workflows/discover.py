@@ -28,7 +28,6 @@ from service.workflows.discovery_doc import finding_doc
 from service.workflows.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering
 from service.workflows.known_effects import applies, readings_of, without
 from service.workflows.model_book import grown
-from service.workflows.never_fitted import told_missing
 from service.workflows.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
 from service.workflows.solve import ALL_READINGS
 from service.workflows.thinned import Thinning, thinned, thinning
@@ -195,8 +194,7 @@ def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink)
     for seq, (state, doc) in enumerate(after_fit(finding), start=1):
         if seq < len(journal.states):
             continue
-        told = {"why": told_missing(finding)} if finding["verdict"] == "none" else {}
-        kept = doc | told | ({"finding": finding} if seq == 1 else {})
+        kept = doc | ({"finding": finding} if seq == 1 else {})
         journal.write(state, kept, _version(job, journal, finding) if state == "EXPLAINED" and _enters(doc, finding) else None)
     return finding
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Literal
 
+from service.workflows.never_fitted import told_missing
+
 State = Literal["FITTED", "SUSPICIOUS", "PROPOSED", "TESTING", "EXPLAINED", "UNEXPLAINED"]
 FOLLOWS: dict[str | None, frozenset[str]] = {
     None: frozenset({"FITTED"}),
@@ -27,15 +29,13 @@ WORSE = 1.05
 """No runs may have a larger gap after than before by this factor: a solution that has run away is no finding."""
 NEAR = 3.0
 """Evidence (natural logarithm) by which a name must be ahead of every rival to enter the model book: twenty times as likely."""
-OFF = 1.1
-"""Runs that were never fitted and miss the noise by this factor disagree with a model that explains the fitted ones."""
 PROGRAM = "abbe discover"
 
 
 def after_fit(finding: dict[str, Any]) -> Iterator[tuple[State, dict[str, Any]]]:
     """The states that follow FITTED, each with its document, to the end."""
     if finding["verdict"] == "none":
-        yield "EXPLAINED", _decided(nothing_missing(finding), p_value=finding["p_value"], gaps=finding["gaps"])
+        yield "EXPLAINED", _decided(told_missing(finding), p_value=finding["p_value"], gaps=finding["gaps"])
         return
     yield (
         "SUSPICIOUS",
@@ -53,22 +53,6 @@ def after_fit(finding: dict[str, Any]) -> Iterator[tuple[State, dict[str, Any]]]
     judged = judge(finding)
     yield "TESTING", _decided(judged["rule"], **{k: v for k, v in judged.items() if k != "rule"})
     yield ending(finding, judged)
-
-
-def nothing_missing(finding: dict[str, Any]) -> str:
-    """What is explained where nothing is missing in the fitted runs: the runs that were never fitted too, or not."""
-    times = off_by(finding)
-    if times is None:
-        return "the present model explains all runs to their noise"
-    return f"the present model explains the fitted runs to their noise; runs that were never fitted are off by {times:.2g} times the noise"
-
-
-def off_by(finding: dict[str, Any]) -> float | None:
-    """Rms of the runs that were never fitted over their noise, under the present model; None where they agree or there are none."""
-    gap = finding["gaps"].get("holdout")
-    if gap is None or gap["before_um"] <= OFF * gap["floor_um"] or gap["floor_um"] <= 0.0:
-        return None
-    return float(gap["before_um"] / gap["floor_um"])
 
 
 def ending(finding: dict[str, Any], judged: dict[str, Any]) -> tuple[State, dict[str, Any]]:
