@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.arrays import F1, F2
 from models.discovery.scene import Scene
 from models.discovery.space import rows_of
 from models.effects.effect import Effect, Form, Values
-from models.effects.path import Path
 
 UNNAMED = "unnamed_"
 """Names that begin so mean: something is missing, but it is nothing that the catalogue knows."""
@@ -20,6 +20,9 @@ GENEROUS = 3.0
 """Prior standard deviation of a strength over the top of its usual range."""
 SEEN = 1e-5
 """A candidate of which less than this share of its square is left shows nothing."""
+MOST_KEPT = 16
+"""So many picks' columns are kept: a search comes back to those it has just used."""
+Short = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -47,17 +50,27 @@ class Pick:
         parts += [scene.raw(f.signal, self.key, self.values) for f in self.forms]
         return np.concatenate(parts, axis=1)
 
+    @property
+    def start(self) -> str:
+        """Label, non-linear parameters and forms: what its columns depend on."""
+        return f"{self.label} {sorted(self.values.items())} {[f.name for f in self.forms]}"
+
     def prior_sd(self, scene: Scene, columns: int) -> F1:
         """Prior standard deviation of each coefficient, shape (columns,)."""
-        return np.full(columns, coefficient_sd(self.effect, self.values, scene.paths[0], self.key))
+        if self.label not in scene.widths:
+            scene.widths[self.label] = int(self.effect.signal(scene.paths[:1], self.key, self.values)[0].shape[1])
+        return np.full(columns, coefficient_sd(self.effect, self.values, scene.widths[self.label]))
 
 
-def coefficient_sd(effect: Effect, values: Values, path: Path, key: str) -> float:
-    """The coefficient at which the strength is `GENEROUS` times the top of what is usual, for any power law of the strength."""
+def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
+    """The coefficient at which the strength is `GENEROUS` times the top of what is usual, for any power law of the strength.
+
+    ``width``: how many columns the effect has along one run.
+    """
     top = GENEROUS * effect.typical[1]
     if effect.name.startswith(UNNAMED):
         return top * effect.per_unit
-    unit = np.zeros(effect.signal((path,), key, values)[0].shape[1])
+    unit = np.zeros(width)
     sizes = []
     for c in (1.0, 4.0):
         unit[0] = c * effect.per_unit
@@ -81,23 +94,27 @@ def starts_of(effects: Sequence[Effect]) -> list[Pick]:
     return [Pick(e, key, values) for e in effects for key in e.keys for values in grid(e)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bank:
     """All candidates of a scene with what the present simulation leaves of them.
 
     Attributes
     ----------
     picks : tuple of Pick, one per group.
+    known : every start that was asked for and its group; -1 where no run sees it.
     first : array of int, where each group's columns begin; size : how many each has.
-    columns : array, shape (n, K), whitened. own : array, shape (K,): square of each before anything was taken out.
+    parts : arrays, shape (columns, n): whitened columns as rows, part after part, no group in two. Seven digits choose where a refinement
+        starts; they are half of what a search needs of memory.
+    own : array, shape (K,): square of each column before anything was taken out.
     gram : tuple of arrays (k, k), one per group: columns^T M columns. moment : array, shape (K,): columns^T M y.
     prior_sd : array, shape (K,). logs : array, shape (groups,): sum over a group's columns of the log of how many readings see them.
     """
 
     picks: tuple[Pick, ...]
+    known: Mapping[str, int]
     first: np.ndarray[tuple[int], np.dtype[np.intp]]
     size: np.ndarray[tuple[int], np.dtype[np.intp]]
-    columns: F2
+    parts: tuple[Short, ...]
     own: F1
     gram: tuple[F2, ...]
     moment: F1
@@ -106,7 +123,8 @@ class Bank:
 
     def gains(self, y: F1, rows: F2) -> F1:
         """Chi-square that each group takes away after ``rows`` (k, n) of earlier picks were taken out too, shape (groups,)."""
-        also = rows @ self.columns
+        short = rows.astype(np.float32)
+        also = np.concatenate([np.zeros((len(rows), 0)), *(short @ part.T for part in self.parts)], axis=1)
         moment = self.moment - also.T @ (rows @ y)
         out = np.zeros(len(self.picks))
         for k in np.unique(self.size):
@@ -116,6 +134,27 @@ class Bank:
             gram = np.stack([self.gram[i] for i in at]) - taken @ taken.transpose(0, 2, 1)
             out[at] = _gains(gram, moment[index], self.own[index], self.prior_sd[index])
         return out
+
+    def groups(self) -> Iterator[_Group]:
+        """One group after the other."""
+        rows = (part[i:] for part in self.parts for i in range(len(part)))  # from each column on to the end of its part
+        starts = dict(zip(self.first.tolist(), range(len(self.picks)), strict=True))
+        for column, after in enumerate(rows):
+            if column in starts:
+                i = starts[column]
+                at = slice(column, column + int(self.size[i]))
+                yield _Group(after[: self.size[i]], self.own[at], self.gram[i], self.moment[at], float(self.logs[i]))
+
+
+@dataclass(frozen=True)
+class _Group:
+    """What a bank holds of one pick."""
+
+    rows: Short
+    own: F1
+    gram: F2
+    moment: F1
+    log: float
 
 
 def _gains(gram: np.ndarray, moment: F2, own: F2, prior_sd: F2) -> F1:
@@ -128,50 +167,71 @@ def _gains(gram: np.ndarray, moment: F2, own: F2, prior_sd: F2) -> F1:
 
 
 def bank_of(scene: Scene, picks: Sequence[Pick]) -> Bank:
-    """Columns of all candidates; those that no run sees are left out."""
-    kept, blocks = [], []
-    for p in picks:
-        raw = p.raw(scene)
-        if np.abs(raw).max() > 0.0:
-            kept.append(p)
-            blocks.append(raw)
-    size = np.array([b.shape[1] for b in blocks], dtype=np.intp)
-    first = np.concatenate([[0], np.cumsum(size)[:-1]]).astype(np.intp)
-    sd = np.concatenate([p.prior_sd(scene, b.shape[1]) for p, b in zip(kept, blocks, strict=True)])
-    logs = np.array([np.log(np.maximum((np.abs(b) > SEEN * np.abs(b).max()).sum(axis=0), 2)).sum() for b in blocks])
-    columns = _whitened_in_parts(scene, blocks)
-    space = scene.space
-    seen = space.taken @ columns
+    """Columns of all candidates; those that no run sees are left out. What another bank of the scene still holds is not made again."""
+    asked = [p.start for p in picks]
+    held = [b for b in scene.banks if isinstance(b, Bank)]
+    same = next((b for b in held if list(b.known) == asked), None)
+    if same is not None:
+        return replace(same, picks=tuple(p for p in picks if same.known[p.start] >= 0))
+    blind = {name for b in held for name, i in b.known.items() if i < 0}
+    old = {name: g for b in held for (name, g) in zip((n for n, i in b.known.items() if i >= 0), b.groups(), strict=True)}
+    kept: list[Pick] = []
+    parts, groups = list[Short](), list[_Group]()
+    for start in range(0, len(picks), PART):
+        some = [p for p in picks[start : start + PART] if p.start not in blind]
+        found = {**old, **dict(_groups(scene, [p for p in some if p.start not in old]))}
+        some = [p for p in some if p.start in found]
+        if some:
+            parts.append(np.concatenate([found[p.start].rows for p in some]))
+            groups += [replace(found[p.start], rows=parts[-1][:0]) for p in some]
+            kept += some
+    number = {p.start: i for i, p in enumerate(kept)}
+    size = np.array([g.own.size for g in groups], dtype=np.intp)
+    bank = Bank(
+        tuple(kept), {name: number.get(name, -1) for name in asked}, np.cumsum(size) - size, size, tuple(parts),
+        np.concatenate([np.zeros(0), *(g.own for g in groups)]), tuple(g.gram for g in groups),
+        np.concatenate([np.zeros(0), *(g.moment for g in groups)]),
+        np.concatenate([np.zeros(0), *(p.prior_sd(scene, g.own.size) for p, g in zip(kept, groups, strict=True))]),
+        np.array([g.log for g in groups]),
+    )  # fmt: skip
+    scene.banks.add(bank)
+    return bank
+
+
+PART = 20
+"""So many candidates are whitened together: whitening takes several copies of what it is given."""
+
+
+def _groups(scene: Scene, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
+    """Start and group of each pick that some run sees."""
+    blocks = [(p, raw) for p, raw in ((p, p.raw(scene)) for p in picks) if raw.any()]
+    if not blocks:
+        return
+    raw = np.asfortranarray(np.concatenate([b.T for _, b in blocks]).T)  # a filter along the runs is fastest so
+    columns, space = scene.white(raw), scene.space
+    seen = space.seen(columns)
     moment = columns.T @ space.y - seen.T @ space.moment
-    gram = tuple(
-        columns[:, f : f + k].T @ columns[:, f : f + k] - seen[:, f : f + k].T @ seen[:, f : f + k]
-        for f, k in zip(first, size, strict=True)
-    )
     own = np.einsum("nk,nk->k", columns, columns)
-    return Bank(tuple(kept), first, size, columns, own, gram, moment, sd, logs)
-
-
-PART = 40
-
-
-def _whitened_in_parts(scene: Scene, blocks: list[F2]) -> F2:
-    """Whitened blocks side by side, some at a time and each forgotten then: whitening takes several copies of what it is given."""
-    columns = np.empty((scene.gap.size, sum(b.shape[1] for b in blocks)))
-    at = 0
-    for start in range(0, len(blocks), PART):
-        part = np.concatenate(blocks[start : start + PART], axis=1)
-        blocks[start : start + PART] = [np.zeros((0, 0))] * len(blocks[start : start + PART])
-        columns[:, at : at + part.shape[1]] = scene.white(part)
-        at += part.shape[1]
-    return columns
+    short = columns.T.astype(np.float32)
+    size = np.abs(raw)
+    start = 0
+    for p, block in blocks:
+        at = slice(start, start + block.shape[1])
+        start = at.stop
+        gram = columns[:, at].T @ columns[:, at] - seen[:, at].T @ seen[:, at]
+        sees = (size[:, at] > SEEN * size[:, at].max()).sum(axis=0)
+        yield p.start, _Group(short[at], own[at], gram, moment[at], float(np.log(np.maximum(sees, 2)).sum()))
 
 
 def gain_of(scene: Scene, pick: Pick, rows: F2) -> float:
-    """Chi-square that one pick takes away after ``rows`` of others were taken out too; seven digits, for trials."""
+    """Chi-square that one pick takes away after ``rows`` of others were taken out too.
+
+    With all digits: where the simulation leaves little of a column, seven of them put evidence of thousands off by several.
+    """
     space = scene.space
     columns = scene.white(pick.raw(scene))
-    seen, also = space.taken_short @ columns.astype(np.float32), rows @ columns
-    gram = columns.T @ columns - (seen.T @ seen).astype(np.float64) - also.T @ also
+    seen, also = space.seen(columns), rows @ columns
+    gram = columns.T @ columns - seen.T @ seen - also.T @ also
     moment = columns.T @ space.residual - also.T @ (rows @ space.y)
     sd = pick.prior_sd(scene, columns.shape[1])
     return float(_gains(gram[None], moment[None], np.einsum("nk,nk->k", columns, columns)[None], sd[None])[0])
@@ -179,8 +239,10 @@ def gain_of(scene: Scene, pick: Pick, rows: F2) -> float:
 
 def whitened(scene: Scene, pick: Pick) -> tuple[F2, F2]:
     """Whitened columns of a pick and what the simulation leaves of them, kept for as long as the scene."""
-    name = f"{pick.label} {sorted(pick.values.items())} {[f.name for f in pick.forms]}"
+    name = pick.start
     if name not in scene.kept:
+        if len(scene.kept) >= MOST_KEPT:
+            scene.kept.pop(next(iter(scene.kept)))
         columns = scene.white(pick.raw(scene))
         scene.kept[name] = columns, scene.space.left(columns)
     return scene.kept[name]

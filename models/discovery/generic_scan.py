@@ -23,6 +23,8 @@ BURST_S = (0.35, 0.8, 1.8)
 BURST_HZ = (0.15, 8.0)
 CELL_MM = 14.0
 """Distance of the bumps' centres that are tried."""
+PLACES = 64
+"""So many of them are tried at once; each has hundreds of readings near it."""
 
 
 @dataclass(frozen=True)
@@ -144,18 +146,8 @@ def bumps(seen: Seen, widths_mm: tuple[float, ...], count: int) -> tuple[float, 
     q = np.concatenate([p.at.q_mm for p in seen.paths])
     t, look, rest = seen.stacked()
     _, cells = np.unique(np.round(q / CELL_MM).astype(int), axis=0, return_index=True)
-    near = cKDTree(q[cells]).sparse_distance_matrix(cKDTree(q), 2.5 * max(widths_mm), output_type="coo_matrix")
-    total = np.zeros(len(cells))
-    for width in widths_mm:
-        g = np.exp(-0.5 * (near.data / width) ** 2)
-        pull = np.zeros((len(cells), 3))
-        shape = np.zeros((len(cells), 3, 3))
-        for a in range(3):
-            pull[:, a] = np.bincount(near.row, g * (look[:, a] * rest)[near.col], len(cells))
-            for b in range(a, 3):
-                shape[:, a, b] = shape[:, b, a] = np.bincount(near.row, g * g * (look[:, a] * look[:, b])[near.col], len(cells))
-        shape += 0.1 * np.trace(shape, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-9 * np.eye(3)
-        total = np.maximum(total, np.einsum("na,na->n", pull, np.linalg.solve(shape, pull[:, :, None])[:, :, 0]))
+    tree = cKDTree(q)
+    total = np.concatenate([_bump_gains(q[cells[i : i + PLACES]], tree, look, rest, widths_mm) for i in range(0, len(cells), PLACES)])
     chosen: list[int] = []
     for i in np.argsort(-total):
         if all(np.linalg.norm(q[cells[i]] - q[cells[j]]) > 1.5 * max(widths_mm) for j in chosen):
@@ -163,3 +155,20 @@ def bumps(seen: Seen, widths_mm: tuple[float, ...], count: int) -> tuple[float, 
         if len(chosen) == count:
             break
     return tuple(float(t[cells[i]]) for i in chosen)
+
+
+def _bump_gains(places: F2, tree: cKDTree, look: F2, rest: F1, widths_mm: tuple[float, ...]) -> F1:
+    """What a bump at each place takes out at most, of any of the widths, shape (places,)."""
+    near = cKDTree(places).sparse_distance_matrix(tree, 2.5 * max(widths_mm), output_type="coo_matrix")
+    total = np.zeros(len(places))
+    for width in widths_mm:
+        g = np.exp(-0.5 * (near.data / width) ** 2)
+        pull = np.zeros((len(places), 3))
+        shape = np.zeros((len(places), 3, 3))
+        for a in range(3):
+            pull[:, a] = np.bincount(near.row, g * (look[:, a] * rest)[near.col], len(places))
+            for b in range(a, 3):
+                shape[:, a, b] = shape[:, b, a] = np.bincount(near.row, g * g * (look[:, a] * look[:, b])[near.col], len(places))
+        shape += 0.1 * np.trace(shape, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-9 * np.eye(3)
+        total = np.maximum(total, np.einsum("na,na->n", pull, np.linalg.solve(shape, pull[:, :, None])[:, :, 0]))
+    return total

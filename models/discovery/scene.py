@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from weakref import WeakSet
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.arrays import F1, F2
 from models.discovery.baseline import Baseline
 from models.discovery.case import Case, CaseRun
 from models.discovery.noise import Colour, level, lone, unscaled
-from models.discovery.space import Space
+from models.discovery.space import ROWS, Space
 from models.effects.effect import Signal, Values
 from models.effects.path import Path
 
@@ -41,6 +43,8 @@ class Scene:
     tangent : columns of the simulation's unknowns, whitened but for the size of the noise.
     space : what is left of the whitened gap.
     also : array, shape (n, k): columns that are no part of the simulation and are taken out too (waves of a vibration), mm per mm.
+    kept : whitened columns of picks and what the simulation leaves of them; banks : banks of candidates of this very scene that somebody
+        still holds; widths : columns of an effect along one run, by label. Work that is not done twice, no part of what the scene says.
     """
 
     case: Case
@@ -55,6 +59,8 @@ class Scene:
     space: Space
     also: F2
     kept: dict[str, tuple[F2, F2]] = field(default_factory=dict)
+    banks: WeakSet[object] = field(default_factory=WeakSet)
+    widths: dict[str, int] = field(default_factory=dict)
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -84,6 +90,28 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Slopes:
+    """Derivatives (n, p) with seven digits: they are first order about the perfect machine and right to 1e-4 anyway."""
+
+    short: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, runs: Sequence[CaseRun], base: Baseline) -> Slopes:
+        """Of the readings of runs with respect to the simulation's unknowns."""
+        out = np.empty((sum(r.path.n for r in runs), base.size), dtype=np.float32)
+        start = 0
+        for run in runs:
+            out[start : start + run.path.n] = base.linear(run.data(), np.zeros(base.size))[1]
+            start += run.path.n
+        return cls(out)
+
+    def __matmul__(self, theta: F1) -> F1:
+        """Change of every reading, mm, shape (n,)."""
+        parts = [self.short[i : i + ROWS].astype(np.float64) @ theta for i in range(0, len(self.short), ROWS)]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+
+@dataclass(frozen=True)
 class Tangent:
     """Derivatives of all readings with respect to the simulation's unknowns about the perfect machine, whitened for noise of 1 mm.
 
@@ -91,17 +119,24 @@ class Tangent:
     exactly. ``columns`` (n, p); ``gram`` (p, p) of the rows of each instrument; ``raw`` (n, p) as they are.
     """
 
-    raw: F2
+    raw: Slopes
     columns: F2
     gram: Mapping[str, F2]
 
     @classmethod
-    def of(cls, raw: F2, use: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> Tangent:
-        """Whiten and multiply out once."""
-        columns = unscaled(raw * use[:, None], lengths, kinds, colours)
-        rows = np.repeat(np.array(kinds), lengths)
-        parts = {kind: columns[rows == kind] for kind in dict.fromkeys(kinds)}
-        return cls(raw, columns, {kind: part.T @ part for kind, part in parts.items()})
+    def of(cls, raw: Slopes, use: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> Tangent:
+        """Whiten and multiply out once, run by run: there is never more than one large matrix besides what is given."""
+        n, p = raw.short.shape
+        columns = np.empty((n, p))
+        gram = {kind: np.zeros((p, p)) for kind in dict.fromkeys(kinds)}
+        start = 0
+        for length, kind in zip(lengths, kinds, strict=True):
+            at = slice(start, start + length)
+            part = unscaled(np.asfortranarray(raw.short[at] * use[at, None]), (length,), (kind,), colours)
+            columns[at] = part
+            gram[kind] += part.T @ part
+            start += length
+        return cls(raw, columns, gram)
 
     def blend(self, colours: Mapping[str, Colour]) -> F2:
         """Columns^T columns of whitened columns, shape (p, p)."""
@@ -118,10 +153,8 @@ def scene_of(case: Case, base: Baseline) -> Scene:
     runs = ordered(case.of("identify"))
     use = np.concatenate([r.valid.astype(float) for r in runs])
     paths, n = tuple(r.path for r in runs), use.size
-    raw = np.concatenate([base.linear(r.data(), np.zeros(base.size))[1] for r in runs])
-    tangent = Tangent.of(raw, use, [p.n for p in paths], [p.kind for p in paths], FIRST_NOISE)
-    nothing = Space(np.zeros(n), np.zeros((0, n)), np.zeros(0))
-    scene = Scene(case, base, runs, paths, np.zeros(n), use, np.zeros(base.size), FIRST_NOISE, tangent, nothing, np.zeros((n, 0)))
+    tangent = Tangent.of(Slopes.of(runs, base), use, [p.n for p in paths], [p.kind for p in paths], FIRST_NOISE)
+    scene = Scene(case, base, runs, paths, np.zeros(n), use, np.zeros(base.size), FIRST_NOISE, tangent, Space.nothing(n), np.zeros((n, 0)))
     scene = replace(scene, gap=np.concatenate([r.data().deviation_mm for r in runs]))
     for _ in range(STEPS):
         scene = linearised(scene, np.zeros((n, 0)), np.zeros(0))
@@ -145,17 +178,19 @@ def linearised(scene: Scene, extra: F2, extra_sd: F1) -> Scene:
     value = np.concatenate([base.read(d, theta) for d in data])
     paths = tuple(base.along(r.path, d, theta) for r, d in zip(scene.runs, data, strict=True))
     gap = np.concatenate([d.deviation_mm for d in data]) - value
-    return replace(scene, theta=theta, gap=gap, paths=paths, kept={})
+    scene.kept.clear()  # another scene takes its place: what was only kept for speed would be as large
+    return replace(scene, theta=theta, gap=gap, paths=paths, kept={}, banks=WeakSet())
 
 
 def taken_out(scene: Scene) -> Scene:
     """The same with its space made anew from gap, columns and noise."""
     y = scene.white(scene.gap[:, None])[:, 0]
-    columns = scene.tangent.columns / scene.sd_mm()[:, None]
-    space = Space.of(y, columns, scene.tangent.blend(scene.colours), scene.base.prior_sd * WIDE)
+    tangent = scene.tangent
+    scene.kept.clear()
+    space = Space.of(y, tangent.columns, tangent.blend(scene.colours), scene.base.prior_sd * WIDE, 1.0 / scene.sd_mm())
     if scene.also.shape[1]:
         space = space.without(scene.white(scene.also), np.full(scene.also.shape[1], LOUDEST_MM))
-    return replace(scene, space=space, kept={})
+    return replace(scene, space=space, kept={}, banks=WeakSet())
 
 
 def quieted(scene: Scene, found: Sequence[tuple[F2, F1]]) -> Scene:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.bench.discovery_case import FIRST_SEED, kinds_of, truth, write_cases
+from tests.bench.discovery_case import FIRST_SEED, kinds_of, measured_bar_readings, read_case, truth, write_cases, write_long
 from tests.bench.discovery_contestants import CONTESTANTS
 from tests.bench.discovery_judge import costs, counted
 
@@ -25,12 +25,16 @@ def compared(folder: Path, count: int, tell: Callable[[str], None]) -> dict:
         for k in CONTESTANTS:
             tell(f"campaign {i + 1} of {count}: {k}")
             runs[k].append(_run(folder, name, k))
+    tell("a long campaign")
+    long = write_long(folder)
+    longest = _run(folder, long, "discover") | {"readings": measured_bar_readings(read_case(folder, long))}
     tell("")
     truths = [truth(folder, name) for name in names]
     return {
         "first_seed": FIRST_SEED,
         "kinds": kinds_of(count),
         "truths": [{"case": t["case"], "effects": [[e["label"], e["snr_total"]] for e in t["effects"]]} for t in truths],
+        "long": longest,
         "contestants": {k: {"counts": counted(truths, [r["answer"] for r in v]), "costs": costs(v), "runs": v} for k, v in runs.items()},
     }
 

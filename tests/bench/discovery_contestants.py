@@ -59,7 +59,7 @@ def candidates_of(case: Case, *, unnamed: bool = True) -> Candidates:
     parts = []
     while contest.banks:  # one after the other is let go: memory is compared too
         bank = contest.banks.pop(0)
-        left = scene.space.left(bank.columns)
+        left = np.concatenate([scene.space.left(part.T.astype(np.float64)) for part in bank.parts], axis=1)
         length = np.linalg.norm(left, axis=0)
         seen = length**2 > SEEN * bank.own
         for pick, first, size in zip(bank.picks, bank.first, bank.size, strict=True):

@@ -30,7 +30,14 @@ def lines(found: dict) -> list[str]:
         c = who[k]["costs"]
         times = f"{c['median_s']:10.2f}{c['longest_s']:11.2f}{_s(c['columns_s'])}{c['clock_s']:9.2f}"
         out.append(f"  {words:<39}{times}{_mb(c['beyond_mb']):>11}{_mb(c['process_peak_mb']):>12}")
-    return [*out, _goals(who["discover"]["costs"]), *NOTES]
+    return [*out, _goals(who["discover"]["costs"]), _long(found["long"]), *NOTES]
+
+
+def _long(run: dict) -> str:
+    """The longest campaign whose readings are searched one by one."""
+    time, peak = run["cpu_s"], run["process_peak_mb"]
+    memory = "memory not measured" if peak is None else f"process {peak:.0f} MB{_verdict(peak <= GOAL_MB)}"
+    return f"  discover with {run['readings']} ball-bar readings: {time:.1f} s{_verdict(time <= GOAL_LONGEST_S)}, {memory}"
 
 
 def _goals(c: dict) -> str:
