@@ -14,6 +14,9 @@ from contextlib import suppress
 
 import pytest
 
+from tests.contract.cnc_peer import cnc as cnc  # fixtures
+from tests.contract.cnc_peer import controller as controller
+
 Trick = Callable[["Exchange"], Awaitable[None]]
 
 
