@@ -108,7 +108,7 @@ class Fixture:
         radius_mm = _number(request, "radius_mm")
         if not 0.0 < radius_mm <= MAX_RADIUS_MM:
             raise FixtureError("radius_mm is out of range")
-        self._world.ballbar.mount(radius_mm, self._standing())
+        self._world.ballbar.mount(radius_mm, self._standing(), self._world.time_s)
         return {}
 
     async def _take_out_ballbar(self, request: Answer) -> Answer:
@@ -122,7 +122,7 @@ class Fixture:
         if not 0.0 < radius_mm <= MAX_RADIUS_MM:
             raise FixtureError("radius_mm is out of range")
         self._standing()
-        if not self._world.ballbar.change(radius_mm):
+        if not self._world.ballbar.change(radius_mm, self._world.time_s):
             raise FixtureError("no cup stands here")
         return {}
 

@@ -39,6 +39,7 @@ class World:
         self.laser = LaserDevice(self.draws, laser_sizes(scenario), Air(scenario.seed), self.locate)
         if self.hidden is not None:
             self.laser.too_much = self.hidden.laser_mm
+            self.ballbar.too_much = self.hidden.bar_mm
         self._play = Play(self.draws.backlash_mm, self.controller.position_mm)
         self._laser_tick = 0
         self.laser.record(0, 0.0, self._play.position_mm)

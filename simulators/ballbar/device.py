@@ -49,14 +49,17 @@ class BallbarDevice:
         self._cup_mm: F | None = None
         self._radius_mm = 0.0
         self._bar_in = False
+        self._hung_in_s = 0.0
         self._mounts = 0
+        self.too_much: Callable[[F, float, float], F] | None = None
+        """What a hidden effect adds: instants (n,) s, when the bar was hung in, and its nominal length in mm to (n,) mm."""
         self._noise = generator(draws.seed, STREAM_BAR_NOISE)
         self._taken: list[_Taken] = []
         self._ready: list[Samples] = []
 
     # ---- people --------------------------------------------------------------------------------------------------
 
-    def mount(self, radius_mm: float, tool_mm: F) -> None:
+    def mount(self, radius_mm: float, tool_mm: F, now_s: float) -> None:
         """Put the cup at the tool's actual position (3,), a little beside it, and hang in the bar of nominal length ``radius_mm``."""
         self.settle()
         rng = generator(self._draws.seed, STREAM_CUP, self._mounts)
@@ -64,7 +67,7 @@ class BallbarDevice:
         direction = rng.normal(size=3)
         offset_mm = rng.uniform(*self._sizes.cup_offset_um) * 1e-3
         self._cup_mm = tool_mm + direction / np.linalg.norm(direction) * offset_mm
-        self._radius_mm, self._bar_in = radius_mm, True
+        self._radius_mm, self._bar_in, self._hung_in_s = radius_mm, True, now_s
 
     def take_out(self) -> bool:
         """Take the bar out; the cup stays. False: no cup stands."""
@@ -72,12 +75,12 @@ class BallbarDevice:
         self._bar_in = False
         return self._cup_mm is not None
 
-    def change(self, radius_mm: float) -> bool:
-        """Hang the bar of another nominal length in; the cup stays. False: no cup stands."""
+    def change(self, radius_mm: float, now_s: float) -> bool:
+        """Hang the bar of another nominal length in; the cup stays, the bar comes from the hand. False: no cup stands."""
         self.settle()
         if self._cup_mm is None:
             return False
-        self._radius_mm, self._bar_in = radius_mm, True
+        self._radius_mm, self._bar_in, self._hung_in_s = radius_mm, True, now_s
         return True
 
     def unmount(self) -> None:
@@ -145,8 +148,11 @@ class BallbarDevice:
         if self._cup_mm is None or not self._bar_in:
             status |= NO_BAR
         else:
-            distance = np.linalg.norm(self._locate(time_us * 1e-6, axes_mm) - self._cup_mm, axis=1)
+            times_s = time_us * 1e-6
+            distance = np.linalg.norm(self._locate(times_s, axes_mm) - self._cup_mm, axis=1)
             free = distance - self._radius_mm + self._draws.bar_length_error_mm + noise
+            if self.too_much is not None:
+                free = free + self.too_much(times_s, self._hung_in_s, self._radius_mm)
             reading_mm[:] = np.clip(free, -RANGE_MM, RANGE_MM)
             status |= np.where(np.abs(free) > RANGE_MM, OUT_OF_RANGE, 0)
         reading_nm = np.rint(reading_mm * 1e6).astype(np.int64)

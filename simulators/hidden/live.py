@@ -17,14 +17,14 @@ MOVES = frozenset({
     "counterbalance_surge", "encoder_count_loss",
 })  # fmt: skip
 """Effects that move the tool; they act on every instrument."""
-READS = frozenset({"laser_cosine", "air_refraction", "dead_path", "bar_length_error"})
+READS = frozenset({"laser_cosine", "air_refraction", "dead_path", "bar_length_error", "bar_thermal"})
 """Effects of an instrument alone."""
 NEEDED = {
     "backlash_position_dependent": ("k",), "reversal_spike": ("d0_mm", "p"), "cyclic_error": ("pitch_mm", "ph1", "r2", "ph2"),
     "stick_slip": ("period_mm", "v_c"), "vibration": ("f_hz",), "nonrigid_bed": ("other",), "straightness": ("seed",),
     "positioning_nonlinear": ("seed",), "axis_thermal_growth": ("tau_s", "x_fixed"), "spindle_thermal_drift": ("tau_s",),
     "squareness_thermal": ("tau_s",), "local_bump": ("cx", "cy", "cz", "w_mm"), "counterbalance_surge": ("period_s", "phase"),
-    "encoder_count_loss": ("t0_s",), "air_refraction": ("period_s", "phase"),
+    "encoder_count_loss": ("t0_s",), "air_refraction": ("period_s", "phase"), "bar_thermal": ("tau_s",),
 }  # fmt: skip
 """Parameters beside ``strength``."""
 VERTICAL = 2
@@ -134,6 +134,18 @@ class Live:
         if e.name == "dead_path":
             return AIR_PPM_PER_K * 1e-6 * DEAD_PATH_MM * e["strength"] * since_zero_s / 3600.0
         return 0.0
+
+    def bar_mm(self, times_s: F, hung_in_s: float, radius_mm: float) -> F:
+        """What the ball-bar reads too much at n instants, with this bar hung in at ``hung_in_s``, (n,) mm."""
+        n = len(times_s)
+        if self.effect.name != "bar_thermal":
+            return np.zeros(n)
+        zero = np.zeros((n, 3))
+        track = Track(
+            "bar", "", zero, times_s, zero, zero, zero, zero, zero, zero, np.zeros(n), hung_in_s, hung_in_s,
+            self.low_mm, self.high_mm, VERTICAL, 0.0, 0, radius_mm,
+        )  # fmt: skip
+        return self.effect.bend(track).reading
 
     def describe(self) -> dict[str, object]:
         """Name, key and parameters, for whoever opens the truth."""

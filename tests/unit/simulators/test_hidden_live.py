@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulators.hidden.picks import packaged, picked
+from simulators.hidden.picks import packaged, picked, winner
 from simulators.scenario import Scenario, ScenarioError, from_dict, load
 from simulators.sealed import truth
 from simulators.world import World
@@ -101,6 +101,61 @@ def test_what_the_laser_alone_has() -> None:
     assert thin == pytest.approx(0.93e-6 * 400.0 * 3.0 * np.sin(2.0 * np.pi * w.time_s / 6000.0 + 1.0), rel=0.02)
 
 
+def bar_um(w: World, seconds: float = 0.1) -> float:
+    """What the bar reads now, um, by many samples."""
+    w.ballbar.start(100, w.time_s)
+    w.advance(w.time_s + seconds)
+    w.ballbar.stop()
+    return float(w.ballbar.take().reading_nm.mean()) / 1000.0
+
+
+def hung_in(w: World, radius_mm: float = 100.0) -> float:
+    """Mount cup and bar at the middle, go out to where it reads; when that was, s."""
+    go(w, (300.0, 250.0, 225.0))
+    w.ballbar.mount(radius_mm, w.tool_position(), w.time_s)
+    at = w.time_s
+    go(w, (300.0 + radius_mm, 250.0, 225.0))
+    return at
+
+
+def test_a_bar_warm_from_the_hand_reads_too_little_until_it_has_cooled() -> None:
+    w = world("bar_thermal", strength=5.0, tau_s=600.0)
+    w.advance(4000.0)  # how long the machine has been on does not matter
+    began = hung_in(w)
+    for wait_s in (0.0, 300.0, 1200.0):
+        w.advance(w.time_s + wait_s)
+        since = w.time_s + 0.05 - began
+        assert bar_um(w) == pytest.approx(-11.5e-6 * 1e5 * 5.0 * np.exp(-since / 600.0), abs=2e-3)
+
+
+def test_every_bar_that_is_hung_in_comes_from_the_hand_and_one_left_in_goes_on_cooling() -> None:
+    w = world("bar_thermal", strength=5.0, tau_s=600.0)
+    hung_in(w)
+    w.advance(w.time_s + 3000.0)
+    cool = bar_um(w)
+    assert abs(cool) < 0.05
+    assert w.ballbar.take_out()
+    go(w, (400.0, 250.0, 225.0))
+    assert w.ballbar.change(100.0, w.time_s)
+    assert bar_um(w) == pytest.approx(-5.75, abs=0.01)
+    hung_in(w)
+    assert bar_um(w) == pytest.approx(-5.75 * np.exp(-30.0 / 600.0), abs=0.01)
+
+
+def test_a_bent_hand_is_not_alike_every_time_and_nothing_else_warms_a_bar() -> None:
+    secret = {"name": "bar_thermal", "wild": 7, "parameters": {"strength": 5.0, "tau_s": 600.0}}
+    w = World(from_dict({"seed": 4, "magnitudes": QUIET, "hidden": secret}))
+    shown = []
+    for _ in range(3):
+        hung_in(w)
+        shown.append(bar_um(w))
+    assert max(shown) - min(shown) > 0.1
+    assert all(-7.5 < one < -4.0 for one in shown)
+    for other in (world(), world("laser_cosine", strength=4.0)):
+        hung_in(other)
+        assert bar_um(other) == pytest.approx(0.0, abs=1e-3)
+
+
 def test_the_truth_opens() -> None:
     told = truth(from_dict({"hidden": {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 4.0}}}), None, 2)
     assert told["hidden"] == {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 4.0}, "wild": 0}
@@ -123,20 +178,29 @@ def test_packaged_scenarios_hide_something_that_shows(path: Path) -> None:
     for one in (w, plain):
         one.advance(3600.0)
         ends = [go(one, place) for place in ((300.0, 250.0, 225.0), (560.0, 300.0, 300.0), (559.9, 299.9, 299.9))]
-        shown.append([*np.concatenate(ends).tolist(), reading(one, 400.0, 60.0)])
+        hung_in(one)
+        shown.append([*np.concatenate(ends).tolist(), 1e-3 * bar_um(one), reading(one, 400.0, 60.0)])
     assert np.abs(np.subtract(*shown)).max() > 5e-4
 
 
 def test_a_seed_stands_for_a_scenario_and_in_some_nothing_is_hidden() -> None:
-    found = [picked(seed) for seed in range(60)]
+    found = [picked(seed) for seed in range(200)]
     assert {s.hidden.name for s in found} == {load(p).hidden.name for p in packaged()}
-    assert sum(not s.hidden.name for s in found) >= 3
-    assert [s.seed for s in found] == list(range(60))
+    assert sum(not s.hidden.name for s in found) >= 10
+    assert [s.seed for s in found] == list(range(200))
     assert picked(7) == picked(7)
 
 
 def test_there_is_a_scenario_of_every_family() -> None:
-    assert [p.stem.removeprefix("hidden-") for p in PACKAGED] == ["drive", "instrument", "structure", "thermal", "unlisted"]
+    assert [p.stem.removeprefix("hidden-") for p in PACKAGED] == ["cosine", "drive", "instrument", "structure", "thermal", "unlisted"]
+
+
+def test_one_more_scenario_changes_only_the_seeds_that_it_wins() -> None:
+    fewer = [winner(seed, packaged()[1:]) for seed in range(200)]
+    more = [winner(seed, packaged()) for seed in range(200)]
+    new = [b for a, b in zip(fewer, more, strict=True) if a != b]
+    assert set(new) == {packaged()[0]}
+    assert 10 < len(new) < 60
 
 
 @pytest.mark.parametrize(
@@ -147,6 +211,7 @@ def test_there_is_a_scenario_of_every_family() -> None:
         ({"name": "lateral_play", "key": "EYX"}, "needs strength"),
         ({"name": "lateral_play", "key": "Q", "parameters": {"strength": 3.0}}, "'Q' is no key of lateral_play"),
         ({"name": "lateral_play", "parameters": {"strength": "much"}}, "hidden.parameters"),
+        ({"name": "bar_thermal", "parameters": {"strength": 3.0}}, "needs tau_s"),
         ({"nome": "backlash"}, "unknown key: hidden.nome"),
     ],
 )

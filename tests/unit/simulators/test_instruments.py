@@ -25,7 +25,7 @@ def read_bar(world: World, seconds: float = 0.1):
 
 def test_bar_of_a_perfect_machine_reads_zero_on_the_sphere(quiet_world) -> None:
     world = quiet_world()
-    world.ballbar.mount(100.0, world.tool_position())
+    world.ballbar.mount(100.0, world.tool_position(), world.time_s)
     go(world, (300 + 60, 250 + 80, 225))
     assert np.abs(read_bar(world).reading_nm).max() == 0
     go(world, (300, 250 + 100.5, 225))
@@ -37,7 +37,7 @@ def test_bar_reads_length_error_cup_and_noise(quiet_world) -> None:
     readings = []
     for _ in range(2):
         go(world, (300, 250, 225))
-        world.ballbar.mount(100.0, world.tool_position())
+        world.ballbar.mount(100.0, world.tool_position(), world.time_s)
         for direction in np.vstack([np.eye(3), -np.eye(3)]):
             go(world, np.array([300, 250, 225]) + 100.0 * direction)
             readings.append(read_bar(world, 20.0).reading_nm / 1000.0)
@@ -52,7 +52,7 @@ def test_bar_reads_length_error_cup_and_noise(quiet_world) -> None:
 
 def test_bar_beyond_its_stroke_and_no_bar(quiet_world) -> None:
     world = quiet_world()
-    world.ballbar.mount(100.0, world.tool_position())
+    world.ballbar.mount(100.0, world.tool_position(), world.time_s)
     go(world, (300 + 102, 250, 225))
     out = read_bar(world)
     assert set(out.status.tolist()) == {1}
@@ -65,7 +65,7 @@ def test_bar_beyond_its_stroke_and_no_bar(quiet_world) -> None:
 
 def test_sync_level_aligns_samples_with_the_path(quiet_world) -> None:
     world = quiet_world()
-    world.ballbar.mount(100.0, world.tool_position())
+    world.ballbar.mount(100.0, world.tool_position(), world.time_s)
     go(world, (400, 250, 225))
     world.ballbar.start(1000, world.time_s)
     world.advance(world.time_s + 0.0503)
@@ -90,7 +90,7 @@ def test_sync_level_aligns_samples_with_the_path(quiet_world) -> None:
 def test_readings_do_not_depend_on_how_time_is_cut() -> None:
     def run(cuts: np.ndarray) -> tuple[list[int], list[int]]:
         world = World(Scenario(seed=9))
-        world.ballbar.mount(100.0, world.tool_position())
+        world.ballbar.mount(100.0, world.tool_position(), world.time_s)
         world.ballbar.start(500, 0.0)
         world.controller.move(np.array([300.5, 250.4, 225.3]), 50.0)
         readings: list[int] = []

@@ -32,7 +32,7 @@ def go(world: World, target) -> np.ndarray:
 
 def test_a_pushed_one_axis_image_moves_the_reading_by_what_it_says(quiet_world) -> None:
     world = quiet_world()
-    world.ballbar.mount(100.0, world.tool_position())
+    world.ballbar.mount(100.0, world.tool_position(), world.time_s)
     go(world, (400, 250, 225))
     world.ballbar.start(100, world.time_s)
     world.advance(world.time_s + 0.05)
@@ -87,7 +87,7 @@ def test_drift_grows_exponentially(quiet_world) -> None:
 
 def test_added_scale_acts_from_now_on(quiet_world) -> None:
     world = quiet_world()
-    world.ballbar.mount(100.0, world.tool_position())
+    world.ballbar.mount(100.0, world.tool_position(), world.time_s)
     go(world, (400, 250, 225))
     world.ballbar.start(100, world.time_s)
     world.advance(world.time_s + 0.05)
@@ -108,7 +108,7 @@ def test_time_does_not_run_backwards(quiet_world) -> None:
 def story(scenario: Scenario) -> list[int]:
     """Bar and laser readings of a short measurement."""
     world = World(scenario)
-    world.ballbar.mount(100.0, world.tool_position())
+    world.ballbar.mount(100.0, world.tool_position(), world.time_s)
     go(world, (400, 250, 225))
     world.ballbar.start(100, world.time_s)
     angle = np.linspace(0, 6, 500)[1:]
@@ -158,7 +158,7 @@ def test_every_mount_draws_anew_within_the_stated_sizes() -> None:
     here = world.tool_position()
     cups, tilts, beams = [], [], []
     for _ in range(400):
-        world.ballbar.mount(100.0, here)
+        world.ballbar.mount(100.0, here, world.time_s)
         assert world.ballbar._cup_mm is not None
         cups.append(world.ballbar._cup_mm - here)
         world.laser.mount(np.array([0.0, 0.6, 0.8]), here)
