@@ -39,8 +39,19 @@ def case_of(campaign: dict[str, Any], machine: Machine, runs: list[dict[str, Any
         "laser": float((instruments.get("laser") or {}).get("resolution_mm") or RESOLUTION_MM["laser"]),
     }
     includes = (campaign.get("current_model") or {}).get("includes", ASSUMED_MODEL)
-    found = tuple(_run(run, machine, vertical, dead) for run in runs)
+    found = tuple(_run(run, machine, vertical, dead) for run in _set_once(runs))
     return Case(str(campaign["campaign"]), machine, frozenset(includes), found, resolution)
+
+
+def _set_once(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Runs of one set-up with its earliest ``t_set_s``: nothing was mounted between them, so a later one is only when that run began."""
+    earliest: dict[str, float] = {}
+    for run in runs:
+        setup = run["setup"]
+        if setup.get("t_set_s") is not None:
+            earliest[setup["setup_id"]] = min(float(setup["t_set_s"]), earliest.get(setup["setup_id"], np.inf))
+    times = [earliest.get(run["setup"]["setup_id"]) for run in runs]
+    return [run if t is None else run | {"setup": run["setup"] | {"t_set_s": t}} for run, t in zip(runs, times, strict=True)]
 
 
 def _run(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: float) -> CaseRun:

@@ -4,6 +4,7 @@ Start document: ``setup`` and ``machine`` of the exchange format, ``ctrl0_us`` (
 ball-bar runs ``path`` {``feed_mm_min``, ``direction``, ``points_mm``} and ``rate_hz``. ``points_mm`` begins where the machine stands when
 the path starts. End document of a ball-bar run: ``path_start_us``, ``path_end_us`` (controller time). For a run without end document the
 path's start is taken from the start document: ``path_start_us``, else ``clock.ctrl_us``, else the setup's ``t_set_s``.
+``mounted_us`` of the end document is when cup or laser were mounted (controller time); the start document is written before.
 """
 
 from __future__ import annotations
@@ -78,13 +79,21 @@ def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
     document: Doc = {"format": FORMAT, "campaign": record.campaign, "run_id": record.label, "test": record.test, "role": record.role}
     try:
         columns = _measured(record, chunks)
-        document |= {"machine": record.start_doc["machine"], "setup": record.start_doc["setup"], "columns": columns}
+        document |= {"machine": record.start_doc["machine"], "setup": _setup(record.start_doc, record.end_doc), "columns": columns}
     except (KeyError, TypeError) as err:
         raise StoreError(
             f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
         ) from None
     # which compensation table was active: a solution is only meaningful together with it, so it travels with the run
     return document | ({"table": record.start_doc["table"]} if "table" in record.start_doc else {})
+
+
+def _setup(start: Doc, end: Doc | None) -> Doc:
+    """The set-up with the instant at which it was mounted."""
+    setup: Doc = start["setup"]
+    if not end or "mounted_us" not in end:
+        return setup
+    return setup | {"t_set_s": (end["mounted_us"] - start["ctrl0_us"]) * 1e-6}
 
 
 def pack_columns(columns: Doc) -> list[dict[str, Any]]:

@@ -68,7 +68,9 @@ class Runner:
         self._s = session
 
     async def run(self, plan: TestPlan, recorder: Recorder, tick: Tick) -> dict[str, int]:
-        """Execute a test; returns what the end document needs (path start and end in controller time, for ball-bar runs).
+        """Execute a test; returns what the end document needs, in controller time.
+
+        ``mounted_us``: when a cup or a laser was mounted, if this test mounts one; ``path_start_us``, ``path_end_us``: of a ball-bar run.
 
         Raises
         ------
@@ -96,12 +98,14 @@ class Runner:
                 await self._move(target, feed, here)
             case MountBar(radius):
                 await self._s.need_fixture().mount_ballbar(radius)
+                return await self._mounted()
             case TakeBarOut():
                 await self._s.need_fixture().take_out_ballbar()
             case ChangeBar(radius):
                 await self._s.need_fixture().change_ballbar(radius)
             case MountLaser(beam):
                 await self._s.need_fixture().mount_laser(beam)
+                return await self._mounted()
             case Unmount():
                 await self._s.need_fixture().unmount()
             case ZeroLaser():
@@ -114,6 +118,10 @@ class Runner:
             case RecordPath():
                 return await self._record_path(step, recorder)
         return {}
+
+    async def _mounted(self) -> dict[str, int]:
+        """Whoever mounts takes minutes: the clock is asked when it is done, not when the test began."""
+        return {"mounted_us": (await self._s.controller.status()).ctrl_us}
 
     async def _move(self, target: Point, feed_mm_min: float, here: Point | None) -> None:
         seconds = 60.0 if here is None else math.dist(here, target) / feed_mm_min * 60.0

@@ -87,6 +87,11 @@ class TestPlan:
     setup: dict[str, Any] = field(hash=False)
     steps: tuple[Step, ...]
 
+    @property
+    def mounts(self) -> bool:
+        """Whether it begins a set-up; else it uses what an earlier test has mounted."""
+        return any(isinstance(step, MountBar | MountLaser) for step in self.steps)
+
 
 @dataclass(frozen=True, slots=True)
 class CampaignPlan:

@@ -49,6 +49,15 @@ class Meter:
         self.sink(Progress(self.stage, done_s, self.total_s, eta, message))
 
 
+@dataclass
+class OpenCampaign:
+    """A campaign that is being measured: number in the store, clock zero and when each set-up was mounted (controller time, us)."""
+
+    id: int
+    ctrl0_us: int
+    mounted_us: dict[str, int] = field(default_factory=dict)
+
+
 async def start_campaign(session: Session, store: Store, site: Site, name: str, more: dict[str, Any] | None = None) -> tuple[int, int]:
     """A new campaign in the store and its clock zero (controller time, us). ``more``: what else its document shall say."""
     machine_id = await store.write(store.add_machine, site.name, site.doc)
@@ -94,14 +103,14 @@ async def measure(
     dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     campaign = campaign or await start_campaign(session, store, site, plan.name)
     meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock)
-    run_ids = []
+    run_ids, under_way = [], OpenCampaign(*campaign)
     for test, expected in zip(plan.tests, dry, strict=True):
         base = meter.done_s
 
         def tick(seconds: float, waited_s: float, base: float = base, label: str = test.label) -> None:
             meter.at(base + seconds, label, waited_s)
 
-        run_ids.append(await measure_test(session, store, site, campaign, test, tick, clock))
+        run_ids.append(await measure_test(session, store, site, under_way, test, tick, clock))
         meter.done_s = base + expected.duration_s
         meter.at(meter.done_s, test.label)
     return run_ids
@@ -111,21 +120,22 @@ async def measure_test(
     session: Session,
     store: Store,
     site: Site,
-    campaign: tuple[int, int],
+    campaign: OpenCampaign,
     test: TestPlan,
     tick: Tick,
     clock: Clock,
 ) -> int:
     """One test as one run; whatever ends it early is written into the run before it is raised again."""
-    campaign_id, ctrl0_us = campaign
-    doc = await _start_doc(session, site, ctrl0_us, test, clock)
-    run_id = await store.write(store.start_run, campaign_id, test.label, test.test, test.role, doc)
+    doc = await _start_doc(session, site, campaign, test, clock)
+    run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, doc)
     status, reason, end = "aborted", "stopped", dict[str, Any]()
     gaps: list[dict[str, int]] = []
     try:
         async with recording(store, run_id) as recorder:
             gaps = recorder.gaps
             end = dict(await Runner(session).run(test, recorder, tick))
+        if "mounted_us" in end:
+            campaign.mounted_us[test.setup["setup_id"]] = end["mounted_us"]
         status, reason = "complete", ""
     except (AbbeError, DriverError) as error:
         status, reason = "failed", f"{error.code}: {error}"
@@ -142,11 +152,15 @@ async def measure_test(
     return run_id
 
 
-async def _start_doc(session: Session, site: Site, ctrl0_us: int, test: TestPlan, clock: Clock) -> dict[str, Any]:
+async def _start_doc(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:
+    """What is known before the first step. A test that mounts is taken to mount now; the end document knows better (`mounted_us`)."""
     status = await session.controller.status()
     comp = await session.controller.comp_status()
+    ctrl0_us, set_us = campaign.ctrl0_us, status.ctrl_us
+    if not test.mounts:
+        set_us = campaign.mounted_us.get(test.setup["setup_id"], set_us)
     doc: dict[str, Any] = {
-        "setup": test.setup | {"t_set_s": (status.ctrl_us - ctrl0_us) * 1e-6},
+        "setup": test.setup | {"t_set_s": (set_us - ctrl0_us) * 1e-6},
         "machine": site.doc,
         "ctrl0_us": ctrl0_us,
         "table": {"bank": comp.active_bank, "crc": comp.bank_crc[comp.active_bank], "gen": comp.gen},

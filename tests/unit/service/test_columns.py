@@ -181,3 +181,11 @@ def test_documents_of_strangers_give_one_error(store: Store, campaign_id: int) -
     store.append_chunk(run_id, "bar", 0, 1, "bar/9", b"", 0.0, 0.0, 0, 0)
     with pytest.raises(StoreError, match="unknown codec 'bar/9'"):
         load_run(store, run_id)
+
+
+def test_a_set_up_was_mounted_when_the_end_document_says(store: Store) -> None:
+    campaign = store.add_campaign(store.add_machine("m", MACHINE), "c", {})
+    run = stored(store, campaign, stream(), END | {"mounted_us": 7_250_000})
+    assert run["setup"] == {"setup_id": "A", "t_set_s": 2.25}
+    other = store.add_campaign(store.add_machine("m", MACHINE), "d", {})
+    assert stored(store, other, stream(), END)["setup"]["t_set_s"] == 3.5  # it was mounted before, or nobody noted it

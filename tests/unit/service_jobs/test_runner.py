@@ -11,11 +11,12 @@ from service.devices.session import Session
 from service.errors import MeasurementFault
 from service.sequences.guard import UNDELIVERED, motion_guard, warnings_of
 from service.sequences.runner import DRIVES, PATH, REFERENCED, REMOTE, Runner
-from service.sequences.steps import MountBar, RecordPath, TestPlan, Unmount
-from service.workflows.measure import Meter, measure_test
+from service.sequences.steps import MountBar, MountLaser, RecordPath, TestPlan, Unmount
+from service.workflows.measure import Meter, OpenCampaign, measure_test
 
 READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
-PLAN = TestPlan("h", "ballbar_helix", "identify", {}, (RecordPath(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 100.0, 100, 1), Unmount()))
+RUNS_ON = RecordPath(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 100.0, 100, 1)
+PLAN = TestPlan("h", "ballbar_helix", "identify", {"setup_id": "H"}, (RUNS_ON, Unmount()))
 
 
 class FakeController:
@@ -174,5 +175,51 @@ async def test_a_run_keeps_the_reason_why_it_ended(monkeypatch, error, ended):
     store, clock = FakeStore(), SimpleNamespace(utc=lambda: SimpleNamespace(isoformat=lambda: "now"), monotonic_s=lambda: 1.0)
     store.append_chunk = None
     with pytest.raises(type(error)):
-        await measure_test(session([]), store, SimpleNamespace(doc={}), (1, 0), PLAN, lambda *_: None, clock)
+        await measure_test(session([]), store, SimpleNamespace(doc={}), OpenCampaign(1, 0), PLAN, lambda *_: None, clock)
     assert store.ended == ended
+
+
+class PatientController(FakeController):
+    """A clock that a person's work moves on: every status is a minute later than the last."""
+
+    def __init__(self, events: list[str]) -> None:
+        super().__init__(events)
+        self.now_us = 0
+
+    async def status(self):
+        self.now_us += 60_000_000
+        return SimpleNamespace(bits=READY, ctrl_us=self.now_us)
+
+
+class KeepingStore(FakeStore):
+    """Keeps what was written about every run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.starts: list[dict] = []
+        self.ends: list[dict] = []
+
+    def start_run(self, *args):
+        self.starts.append(args[-1])
+        return len(self.starts)
+
+    def finish_run(self, _, status, reason, doc):
+        self.ends.append(doc)
+
+
+async def test_a_set_up_begins_when_it_is_mounted_and_all_its_runs_say_so():
+    devices = Session(PatientController([]), MuteBar([]), None, Fixture([]))
+    store = KeepingStore()
+    store.append_chunk = None
+    clock = SimpleNamespace(utc=lambda: SimpleNamespace(isoformat=lambda: "now"), monotonic_s=lambda: 1.0)
+    ways = [("first", (MountBar(150.0),)), ("second", ()), ("third", (Unmount(),))]
+    campaign = OpenCampaign(1, 30_000_000)
+    for label, steps in ways:
+        plan = TestPlan(label, "ballbar_helix", "identify", {"setup_id": "A"}, steps)
+        assert plan.mounts == (label == "first")
+        await measure_test(devices, store, SimpleNamespace(doc={}), campaign, plan, lambda *_: None, clock)
+    assert campaign.mounted_us == {"A": 180_000_000}  # asked for the start document, for the interlocks, and when it was done
+    assert store.ends[0]["mounted_us"] == 180_000_000
+    assert [doc["setup"]["t_set_s"] for doc in store.starts] == [30.0, 150.0, 150.0]
+    assert all("mounted_us" not in end for end in store.ends[1:])
+    assert TestPlan("l", "laser_linear", "identify", {}, (MountLaser((1.0, 0.0, 0.0)),)).mounts
