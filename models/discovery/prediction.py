@@ -162,3 +162,34 @@ def left_over(run: CaseRun, predicted_mm: F1, seen: set[str]) -> F1:
     if free.shape[1]:
         gap = gap - free @ np.linalg.lstsq(free, gap, rcond=None)[0]
     return np.asarray(np.where(run.valid, gap, np.nan))
+
+
+def left_together(runs: Sequence[CaseRun], predicted_mm: Mapping[str, F1], seen: set[str]) -> dict[str, F1]:
+    """As `left_over` for several runs, by label; ball-bar runs that share a set-up of their own have one cup and one length of each bar."""
+    groups: dict[str, list[CaseRun]] = {}
+    for run in runs:
+        own_cup = run.path.kind == "bar" and run.path.setup not in seen
+        groups.setdefault(f"set-up {run.path.setup}" if own_cup else f"run {run.path.label}", []).append(run)
+    out: dict[str, F1] = {}
+    for group in groups.values():
+        if len(group) == 1:
+            label = group[0].path.label
+            out[label] = left_over(group[0], predicted_mm[label], seen)
+        else:
+            out |= _left_of_cup(group, predicted_mm)
+    return out
+
+
+def _left_of_cup(group: list[CaseRun], predicted_mm: Mapping[str, F1]) -> dict[str, F1]:
+    """What runs about one cup leave once it stands where all of them together want it, and every bar is as long as its runs want."""
+    bars = sorted({r.path.radius_mm for r in group})
+    rows, gaps = [], []
+    for run in group:
+        assert run.deviation_mm is not None
+        length = np.array([float(run.path.radius_mm == bar) for bar in bars])
+        rows.append(np.column_stack([run.path.look, np.tile(length, (run.path.n, 1))]) * run.valid[:, None])
+        gaps.append(np.where(run.valid, run.deviation_mm, 0.0) - np.where(run.valid, predicted_mm[run.path.label], 0.0))
+    free, gap = np.concatenate(rows), np.concatenate(gaps)
+    left = gap - free @ np.linalg.lstsq(free, gap, rcond=None)[0]
+    parts = np.split(left, np.cumsum([r.path.n for r in group])[:-1])
+    return {r.path.label: np.asarray(np.where(r.valid, part, np.nan)) for r, part in zip(group, parts, strict=True)}

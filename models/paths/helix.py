@@ -9,6 +9,8 @@ import numpy as np
 from models.arrays import F1, F2
 
 Law = Literal["angle", "area"]
+FINER, GROWS = 8, 0.2
+"""The way along a curve is added up in pieces this much shorter than the distances of its points; these differ so much from their mean."""
 
 
 def helix_points(
@@ -48,15 +50,37 @@ def helix_points(
         raise ValueError(f"helix: axis {axis} must be 0, 1 or 2")
     if np.shape(centre_mm) != (3,) or not np.isfinite(centre_mm).all():
         raise ValueError(f"helix: the centre must be three finite numbers, got {centre_mm!r}")
-    k = np.linspace(0.0, 1.0, n)
-    phi = span_rad * k if law == "angle" else np.arccos(1.0 - k * (1.0 - np.cos(span_rad)))
-    theta = 2 * np.pi * turns * k
+    return np.asarray(centre_mm) + radius_mm * _unit(np.linspace(0.0, 1.0, n), turns, law, axis, span_rad)
+
+
+def even_helix_points(centre_mm: F1, radius_mm: float, *, turns: float, n: int, law: Law = "area", axis: int = 2) -> F2:
+    """Points of the same curve at almost equal distances along it, growing from 0.8 to 1.2 of their mean.
+
+    By the area law itself, points lie several times as far apart at the pole as elsewhere. All of one distance, driven at one feed, they
+    would be passed with one frequency, like a vibration.
+
+    Parameters, result, errors: as `helix_points`, for the full hemisphere.
+    """
+    fine = np.linspace(0.0, 1.0, FINER * n) ** 2  # the area law leaves the pole like a square root
+    curve = _unit(fine, turns, law, axis, 0.5 * np.pi)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    ends = helix_points(centre_mm, radius_mm, turns=turns, n=2, law=law, axis=axis)
+    even = np.linspace(0.0, 1.0, n)[1:-1]
+    between = np.interp(along[-1] * even * (1.0 - GROWS + GROWS * even), along, fine)
+    inner = np.asarray(centre_mm) + radius_mm * _unit(between, turns, law, axis, 0.5 * np.pi)
+    return np.concatenate([ends[:1], inner, ends[1:]])
+
+
+def _unit(share: F1, turns: float, law: Law, axis: int, span_rad: float) -> F2:
+    """Where a helix of radius 1 about the origin is at shares 0..1 of its turns, shape (n, 3)."""
+    phi = span_rad * share if law == "angle" else np.arccos(1.0 - share * (1.0 - np.cos(span_rad)))
+    theta = 2 * np.pi * turns * share
     a, b = (0, 2) if axis == 1 else ((axis + 1) % 3, (axis + 2) % 3)
-    out = np.empty((n, 3))
+    out = np.empty((len(share), 3))
     out[:, axis] = np.cos(phi)
     out[:, a] = np.sin(phi) * np.cos(theta)
     out[:, b] = np.sin(phi) * np.sin(theta)
-    return np.asarray(centre_mm) + radius_mm * out
+    return out
 
 
 def helix_points_likely_code(centre_mm: F1, radius_mm: float, *, turns: float) -> F2:

@@ -41,10 +41,15 @@ def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identif
 
 def verification(machine: Machine, *, rate_hz: int = 100, name: str = "verify", role: str = "holdout") -> CampaignPlan:
     """One helix (another centre and radius than any used to identify) and the four plain body diagonals."""
-    centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
-    recipes: list[Recipe] = [Helix("check-helix", "VB", role, centre, radius, turns=4, rate_hz=rate_hz)]
+    recipes: list[Recipe] = [verification_helix(machine, rate_hz=rate_hz, role=role)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", role, d, 20, "") for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
+
+
+def verification_helix(machine: Machine, *, rate_hz: int = 100, role: str = "holdout") -> Helix:
+    """The helix of the verification."""
+    centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
+    return Helix("check-helix", "VB", role, centre, radius, turns=4, rate_hz=rate_hz)
 
 
 def quick_check(machine: Machine, *, rate_hz: int = 100, name: str = "quick-check") -> CampaignPlan:

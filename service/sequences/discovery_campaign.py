@@ -7,13 +7,18 @@ from typing import Literal
 
 from models.machine import AXES, Machine
 from models.paths.lines import DIAGONALS
-from service.sequences.campaigns import hemisphere
+from service.sequences.campaigns import hemisphere, verification, verification_helix
 from service.sequences.recipes import Diagonal, Helix, Linear, Recipe
 from service.sequences.steps import CampaignPlan
 
 SLOW, MIDDLE, FAST = 1000.0, 2000.0, 3000.0
 STEPS, LINE_N = 12, 13
 JUDGED = "pnp"
+BACK = "check-back"
+CHORD_MM = 0.5
+"""A sample is placed on its path to half a sampling period, 0.3 mm at 50 Hz and 2000 mm/min. By the area law the usual chords are 1 mm long
+at the equator and 3 mm at the pole, and run 0.9 and 10 um inside the sphere: readings put beside their place scatter there, and a clean
+machine seems to be disturbed. Even chords of 0.4 mm are 0.24 um inside at most."""
 ROUND: tuple[Literal[1, -1], ...] = (1, -1)
 
 
@@ -39,6 +44,18 @@ def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "dis
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
 
 
+def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew") -> CampaignPlan:
+    """The verification, its helix run back as well, slowly and with the bar left in: what changes while a bar hangs shows between the two.
+
+    One helix alone takes a bar that is warm all the time for a longer one.
+    """
+    plan = verification(machine, rate_hz=rate_hz, name=name)
+    check = replace(verification_helix(machine, rate_hz=rate_hz), chord_mm=CHORD_MM, even=True)
+    there = replace(check, unmount=False)
+    back = replace(check, label=BACK, feed_mm_min=SLOW, direction=-1, mount=False)
+    return CampaignPlan(name, (there.plan(machine), back.plan(machine), *plan.tests[1:]))
+
+
 def _lines(machine: Machine, when: str) -> list[Recipe]:
     """Every axis alone: what grows with the session shows in its length, whatever the squareness does."""
     return [Linear(f"{when}-line{AXES[a]}", f"{when}{AXES[a]}", "identify", a, n=LINE_N, at=0.5) for a in range(len(machine.stroke_mm))]
@@ -46,7 +63,7 @@ def _lines(machine: Machine, when: str) -> list[Recipe]:
 
 def _helix(machine: Machine, setup: str, rel: tuple[float, float, float], share: float, rate_hz: int) -> Helix:
     centre, radius = hemisphere(machine, rel, share)
-    return Helix("", setup, "identify", centre, radius, turns=4, rate_hz=rate_hz)
+    return Helix("", setup, "identify", centre, radius, turns=4, rate_hz=rate_hz, chord_mm=CHORD_MM, even=True)
 
 
 def _series(like: Helix, name: str, ways: list[tuple[float, Literal[1, -1], str]]) -> list[Recipe]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.machine import Machine
-from models.paths.helix import Law, helix_points
+from models.paths.helix import Law, even_helix_points, helix_points
 from models.paths.lines import diagonal_ends, step_diagonal, straight_line
 from service.errors import ConfigError
 from service.sequences.steps import (
@@ -55,7 +55,8 @@ class Helix:
 
     ``chord_mm`` is the wanted mean distance of the path's points; a long path gets longer chords, so that the controller can hold it. The
     polyline then runs chord^2 / (8 radius) inside the sphere, and by the area law radius / (4 n) beside the pole: with 750 mm, 1.3 and
-    23 um. That costs no accuracy: columns and solvers take the commanded position on the polyline, not on the sphere.
+    23 um. Columns and solvers take the commanded position on the polyline, not on the sphere: that costs accuracy only
+    where a sample's place on the path is uncertain by a part of a chord. ``even``: points almost equally far apart along the same curve.
     ``mount`` and ``unmount`` are false where two helices in a row share one set-up: the second does not mount, the first leaves the bar.
     ``change_bar``: the second has another radius; the cup stays, the bar is taken out before the machine moves and the other one is hung in
     where its path starts. ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
@@ -80,6 +81,7 @@ class Helix:
     opens: Literal[1, -1] = 1
     length_calibrated: bool = True
     u_length_mm: float = 0.002
+    even: bool = False
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: to the centre, mount, out to the path's start, record the path, clear away.
@@ -96,7 +98,8 @@ class Helix:
             )
         length = 2 * np.pi * self.radius_mm * self.turns
         n = min(max(64, int(length / self.chord_mm)), MAX_PATH_POINTS)
-        points = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=n, law=self.law, axis=self.axis)
+        draw = even_helix_points if self.even else helix_points
+        points = draw(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=n, law=self.law, axis=self.axis)
         if self.opens < 0:  # seen in a mirror across the equator
             points[:, self.axis] = 2.0 * self.centre_mm[self.axis] - points[:, self.axis]
         pole = as_point(points[0])

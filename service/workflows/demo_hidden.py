@@ -15,8 +15,7 @@ from service.clock import Clock, SystemClock
 from service.devices.session import Session, open_session
 from service.errors import NotObservable, TableRefused
 from service.events import Progress, ProgressSink
-from service.sequences.campaigns import verification
-from service.sequences.discovery_campaign import discovery_campaign
+from service.sequences.discovery_campaign import BACK, discovery_campaign, new_measurement
 from service.site import Site
 from service.storage.store import Store
 from service.workflows.campaign_folder import from_store
@@ -107,7 +106,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
     journal = await asyncio.to_thread(journal_of, store, job)
     result.job, result.journal = job, journal
     result.finding = await _searched(job, journal, progress)
-    ids = await measure(session, store, site, verification(site.machine, rate_hz=rate, name=ANEW), progress=progress)
+    ids = await measure(session, store, site, new_measurement(site.machine, rate_hz=rate, name=ANEW), progress=progress)
     progress(Progress("prediction", 0.0, 1.0, None, "the new measurement against what the model says"))
     new = await asyncio.to_thread(from_store, store, ANEW)
     model = current(store, site.name)
@@ -115,7 +114,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
     if not tables or model is None:
         return
     try:
-        before = await load_runs(store, ids)
+        before = [run for run in await load_runs(store, ids) if run["run_id"] != BACK]  # the verification, as tables are judged
         result.correction = await correct(session, store, site, CAMPAIGN, before, rate_hz=rate, progress=progress)
     except (TableRefused, NotObservable) as error:
         result.refused = str(error)

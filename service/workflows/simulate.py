@@ -10,7 +10,7 @@ import numpy as np
 from models.arrays import F1
 from models.discovery.baseline import baseline_of
 from models.discovery.case import CaseRun, Role
-from models.discovery.prediction import left_over, predictions, solve
+from models.discovery.prediction import left_together, predictions, solve
 from models.discovery.scene import scene_of
 from service.workflows.discover import Job
 from service.workflows.discovery_doc import noise_mm_of
@@ -26,8 +26,9 @@ AGREE = 1.1
 class Simulation:
     """Readings of every run as the present model has them, and what measurement leaves of them.
 
-    ``predicted_mm``: by run, sealed runs too; ``left_mm``: reading less prediction once the run has set what is its own (the zero of a
-    laser, the cup of a set-up that no fitted run shares), NaN where the instrument flagged it; ``noise_mm``: of one reading, by instrument.
+    ``predicted_mm``: by run, sealed runs too; ``left_mm``: reading less prediction once the runs have set what is their own (the zero of a
+    laser run, cup and bar length of a set-up that no fitted run shares), NaN where the instrument flagged it; ``noise_mm``: of one reading,
+    by instrument.
     """
 
     predicted_mm: dict[str, F1]
@@ -40,7 +41,7 @@ def simulate(job: Job) -> Simulation:
     scene = scene_of(job.case, baseline_of(job.case))
     predicted = predictions(scene, solve(scene, ()))
     seen = {r.path.setup for r in scene.runs}
-    left = {r.path.label: left_over(r, predicted[r.path.label], seen) for r in job.case.runs if r.deviation_mm is not None}
+    left = left_together([r for r in job.case.runs if r.deviation_mm is not None], predicted, seen)
     total = {label: p + job.known_mm[label] for label, p in predicted.items()}
     return Simulation(total, left, {kind: c.sd_mm for kind, c in scene.colours.items()})
 

@@ -149,3 +149,16 @@ def test_a_path_the_controller_cannot_hold_is_refused_before_anything_moves():
     points = tuple((x, 0.0, 0.0) for x in np.linspace(0.0, 600.0, MAX_PATH_POINTS + 1))
     with pytest.raises(StrokeError, match="test long: the path has 8193 points, the controller holds 8192"):
         dry_run(MACHINE, TestPlan("long", "ballbar_helix", "identify", {}, (RecordPath(points, 2000.0, 100, 1),)))
+
+
+def test_a_discovery_campaign_s_helices_stay_within_a_quarter_of_a_micrometre_of_their_sphere():
+    from service.sequences.discovery_campaign import BACK, discovery_campaign, new_measurement
+
+    for plan in discovery_campaign(MACHINE).tests:
+        for step in plan.steps:
+            if isinstance(step, RecordPath):
+                chord = np.linalg.norm(np.diff(np.array(step.points_mm), axis=0), axis=1).max()
+                assert chord**2 / (8.0 * plan.setup["radius_mm"]) < 2.5e-4, plan.label
+    there, back = new_measurement(MACHINE).tests[:2]
+    assert (back.label, there.setup, back.mounts) == (BACK, back.setup, False)
+    assert not any(isinstance(step, Unmount) for step in there.steps)
