@@ -107,11 +107,11 @@ class Bench:
     async def _measure_test(self, _session: Any, store: Store, _site: Any, campaign: Any, test: Any, *_rest: Any) -> int:
         number = 5 + len(self.measured)
         self.measured.append(test.label)
-        name = store.campaign(campaign[0]).name
+        name = store.campaign(campaign.id).name
         run = circle(number, "identify", name) | {"run_id": test.label}
         run["setup"] = run["setup"] | {"setup_id": test.label}
         payload = encode_json(pack_columns(run["columns"]))
-        run_id = await store.write(store.start_run, campaign[0], test.label, run["test"], "identify", {"imported": run})
+        run_id = await store.write(store.start_run, campaign.id, test.label, run["test"], "identify", {"imported": run})
         await store.write(store.append_chunk, run_id, "columns", 0, 120, JSON_CODEC, payload, 0.0, 0.0, 0, 0)
         await store.write(store.finish_run, run_id, "complete", "", {})
         return int(run_id)
@@ -229,7 +229,7 @@ def test_a_fault_of_one_run_keeps_the_others(bench: Bench, monkeypatch: pytest.M
     async def fails(_session: Any, store: Store, _site: Any, campaign: Any, test: Any, *rest: Any) -> int:
         if test.label != "n1-late":
             return await bench._measure_test(_session, store, _site, campaign, test, *rest)
-        run_id = await store.write(store.start_run, campaign[0], test.label, test.test, test.role, {})
+        run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, {})
         await store.write(store.finish_run, run_id, "failed", "SEQ-003: the bar fell out", None)
         raise MeasurementFault("the bar fell out")
 
