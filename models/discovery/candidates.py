@@ -86,7 +86,7 @@ def competing(effects: Sequence[Effect], includes: frozenset[str]) -> tuple[Effe
 
 def grid(effect: Effect) -> list[dict[str, float]]:
     """Every combination of the starts of an effect's non-linear parameters."""
-    return [dict(zip((p.name for p in effect.shape), v, strict=True)) for v in product(*(p.starts for p in effect.shape))]
+    return [dict(zip((p.name for p in effect.shape), v, strict=True)) for v in product(*(dict.fromkeys(p.starts) for p in effect.shape))]
 
 
 def starts_of(effects: Sequence[Effect]) -> list[Pick]:

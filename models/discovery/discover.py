@@ -15,12 +15,14 @@ from models.discovery.prediction import predictions, solve
 from models.discovery.rivals import Rival, rivals_of
 from models.discovery.scatter import scattered, without
 from models.discovery.scene import Scene, linearised, quieted, scene_of
-from models.discovery.selection import Contest, Found, selected, weighed
+from models.discovery.selection import Contest, Found, dropped, selected, weighed
 from models.discovery.variance import VarianceFinding
 from models.effects.effect import Effect
 
 Progress = Callable[[str, float], None]
 Search = tuple[Scene, Contest, list[Found], tuple[VarianceFinding, ...]]
+CLEAR = 1.0
+"""A rival takes a name's place when it explains more by this chi-square: as much as a new name has to beat one that is there."""
 ROUNDS = 3
 """The search is repeated with the noise and the simulation that its findings leave, at most this often."""
 
@@ -80,15 +82,21 @@ def fairly(contest: Contest, found: list[Found]) -> tuple[list[Found], list[list
 
     The search compares names before their forms, so that a bent effect may have let the wrong one of two near kin in.
     """
-    rivals: list[list[Rival]] = []
+    changed = False
     for i in range(len(found)):
-        rivals.append([] if found[i].pick.unnamed else rivals_of(contest, found, i))
-        if rivals[i] and rivals[i][0].less < 0.0:
+        rivals = _rivals(contest, found, i)
+        if rivals and rivals[0].less < -CLEAR:
             picks = [f.pick for f in found]
-            picks[i] = rivals[i][0].pick
-            found = weighed(contest, picks)
-            rivals[i] = rivals_of(contest, found, i)
-    return found, rivals
+            picks[i] = rivals[0].pick
+            found, changed = weighed(contest, picks), True
+    if changed:
+        found = sorted(weighed(contest, dropped(contest, [f.pick for f in found])), key=lambda f: -f.score)
+    return found, [_rivals(contest, found, i) for i in range(len(found))]
+
+
+def _rivals(contest: Contest, found: list[Found], i: int) -> list[Rival]:
+    """Of one name; none of a structure without a name."""
+    return [] if found[i].pick.unnamed else rivals_of(contest, found, i)
 
 
 def _labels(found: list[Found], loud: tuple[VarianceFinding, ...]) -> set[str]:

@@ -10,7 +10,7 @@ RESIDUE_SHARE = 0.001
 """A name with less evidence than this share of the largest is nothing that can be told from what the largest one's formula leaves."""
 SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
 """Scatter of readings that move along with the axes: below this share of the strongest effect of the mean, at any axis, it is its rest; a
-smooth effect leaves less that looks like scatter than one with corners or waves."""
+smooth effect leaves less that looks like scatter than one with corners or waves (a true stick-slip lay at 1.0 % of a pitch error)."""
 AXIS_SHARE = 0.02
 AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
 """What a drive shows at the turns of its axis is told from another such effect of the same axis by its form only: below this share it is
@@ -20,8 +20,8 @@ ROUGH = (*AT_TURNS, "cyclic_error")
 KIN_SHARE = 0.03
 CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
 SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
-"""Effects that live on the same clock, or are curves over the same positions: what one's formula leaves, off by a sixth, is shaped like
-another."""
+"""Effects that live on the same clock, or are curves over the same positions: what one's formula leaves, off by a sixth (3 % squared),
+is shaped like another. Counted on 345 cases: ten false names of these kinds at 0.2 to 2.8 % of the strong one, one true one, at 9 %."""
 
 
 def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
@@ -33,10 +33,10 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
     - 1 % of the strongest effect of the mean's, where it is stick-slip or vibration, whatever the axis (0.3 % where that effect is smooth);
     - 2 % of a stronger effect's of the same drive (lost motion, its change along the axis, spikes, play across, servo mismatch: keys that
       end with the same axis);
-    - 3 % of a stronger one's of its kin: what warms up on the same clock, or is a curve over the same positions (and positioning beside
-      thermal growth of the same axis).
+    - 3 % of a stronger one's of its kin: what warms up on the same clock (a bar from the hand too), or is a curve over the same axis or in
+      the same direction (and positioning beside thermal growth of the same axis).
 
-    What is weak but at another axis, or of another instrument (lost beams), stays: it is no form of the strong one.
+    What is weak but of another kind, or shares neither axis nor direction, stays: it is no form of the strong one.
 
     Parameters
     ----------
@@ -63,8 +63,17 @@ def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
     if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
         return AXIS_SHARE
     grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
-    if grown or any(small.name in kin and big.name in kin for kin in (CLOCK, SHAPE)):
+    clock = small.name in CLOCK and big.name in CLOCK
+    if grown or clock or (small.name in SHAPE and big.name in SHAPE and _together(small.key, big.key)):
         return KIN_SHARE
     if small.name in SCATTER and not big_is_scatter:
         return SCATTER_SHARE if big.name in ROUGH else SMOOTH_SHARE
     return RESIDUE_SHARE
+
+
+def _together(a: str, b: str) -> bool:
+    """Whether two error motions (EYX) or axes (X) share the moving axis or the direction that deviates; the ram's sag (no key) with all."""
+    if not a or not b or a[-1] == b[-1]:
+        return True
+    directions = [key[1] for key in (a, b) if len(key) == 3 and key[1] in "XYZ"]
+    return len(directions) == 2 and directions[0] == directions[1]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from models.arrays import F2
 from models.discovery.candidates import Pick, gain_of
 from models.discovery.refine import refined
-from models.discovery.selection import Contest, Found, others
+from models.discovery.selection import FORM_LEAST, Contest, Found, others
 
 EXCLUDED = 12.0
 """A rival that explains less by this much chi-square, after its price, is excluded."""
@@ -55,6 +55,8 @@ def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, 
     for form in pick.effect.forms:
         more = replace(pick, forms=(*pick.forms, form))
         with_form = gain_of(contest.scene, more, rows)
+        if with_form - gain < FORM_LEAST * gain:  # as for the name that won: less would be no matter of form
+            continue
         if with_form - contest.price(more) > score:
             pick, gain, score = more, with_form, with_form - contest.price(more)
     return pick, gain, score

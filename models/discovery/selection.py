@@ -20,7 +20,8 @@ THRESHOLD = 4.0
 """Paid by every new name on top of its parameters and of how many names were tried."""
 UNNAMED_PRICE = 6.0
 VARIANT_PRICE = 4.0
-"""Paid by a name that holds a simpler one beside its own freedom (`models.effects.effect.Effect.variant_of`)."""
+"""Paid by a name that holds a simpler one beside its own freedom (`models.effects.effect.Effect.variant_of`): as much as for being new, for
+it says something new of what the simpler one says already."""
 FORM_LEAST = 0.0002
 """... and explains at least this share of what the effect itself does; less would change its strength more than it is worth."""
 NEARLY = 0.93

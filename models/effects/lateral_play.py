@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from models.arrays import F3
-from models.effects.columns import LATERAL_KEYS, UM, along, axis_of, direction_of, first, of_machine
+from models.effects.columns import LATERAL_KEYS, UM, VISITED, along, axis_of, direction_of, first, of_machine, of_path, share_of_stroke
 from models.effects.effect import Effect, Form, Values
-from models.effects.path import Places
+from models.effects.path import Path, Places
 
 SETTLING_MM = (0.1, 0.5, 3.0)
 
@@ -23,6 +23,14 @@ def _settling(at: Places, key: str, values: Values) -> F3:
     return along(direction_of(key), *(0.5 * UM * at.sign[:, a] * np.exp(-at.since_mm[:, a] / d) for d in SETTLING_MM))
 
 
+def _along_guide(path: Path, at: Places, key: str, values: Values) -> F3:
+    """A guide worn at one end, or in the middle: the jump changes along it."""
+    a = axis_of(key)
+    x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
+    half = 0.5 * UM * at.sign[:, a]
+    return along(direction_of(key), half * x, half * (x**2 - VISITED))
+
+
 EFFECT = Effect(
     name="lateral_play",
     title="lateral play of a carriage",
@@ -34,7 +42,7 @@ EFFECT = Effect(
     shape=(),
     signal=of_machine(jump),
     strength=first,
-    forms=(Form("settling", of_machine(_settling)),),
+    forms=(Form("settling", of_machine(_settling)), Form("along the guide", of_path(_along_guide))),
     needs="runs in both directions",
     signature="a step across the axis where it turns, so a pair of spikes or steps that does not lie on the axis' own ends",
     remedy="mechanics",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from models.arrays import F1, F3
-from models.effects.columns import CAMPAIGN_S, PPM, along, first, of_path, warmth
+from models.effects.columns import CAMPAIGN_S, PPM, VISITED, along, first, of_path, share_of_stroke, warmth
 from models.effects.effect import Effect, Form, Parameter, Values
 from models.effects.path import Path, Places
 
@@ -28,6 +28,14 @@ def _second_time(path: Path, at: Places, key: str, values: Values) -> F3:
     return along(direction, *(travel * (warmth(at.t_s, values["tau_s"] * k) - now) for k in (1.0 / 3.0, 3.0)))
 
 
+def _bent(path: Path, at: Places, key: str, values: Values) -> F3:
+    """The column bends as it leans."""
+    axis, direction, sign = CARRIED[key]
+    low, high = (float(v) for v in path.machine.stroke_mm[axis])
+    bow = share_of_stroke(at.q_mm[:, axis], path.machine.stroke_mm[axis]) ** 2 - VISITED
+    return along(direction, sign * PPM * 0.5 * (high - low) * bow * warmth(at.t_s, values["tau_s"]))
+
+
 EFFECT = Effect(
     name="squareness_thermal",
     title="squareness that drifts as the machine warms up",
@@ -39,7 +47,7 @@ EFFECT = Effect(
     shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "effects.md 3: as the growth of axes", (900.0, 2500.0, 7000.0)),),
     signal=of_path(leaning),
     strength=first,
-    forms=(Form("second time constant", of_path(_second_time)),),
+    forms=(Form("second time constant", of_path(_second_time)), Form("bent", of_path(_bent))),
     needs="an early run repeated late; laser diagonals, to tell it from the growth of one axis",
     signature="an oval at 45 degrees that drifts from run to run",
     remedy="warm up or sensor",

@@ -43,6 +43,10 @@ def effect(label: str, evidence: float) -> NamedEffect:
         ("bar_thermal", "axis_thermal_growth:Y", 0.025, True),
         ("bar_thermal", "axis_thermal_growth:Y", 0.035, False),
         ("nonrigid_bed:EYZ", "straightness:EXZ", 0.01, True),
+        ("nonrigid_bed:EYZ", "nonrigid_bed:EYX", 0.01, True),
+        ("straightness:EYX", "straightness:EXZ", 0.0298, False),  # they share no axis and no direction
+        ("straightness:EYX", "angular_error:EBZ", 0.01, False),
+        ("ram_sag", "angular_error:EBZ", 0.01, True),
         ("axis_thermal_growth:X", "positioning_nonlinear:X", 0.022, True),
         ("axis_thermal_growth:X", "positioning_nonlinear:Y", 0.022, False),
         ("straightness:EYX", "spindle_thermal_drift:Z", 0.022, False),
