@@ -95,35 +95,43 @@ def _live_needs(campaign: str, machine: Path | None) -> None:
 
 def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]]) -> tuple[Job, Journal, dict[str, Any]]:
     """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is done twice."""
+    from datetime import timedelta
+
     from service.clock import SystemClock
     from service.config import load_machine
     from service.site import site_of
-    from service.workflows.discover_live import ROUNDS, added, next_search
+    from service.workflows.discover_live import ROUNDS, added, next_search, rounds
     from service.workflows.discovery_store import StoredJournal
     from service.workflows.next_recipes import next_plan
 
     site = site_of(load_machine(machine).machine)
     job, journal, finding = at
-    for number in range(1, ROUNDS + 1):
+    for _ in range(ROUNDS):
         if finding["next_test"] is None or not isinstance(journal, StoredJournal):
             break
         _print(job, journal, finding)
+        number = rounds(store, job.campaign.name) + 1
         name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
         test = finding["next_test"]
         about = finding["where"] | {"runs": [test["like"]]} if finding["verdict"] == "unknown" and test.get("like") else None
         wanted = next_plan(test["adds"], site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
         if wanted.plan is None:
-            typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe can run on this machine")
+            typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe runs on this machine by itself")
             break
-        what = added(store, job.campaign, wanted.plan)
-        _measured(store, site, job.campaign, what)
+        what = added(store, job.campaign, wanted.plan, wanted.after_s)
+        wait_s = _measured(store, site, job.campaign, what)
+        if wait_s > 0.0:
+            start = SystemClock().utc() + timedelta(seconds=wait_s + 1.0)
+            what_for = ", ".join(test["adds"])
+            typer.echo(f"too early for {what_for}: give the same command at {start:%H:%M:%S} UTC or later; nothing has moved")
+            break
         job, journal = next_search(store, job, journal, what.plan.name)
         finding = _searched(job, journal)
     return job, journal, finding
 
 
-def _measured(store: Store, site: Site, campaign: Campaign, what: Added) -> None:
-    """What is left of an added measurement, run on the machine; stopped, it says what is kept."""
+def _measured(store: Store, site: Site, campaign: Campaign, what: Added) -> float:
+    """What is left of an added measurement, run on the machine; stopped, it says what is kept. Gives the seconds to wait, or 0."""
     from service.cli.measure import ready_session
     from service.cli.progress import display
     from service.cli.running import run_job
@@ -133,15 +141,15 @@ def _measured(store: Store, site: Site, campaign: Campaign, what: Added) -> None
         done = len(what.plan.tests) - (0 if what.left is None else len(what.left.tests))
         typer.echo(f"going on with campaign {what.plan.name!r}: {done} of {len(what.plan.tests)} runs are measured")
     if what.left is None:
-        return
+        return 0.0
 
-    async def work() -> None:
+    async def work() -> float:
         with display() as sink:
             async with ready_session(store, site) as session:
-                await measure_added(session, store, site, campaign, what, sink)
+                return await measure_added(session, store, site, campaign, what, sink)
 
     try:
-        run_job(work())
+        return run_job(work())
     except SystemExit:
         typer.echo("stopped: runs that were measured completely are kept; the same command goes on there", err=True)
         raise

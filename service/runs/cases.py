@@ -39,12 +39,15 @@ def case_of(campaign: dict[str, Any], machine: Machine, runs: list[dict[str, Any
         "laser": float((instruments.get("laser") or {}).get("resolution_mm") or RESOLUTION_MM["laser"]),
     }
     includes = (campaign.get("current_model") or {}).get("includes", ASSUMED_MODEL)
-    found = tuple(_run(run, machine, vertical, dead) for run in _set_once(runs))
+    found = tuple(_run(run, machine, vertical, dead) for run in set_once(runs))
     return Case(str(campaign["campaign"]), machine, frozenset(includes), found, resolution)
 
 
-def _set_once(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Runs of one set-up with its earliest ``t_set_s``: nothing was mounted between them, so a later one is only when that run began."""
+def set_once(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Runs of one set-up with its earliest ``t_set_s``: nothing was mounted between them, so a later one is only when that run began.
+
+    To be done with all runs of a campaign, before any is left out: perhaps only the one that is left out knows when it was mounted.
+    """
     earliest: dict[str, float] = {}
     for run in runs:
         setup = run["setup"]

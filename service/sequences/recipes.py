@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machine import Machine
+from models.machine import AXES, Machine
 from models.paths.helix import Law, even_helix_points, helix_points
 from models.paths.lines import diagonal_ends, step_diagonal, straight_line
 from service.errors import ConfigError
@@ -124,6 +124,13 @@ class Helix:
             "length_calibrated": self.length_calibrated,
             "u_length_mm": self.u_length_mm,
             "tool_mm": [float(v) for v in machine.tool_mm],
+            # what it takes to drive the same path again
+            "axis": AXES[self.axis],
+            "opens": self.opens,
+            "law": self.law,
+            "even": self.even,
+            "chord_mm": self.chord_mm,
+            "rate_hz": self.rate_hz,
         }
         return TestPlan(self.label, "ballbar_helix", self.role, setup, tuple(steps))
 
@@ -188,7 +195,7 @@ class Linear:
         start[others] += np.array(self.at) * machine.length_mm[others]
         end = start.copy()
         start[self.axis], end[self.axis] = machine.stroke_mm[self.axis] + np.array([CLEARANCE_MM, -CLEARANCE_MM])
-        setup = {"setup_id": self.setup_id, "axis": "XYZ"[self.axis]}
+        setup = {"setup_id": self.setup_id, "axis": AXES[self.axis]}
         return _laser_plan(self, "laser_linear", setup, straight_line(start, end, self.n), start, end)
 
 

@@ -26,7 +26,7 @@ from service.sequences.steps import (
     ZeroLaser,
 )
 
-ESTOP, DOOR, ALARM, REMOTE, REFERENCED, DRIVES, HOLD, PATH, PROGRAM = 0, 1, 2, 3, 4, 5, 8, 9, 11
+ESTOP, DOOR, ALARM, REMOTE, REFERENCED, DRIVES, MOVING, HOLD, PATH, PROGRAM = 0, 1, 2, 3, 4, 5, 6, 8, 9, 11
 FORBIDDEN = (
     (ESTOP, "e-stop is pressed"),
     (DOOR, "the door is open"),

@@ -8,6 +8,7 @@ from typing import Any
 
 from service.devices.session import DeviceUrls
 from service.errors import CampaignRefused
+from service.runs.cases import set_once
 from service.runs.columns import load_run
 from service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
 from service.site import Site, machine_from_doc
@@ -75,7 +76,7 @@ def from_store(store: Store, name: str) -> Campaign:
 def _campaign(name: str, doc: dict[str, Any], runs: list[dict[str, Any]], folder: Path | None) -> Campaign:
     machine = doc["machine"]
     site = Site(str(machine.get("name") or name), machine_from_doc(machine), machine, DeviceUrls())
-    return Campaign(name, site, runs, folder, doc)
+    return Campaign(name, site, set_once(runs), folder, doc)
 
 
 def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any]:
@@ -123,12 +124,12 @@ def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
 def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: dict[str, int]) -> None:
     """The stored campaign must be of the same machine and hold the same readings with the same set-ups: solutions refer to its runs."""
     differs = None
+    there = {r["run_id"]: r for r in set_once([load_run(store, number) for number in ids.values()])}
     if machine_digest(machine_from_doc(machine)) != machine_digest(campaign.site.machine):
         differs = "the machine (chain, strokes, pivots or tool)"
     for run in campaign.runs:
-        found = ids.get(run["run_id"])
         if differs is None and run["role"] == "identify":
-            stored = None if found is None else load_run(store, found)
+            stored = there.get(run["run_id"])
             if stored is None:
                 differs = f"run {run['run_id']} is missing there"
             elif stored["columns"] != run["columns"]:

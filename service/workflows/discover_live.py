@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 from service.devices.session import Session
 from service.errors import CampaignRefused, UnsafeToMove
 from service.events import ProgressSink
-from service.sequences.steps import CampaignPlan, TestPlan
+from service.sequences.runner import MOVING
+from service.sequences.steps import CampaignPlan, TestPlan, Unmount
 from service.site import Site
 from service.storage.records import RUNNING, CampaignRecord
 from service.storage.store import Store
@@ -34,17 +36,31 @@ class Added:
     """A measurement that goes on with a campaign.
 
     ``plan``: all of it; ``left``: what of it is not measured completely, None where nothing is left; ``begun``: its campaign in the store,
-    None if it was not begun; ``link``: what that campaign's document says of it.
+    None if it was not begun; ``link``: what that campaign's document says of it; ``after_s``: the last reading of the campaign that it goes
+    on with is to be so old when it begins.
     """
 
     plan: CampaignPlan
     left: CampaignPlan | None
     begun: CampaignRecord | None
     link: dict[str, str]
+    after_s: float = 0.0
 
 
-def added(store: Store, campaign: Campaign, plan: CampaignPlan) -> Added:
+def rounds(store: Store, name: str) -> int:
+    """How many additions a campaign stands on, itself counted if it is one: what its runs are labelled by is taken."""
+    before = {c.name: (c.doc.get("continues") or {}).get("campaign") for c in store.campaigns()}
+    chain = [name]
+    while (old := before.get(chain[-1])) is not None and old not in chain:
+        chain.append(old)
+    return len(chain) - 1
+
+
+def added(store: Store, campaign: Campaign, plan: CampaignPlan, after_s: float = 0.0) -> Added:
     """How far a plan that goes on with a campaign was measured. A campaign that was begun for the same plan is gone on with.
+
+    A set-up counts only where all its tests were completed in one mounting. Nobody knows what hangs in the machine after a test was broken
+    off: whoever goes on is asked first to take it away, then mounts anew under a new set-up's name.
 
     Raises
     ------
@@ -54,7 +70,7 @@ def added(store: Store, campaign: Campaign, plan: CampaignPlan) -> Added:
     link = {"campaign": campaign.name, "plan": hashlib.sha256(repr(plan.tests).encode()).hexdigest()}
     begun = next((c for c in reversed(store.campaigns()) if c.doc.get("continues") == link), None)
     if begun is None:
-        return Added(plan, plan, None, link)
+        return Added(plan, plan, None, link, after_s)
     runs = store.runs(begun.id)
     for run in runs:
         if run.visible_status == RUNNING:
@@ -62,33 +78,53 @@ def added(store: Store, campaign: Campaign, plan: CampaignPlan) -> Added:
                 f"run {run.label} of campaign {begun.name} is being measured (process {run.owner.pid})", "wait until it has ended"
             )
     states = {run.label: run.visible_status for run in runs}
-    left = tuple(again for test in plan.tests if (again := _to_do(test, states)) is not None)
-    return Added(replace(plan, name=begun.name), CampaignPlan(begun.name, left) if left else None, begun, link)
+    left = _left(plan.tests, states)
+    return Added(replace(plan, name=begun.name), CampaignPlan(begun.name, left) if left else None, begun, link, after_s)
 
 
-def _to_do(test: TestPlan, states: dict[str, str]) -> TestPlan | None:
-    """A test as it is to be measured: under a name of its own where an earlier try was not completed. None: it was completed."""
-    label, tries = test.label, 1
-    while label in states:
-        if states[label] == COMPLETE:
-            return None
-        tries += 1
-        label = f"{test.label}-{tries}"
-    return replace(test, label=label)
+def _left(tests: tuple[TestPlan, ...], states: dict[str, str]) -> tuple[TestPlan, ...]:
+    """What is to be measured of whole set-ups: each from its mounting on where a try was begun and not completed.
+
+    Without the process that mounted it a set-up cannot be gone on with: the bar may hang, and cannot follow a move, or be gone.
+    """
+    out: list[TestPlan] = []
+    for _, members in groupby(tests, key=lambda test: str(test.setup["setup_id"])):
+        group, tries = tuple(members), 1
+        while any(_tried(t, tries).label in states for t in group):
+            if all(states.get(_tried(t, tries).label) == COMPLETE for t in group):
+                break
+            tries += 1
+        else:
+            out += [_tried(t, tries) for t in group]
+    if states and out:
+        out[0] = replace(out[0], steps=(Unmount(), *out[0].steps))
+    return tuple(out)
 
 
-async def measure_added(session: Session, store: Store, site: Site, campaign: Campaign, what: Added, progress: ProgressSink) -> None:
+def _tried(test: TestPlan, tries: int) -> TestPlan:
+    """A test of a set-up that is mounted for the n-th time: its runs and its cup have names of their own."""
+    if tries == 1:
+        return test
+    return replace(test, label=f"{test.label}-{tries}", setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{tries}"})
+
+
+async def measure_added(session: Session, store: Store, site: Site, campaign: Campaign, what: Added, progress: ProgressSink) -> float:
     """Measure what is left of an addition to a campaign; every completed run is kept, whatever ends the next one.
+
+    Returns
+    -------
+    float
+        0.0: it was measured. Else it is too early for it: seconds from now until it can begin; nothing was asked or moved.
 
     Raises
     ------
     CampaignRefused
         The old campaign has another clock than the machine has now, or another table was active; nothing has moved.
     UnsafeToMove, MeasurementFault, DriverError
-        The measurement failed.
+        The machine still runs the path of a run that was broken off, or the measurement failed.
     """
     if what.left is None:
-        return
+        return 0.0
     status, comp = await session.controller.status(), await session.controller.comp_status()
     old = campaign.doc
     if "ctrl0_us" not in old or old.get("boot_id") != comp.boot_id or old["ctrl0_us"] > status.ctrl_us:
@@ -97,11 +133,22 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
     tables = {run.get("table", {}).get("crc") for run in campaign.runs} - {None, now}
     if tables:
         raise CampaignRefused(f"campaign {campaign.name} was measured with another compensation table", "measure it again")
+    wait_s: float = what.after_s - (1e-6 * (status.ctrl_us - old["ctrl0_us"]) - _last_s(campaign))
+    if what.after_s > 0.0 and wait_s > 0.0:
+        return wait_s
+    if status.bits >> MOVING & 1:  # nobody is asked to reach into it
+        raise UnsafeToMove("the machine is moving: it may run the path of a run that was broken off", "wait until it stands, then go on")
     if what.begun is None:
         begun = await start_campaign(session, store, site, what.plan.name, {"continues": what.link})
     else:
         begun = (what.begun.id, int(what.begun.doc["ctrl0_us"]))
     await measure(session, store, site, what.left, progress=progress, campaign=begun)
+    return 0.0
+
+
+def _last_s(campaign: Campaign) -> float:
+    """When the last reading of a campaign was taken, on its clock."""
+    return max((float(run["columns"]["t_s"][-1]) for run in campaign.runs), default=0.0)
 
 
 def next_search(store: Store, job: Job, journal: StoredJournal, name: str) -> tuple[Job, StoredJournal]:

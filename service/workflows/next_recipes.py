@@ -9,29 +9,44 @@ from typing import Any, Literal
 
 import numpy as np
 
+from models.discovery.unseen import LATE_S
 from models.machine import AXES, Machine
 from models.paths.lines import DIAGONALS
 from service.errors import StrokeError
-from service.sequences.campaigns import verification
-from service.sequences.check import dry_run_campaign
-from service.sequences.recipes import Diagonal, Helix, Linear, Recipe, as_point
-from service.sequences.steps import CampaignPlan
+from service.sequences.campaigns import verification_helix
+from service.sequences.check import dry_run_campaign, paced
+from service.sequences.recipes import MIN_TURNS, Diagonal, Helix, Linear, Recipe, as_point
+from service.sequences.steps import CampaignPlan, TestPlan
 
+Maker = Callable[[Helix, str], list[Recipe]]
+"""From a helix that was measured, and what labels begin with, to recipes."""
 SHORTER = 0.6
 SLOW = 0.4
 """The second feed is slower: no machine is asked for more than it was asked before."""
 DENSER = 2.0
 """A path through a place has this many times the turns."""
 EQUATOR = 0.05
-"""A place that is lower than the cup by less than this share of the radius is still on the upper half."""
+"""A place that is seen lower than the equator by less than this (sine of the angle) is still on the same half."""
+KNOWN = (
+    "centre_mm", "radius_mm", "turns", "axis", "opens", "law", "even", "chord_mm", "rate_hz", "length_calibrated", "u_length_mm",
+)  # fmt: skip
+"""What a stored set-up says of its helix: without one of these nobody knows what path it was, or with what bar."""
+NO_HELIX = "the run is no helix: the sequencer repeats nothing else"
+NO_PATH = "what is stored of the helix does not say what path it was, or it was of another tool"
+TURNED = "somebody has to turn the bar or change its ball in between"
 
 
 @dataclass(frozen=True)
 class NextPlan:
-    """``plan``: what the machine measures next; None if nothing of it can be run. ``by_hand``: what a person has to do elsewhere."""
+    """What the machine measures next, and what a person has to do.
+
+    ``plan``: None if nothing of it can be run. ``by_hand``: additions that a person has to see to, with the reason where it is not that the
+    sequencer has no such test. ``after_s``: the last reading is to be so old when the plan begins: what comes late has to come late.
+    """
 
     plan: CampaignPlan | None
     by_hand: tuple[str, ...]
+    after_s: float = 0.0
 
 
 def next_plan(
@@ -48,42 +63,68 @@ def next_plan(
     Parameters
     ----------
     runs : list of dict
-        What was measured so far: second feeds and late repeats are of the first helix of it.
+        What was measured so far: second feeds and late repeats are of the first helix of it, exactly as it was.
     name : tuple of str
         Of the new campaign, and what its labels and set-ups begin with, so that they can stand beside the old ones.
     about : dict, optional
         Where something without a name lives (``where`` of a finding, ``runs`` the one that is to be measured again): a helix is repeated
         several times in one set-up, any other run by hand; another radius passes through its place.
     """
-    recipes: list[Recipe] = []
-    by_hand = []
-    like = _first_helix(machine, runs if about is None else _showing(runs, about))
-    place = (about or {}).get("position_mm")
-    makers = MAKERS if about is None else _makers_about(runs, about)
+    tests: list[TestPlan] = []
+    by_hand, after_s = [], 0.0
     for add in adds:
-        make = makers.get(add)
-        if make is None:
-            by_hand.append(add)
+        made = _tests(add, machine, runs, name[1], max_feed_mm_min, about)
+        if isinstance(made, str):
+            by_hand.append(made)
+            continue
+        tests += made
+        after_s = LATE_S if add == "longer_session" else after_s
+    return NextPlan(CampaignPlan(name[0], tuple(tests)) if tests else None, tuple(by_hand), after_s)
+
+
+def _tests(
+    add: str, machine: Machine, runs: list[dict[str, Any]], name: str, max_feed_mm_min: float, about: dict[str, Any] | None
+) -> tuple[TestPlan, ...] | str:
+    """The tests of one addition, or what a person reads who has to see to it."""
+    make = MAKERS.get(add)
+    if make is None:
+        return add
+    place = None if about is None else about.get("position_mm")
+    like = _first_helix(machine, [] if add in LASER else runs if about is None else _showing(runs, about))
+    if about is not None:
+        if add == "ballbar":
+            return f"{add} ({TURNED})"
+        if add == "longer_session" and not _is_helix(runs, about):
+            return f"{add} ({NO_HELIX})"
+        special: dict[str, Maker] = {"longer_session": _repeats, "second_radius": partial(_through, place)}
+        make = special.get(add, make)
+    if like is None:
+        return f"{add} ({NO_PATH})"
+    return _within(add, machine, make(like, name), max_feed_mm_min, place)
+
+
+def _within(
+    add: str, machine: Machine, recipes: list[Recipe], max_feed_mm_min: float, place: list[float] | None
+) -> tuple[TestPlan, ...] | str:
+    """The tests of recipes inside the strokes; a sphere of another radius that has no room may be smaller still."""
+    tries = [recipes]
+    if add == "second_radius":
+        tries.append([_shrunk(r, 0.5, place) if isinstance(r, Helix) else r for r in recipes])
+    why = ""
+    for one in tries:
+        plan = paced(CampaignPlan(add, tuple(r.plan(machine) for r in one)), max_feed_mm_min)
+        try:
+            dry_run_campaign(machine, plan, max_feed_mm_min)
+        except StrokeError as error:
+            why = why or error.detail
         else:
-            recipes += make(like, name[1])
-    plans = [r.plan(machine) for r in recipes]
-    if not plans:
-        return NextPlan(None, tuple(by_hand))
-    plan = CampaignPlan(name[0], tuple(plans))
-    try:
-        dry_run_campaign(machine, plan, max_feed_mm_min)
-    except StrokeError:  # the old centre has no room for a whole hemisphere
-        smaller = [_shrunk(r, 0.5, place) if isinstance(r, Helix) else r for r in recipes]
-        plan = CampaignPlan(name[0], tuple(r.plan(machine) for r in smaller))
-        dry_run_campaign(machine, plan, max_feed_mm_min)
-    return NextPlan(plan, tuple(by_hand))
+            return plan.tests
+    return f"{add} ({why})"
 
 
-def _makers_about(runs: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Callable[[Helix, str], list[Recipe]]]:
-    """What the sequencer can run to see again what has no name; a repeat only if it is a helix that is to be repeated."""
-    makers = MAKERS | {"longer_session": _repeats, "second_radius": partial(_through, about.get("position_mm"))}
-    again = [r["test"] for r in runs if r.get("run_id") in about.get("runs", [])]
-    return makers if "ballbar_helix" in again else {k: v for k, v in makers.items() if k not in ("longer_session", "ballbar")}
+def _is_helix(runs: list[dict[str, Any]], about: dict[str, Any]) -> bool:
+    """Whether the run that is to be measured again is a helix."""
+    return "ballbar_helix" in [r["test"] for r in runs if r.get("run_id") in about.get("runs", [])]
 
 
 def _showing(runs: list[dict[str, Any]], about: dict[str, Any]) -> list[dict[str, Any]]:
@@ -98,7 +139,7 @@ def _shrunk(helix: Helix, scale: float, place: list[float] | None) -> Helix:
     at, centre = np.asarray(place, dtype=np.float64), np.asarray(helix.centre_mm, dtype=np.float64)
     away = float(np.linalg.norm(centre - at))
     radius = scale * helix.radius_mm
-    towards = (centre - at) / away if away > 0.0 else np.array([0.0, 0.0, -1.0])
+    towards = (centre - at) / away if away > 0.0 else -helix.opens * np.eye(3)[helix.axis]
     return replace(helix, radius_mm=radius, centre_mm=as_point(at + radius * towards))
 
 
@@ -106,8 +147,10 @@ def _through(place: list[float] | None, like: Helix, name: str) -> list[Recipe]:
     """Twice the turns on another sphere through a place; without one, another radius as usual."""
     if place is None:
         return _named(like, name, "radius", radius_mm=SHORTER * like.radius_mm)
-    opens: Literal[1, -1] = 1 if place[2] >= like.centre_mm[2] - EQUATOR * like.radius_mm else -1
-    return _named(_shrunk(like, SHORTER, place), name, "radius", turns=DENSER * like.turns, opens=opens)
+    near = _shrunk(like, SHORTER, place)
+    up = like.opens * (place[near.axis] - near.centre_mm[near.axis]) / near.radius_mm
+    opens = like.opens if up >= -EQUATOR else -like.opens
+    return _named(near, name, "radius", turns=DENSER * like.turns, opens=opens)
 
 
 def _repeats(like: Helix, name: str) -> list[Recipe]:
@@ -120,17 +163,29 @@ def _repeats(like: Helix, name: str) -> list[Recipe]:
     ]
 
 
-def _first_helix(machine: Machine, runs: list[dict[str, Any]]) -> Helix:
-    """The first helix of the campaign as a recipe; where there is none, the one that verifies corrections."""
+def _first_helix(machine: Machine, runs: list[dict[str, Any]]) -> Helix | None:
+    """The first helix of the campaign as a recipe; None: nobody can tell what it was. Without any, the one that verifies tables."""
     for run in runs:
         if run["test"] == "ballbar_helix":
-            setup, columns = run["setup"], run["columns"]
-            x, y, z = (float(v) for v in setup["centre_mm"])
-            way: Literal[1, -1] = 1 if columns["direction"][0] > 0 else -1
-            feed, turns = float(columns["feed_mm_min"][0]), max(float(setup.get("turns") or 5.0), 3.0)
-            return Helix("", "", "identify", (x, y, z), float(setup["radius_mm"]), turns=turns, feed_mm_min=feed, direction=way)
-    setup = verification(machine).tests[0].setup
-    return Helix("", "", "identify", as_point(setup["centre_mm"]), float(setup["radius_mm"]))
+            return _again(machine, run)
+    return replace(verification_helix(machine), role="identify")
+
+
+def _again(machine: Machine, run: dict[str, Any]) -> Helix | None:
+    """A stored helix as a recipe; None where its set-up does not say all of it, or says what this machine cannot repeat."""
+    setup, columns = run["setup"], run["columns"]
+    if any(setup.get(key) is None for key in KNOWN) or setup["turns"] < MIN_TURNS:
+        return None
+    if setup.get("tool_mm") is not None and not np.allclose(setup["tool_mm"], machine.tool_mm):
+        return None
+    x, y, z = (float(v) for v in setup["centre_mm"])
+    return Helix(
+        "", "", "identify", (x, y, z), float(setup["radius_mm"]),
+        turns=float(setup["turns"]), law=setup["law"], axis=AXES.index(setup["axis"]), feed_mm_min=float(columns["feed_mm_min"][0]),
+        direction=1 if columns["direction"][0] > 0 else -1, rate_hz=int(setup["rate_hz"]), chord_mm=float(setup["chord_mm"]),
+        opens=1 if setup["opens"] > 0 else -1, length_calibrated=bool(setup["length_calibrated"]),
+        u_length_mm=float(setup["u_length_mm"]), even=bool(setup["even"]),
+    )  # fmt: skip
 
 
 def _named(helix: Helix, name: str, what: str, **changes: Any) -> list[Recipe]:
@@ -145,7 +200,7 @@ def _lines(like: Helix, name: str) -> list[Recipe]:
     return [Linear(f"{name}-line{AXES[a]}", f"{name}-line{AXES[a]}", "identify", a, n=25) for a in range(3)]
 
 
-MAKERS: dict[str, Callable[[Helix, str], list[Recipe]]] = {
+MAKERS: dict[str, Maker] = {
     "second_feed": lambda like, name: _named(like, name, "feed", feed_mm_min=SLOW * like.feed_mm_min),
     "opposite_direction": lambda like, name: _named(like, name, "back", direction=-1 if like.direction > 0 else 1),
     "second_radius": lambda like, name: _named(like, name, "radius", radius_mm=SHORTER * like.radius_mm),
@@ -155,3 +210,5 @@ MAKERS: dict[str, Callable[[Helix, str], list[Recipe]]] = {
     "single_axis_laser": _lines,
 }
 """What the sequencer can run. Circles in the planes, other tools, angular optics and references are a person's work."""
+LASER = ("laser_diagonals", "single_axis_laser")
+"""What needs no helix to be like."""

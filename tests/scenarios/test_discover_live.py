@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from service import cli
+from service.runs.columns import load_run
 from service.storage.store import Store
 from tests.scenarios.world import axes_at_rest, wait_for
 from tests.unit.service.discovery_bench import Search
@@ -98,7 +99,13 @@ def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monk
         assert f": {int(again)} of 1 runs are measured" in out
         assert [list(seen) for seen in search.seen] == [["helix", "n1-feed-2"]]  # the first search was not done again
         assert [state[:2] for state in added()] == [("n1-feed", "incomplete"), ("n1-feed-2", "complete")]
+    _, first_s, set_s = search.seen[0]["n1-feed-2"]
     with Store.open(url) as store:
+        again = load_run(store, "n1-feed-2")
+        assert again["setup"]["setup_id"] == "n1-feed-2"  # mounted anew: another cup
+        broken_off = next(r for r in store.runs(store.campaigns()[1].id) if r.label == "n1-feed")
+        assert broken_off.start_doc["setup"]["t_set_s"] < again["setup"]["t_set_s"] < again["columns"]["t_s"][0]
+        assert set_s < first_s
         assert [c.name.split()[0] for c in store.campaigns()] == ["june", "next1"]
         assert [[s.state for s in store.discovery_steps(d.id)][-1] for d in store.discoveries()] == ["EXPLAINED"] * 2
 

@@ -22,9 +22,11 @@ from service import cli
 from service.errors import MeasurementFault
 from service.runs.codec import JSON_CODEC, encode_json
 from service.runs.columns import pack_columns
+from service.sequences.runner import MOVING
 from service.storage.owner import Owner
 from service.storage.records import NewVersion
 from service.storage.store import Store
+from service.workflows.discover_live import rounds
 from tests.unit.service.discovery_bench import MACHINE, Search, circle, write_case
 
 WRITES = ("add_campaign", "start_run", "append_chunk", "finish_run", "add_discovery", "add_discovery_step")
@@ -43,12 +45,13 @@ class Asks(Search):
     def __init__(self) -> None:
         super().__init__()
         self.asked: list[tuple[str, ...]] = []
+        self.adds: dict[int, tuple[str, ...]] = {4: ("second_feed", "longer_session"), 6: ("opposite_direction",)}
 
     def __call__(self, case: Any, effects: Any, progress: Any) -> Discovery:
         labels = tuple(r.path.label for r in case.runs)
         self.asked.append(labels)
         self.width_um = 7.0 + 0.1 * len(labels)
-        adds = {4: ("second_feed", "longer_session"), 6: ("opposite_direction",)}.get(len(labels))
+        adds = self.adds.get(len(labels))
         test = None if adds is None else NextTest(adds, ("backlash:X", "lateral_play:EYX"), 4.2, 12.0, "")
         return dataclasses.replace(super().__call__(case, effects, progress), next_test=test)
 
@@ -61,6 +64,7 @@ class Bench:
         self.measured: list[str] = []
         self.search = Asks()
         self.boot, self.writes = BOOT, 0
+        self.now_s, self.bits = 7000.0, 0
         self.left: int | None = None
         self._folder, self._patch = folder, monkeypatch
         self._file()
@@ -97,7 +101,7 @@ class Bench:
     @asynccontextmanager
     async def _session(self, _store: Store, _site: Any) -> AsyncIterator[Any]:
         async def status() -> Any:
-            return SimpleNamespace(ctrl_us=6_000_000_000 + 1_000_000 * len(self.measured))
+            return SimpleNamespace(ctrl_us=round(1e6 * self.now_s) + 1_000_000 * len(self.measured), bits=self.bits)
 
         async def comp_status() -> Any:
             return SimpleNamespace(boot_id=self.boot, bank_crc=(1, 2), active_bank=0)
@@ -116,11 +120,11 @@ class Bench:
         await store.write(store.finish_run, run_id, "complete", "", {})
         return int(run_id)
 
-    def live(self, end_after: int | None = None) -> int | None:
+    def live(self, end_after: int | None = None, campaign: str = "june") -> int | None:
         """The command; None: it was ended after so many writes."""
         self.left, self.writes = end_after, 0
         try:
-            return cli.run(["discover", "june", "--machine", str(self._folder / "machine.toml"), "--live"])
+            return cli.run(["discover", campaign, "--machine", str(self._folder / "machine.toml"), "--live"])
         except Ended:
             return None
         finally:
@@ -261,3 +265,34 @@ def test_a_machine_that_was_found_to_be_otherwise_meanwhile_is_searched_anew_and
     assert told["started"] == [(None, None, None), (None, 1, 1), (2, 2, None), (2, 3, 3), (2, 4, 4)]
     assert [states[-1] for states in told["states"]] == ["EXPLAINED", "TESTING", *["EXPLAINED"] * 3]
     assert [v for v, _, _ in told["book"]] == [1, 2, 3, 4, 5]
+
+
+def test_a_late_repeat_waits_until_it_is_late(bench: Bench, capsys: Any) -> None:
+    bench.now_s = 6000.0  # the last reading is of 2437 s
+    assert bench.live() == 0
+    assert "too early for second_feed, longer_session: give the same command at " in capsys.readouterr().out
+    assert bench.measured == []
+    with Store.open(bench.url) as store:
+        assert [c.name for c in store.campaigns()] == ["june"]
+    bench.now_s = 6100.0
+    assert bench.live() == 0
+    assert bench.stored() == WHOLE
+
+
+def test_nobody_is_asked_to_reach_into_a_machine_that_runs_a_path_to_its_end(bench: Bench, capsys: Any) -> None:
+    bench.bits = 1 << MOVING
+    assert bench.live() == 2
+    assert "error SEQ-002: the machine is moving" in capsys.readouterr().err
+    assert bench.measured == []
+
+
+def test_an_addition_that_is_gone_on_with_alone_has_labels_of_its_own(bench: Bench) -> None:
+    bench.search.adds = {4: ("second_feed",)}
+    assert bench.live() == 0
+    with Store.open(bench.url) as store:
+        names = [c.name for c in store.campaigns()]
+        assert [rounds(store, n) for n in names] == [0, 1]
+    bench.search.adds = {1: ("second_feed",)}
+    assert bench.live(campaign=names[1]) == 0
+    assert bench.measured == ["n1-feed", "n2-feed"]
+    assert bench.search.asked[-1] == ("n1-feed", "n2-feed")
