@@ -9,19 +9,22 @@ import numpy as np
 from scipy import linalg, stats
 
 from models.arrays import F1, F2
-from models.discovery.answer import Agreement
+from models.discovery.answer import Agreement, Unjudged
 from models.discovery.case import CaseRun
 from models.discovery.noise import lone, unscaled
 from models.discovery.prediction import Solved, free_columns, left_over
 from models.discovery.scene import Scene
 
 LAGS = 10
-"""Memory that is left in whitened noise is looked for over so many readings."""
+"""Memory that is left in whitened noise is looked for over so many readings: the memory usual for instruments (`noise.MEMORY`) has faded to
+6 % by then, and more lags would add more noise to the sum than memory."""
 BLOCKS, SHORTEST = 12, 8
-"""A run is summed in so many blocks, of so many readings or more."""
+"""A run is summed in so many blocks: enough for a wave of up to six periods along it, and eight or more are left once it has set its cup
+and length. Of so many readings or more: over them the usual memory has faded to a tenth, so that sums are nearly independent."""
 FREE_MM = 1.0
 """Prior of what a run may set for itself: wide."""
-MANY = 1e9
+NO_NOISE = "the fitted runs do not tell the noise of their instrument"
+TOO_FEW = "too few of their readings count"
 
 
 @dataclass(frozen=True)
@@ -32,13 +35,13 @@ class _Noise:
     readings varies than for independent normal ones; ``long``: its long-run variance over that of a reading, 1 or more.
     """
 
-    variance: float = 1.0
-    freedom: float = MANY
-    spread: float = 1.0
-    long: float = 1.0
+    variance: float
+    freedom: float
+    spread: float
+    long: float
 
 
-def agreements(scene: Scene, solved: Solved, predicted_mm: Mapping[str, F1]) -> tuple[Agreement, ...]:
+def agreements(scene: Scene, solved: Solved, predicted_mm: Mapping[str, F1]) -> tuple[tuple[Agreement, ...], tuple[Unjudged, ...]]:
     """How every run that only judges agrees with a solution without effects, the worst first.
 
     A run's whitened residual, reading by reading and in sums over blocks, which see what is smooth, is weighted by the inverse covariance
@@ -52,35 +55,45 @@ def agreements(scene: Scene, solved: Solved, predicted_mm: Mapping[str, F1]) -> 
     Returns
     -------
     tuple of Agreement
-        ``p`` family-wise over the runs (Sidak). Runs of an instrument that was never fitted are left out: nobody knows its noise.
+        ``p`` family-wise over the runs (Sidak).
+    tuple of Unjudged
+        Runs of an instrument whose noise nobody knows, for it was never fitted or its fitted runs went into the unknowns; and runs with too
+        few readings that count.
     """
     noise = {kind: _noise(scene, kind) for kind in scene.colours}
-    root = linalg.cholesky(solved.theta_covariance + 1e-24 * np.eye(solved.theta.size), lower=True)
+    root = _root(solved.theta_covariance)
     seen = {r.path.setup for r in scene.runs}
-    runs = [r for r in scene.case.of("holdout") if r.deviation_mm is not None and r.path.kind in noise]
-    found = []
-    for run in runs:
-        known = noise[run.path.kind]
-        white, free = _white(scene, solved, root * np.sqrt(known.long * known.variance), run, predicted_mm[run.path.label], seen)
-        tests = [_tested(white, free, known, 1.0, known.spread), _tested(_sums(white), free, known, known.long, 1.0)]
-        told = [t for t in tests if t is not None]
-        if told:
-            times, p = min(told, key=lambda t: t[1])
-            found.append((run.path.label, times, min(1.0, len(told) * p)))
+    found, open_ = [], []
+    for run in (r for r in scene.case.of("holdout") if r.deviation_mm is not None):
+        label, known = run.path.label, noise.get(run.path.kind)
+        if known is None:
+            open_.append(Unjudged(label, NO_NOISE))
+            continue
+        told = _worse(*_white(scene, solved, root * np.sqrt(known.long), run, predicted_mm[label], seen), known)
+        if told is None:
+            open_.append(Unjudged(label, TOO_FEW))
+        else:
+            found.append((label, *told))
     tried = len(found)
     every = [Agreement(label, times, float(-np.expm1(tried * np.log1p(-min(p, 1.0 - 1e-12))))) for label, times, p in found]
-    return tuple(sorted(every, key=lambda a: (a.p, a.run)))
+    return tuple(sorted(every, key=lambda a: (a.p, a.run))), tuple(open_)
 
 
-def _noise(scene: Scene, kind: str) -> _Noise:
-    """From what the fitted model leaves of the fitted runs of an instrument."""
+def _root(covariance: F2) -> F2:
+    """A matrix whose product with its own transpose is a covariance; rounding may have made that a little negative somewhere."""
+    values, vectors = linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _noise(scene: Scene, kind: str) -> _Noise | None:
+    """From what the fitted model leaves of the fitted runs of an instrument; None where it leaves too little to know."""
     res, leverage, use = (scene.by_run(v) for v in (scene.space.residual, scene.space.leverage, scene.use))
     mine = [k for k, name in enumerate(scene.kinds) if name == kind]
     parts = [res[k][use[k] > 0] for k in mine]
     total, count = sum(float(r @ r) for r in parts), sum(r.size for r in parts)
     freedom = sum(float(np.sum((1.0 - leverage[k])[use[k] > 0])) for k in mine)
     if total <= 0.0 or freedom <= 1.0:
-        return _Noise()
+        return None
     rho = np.array([sum(float(r[lag:] @ r[:-lag]) for r in parts if r.size > lag) / total for lag in range(1, LAGS + 1)])
     fourth = count * sum(float(np.sum(r**4)) for r in parts) / total**2
     spread = 1.0 + max(0.5 * (fourth - 3.0), 0.0) + 2.0 * float(np.sum(np.maximum(rho**2 - 1.0 / count, 0.0)))
@@ -91,7 +104,8 @@ def _noise(scene: Scene, kind: str) -> _Noise:
 def _white(scene: Scene, solved: Solved, root: F2, run: CaseRun, predicted_mm: F1, seen: set[str]) -> tuple[F2, int]:
     """Whitened residual of a run's readings that count, then what may move the prediction (columns, one standard deviation each).
 
-    Also how many of these the run sets for itself.
+    Also how many of these the run sets for itself; they are the last. One standard deviation is that of the noise as it was assumed: what
+    the noise is over that, `_tested` takes for all of it together.
     """
     p, data = run.path, run.data()
     gap = np.where(run.valid, data.deviation_mm - predicted_mm, 0.0)
@@ -101,6 +115,16 @@ def _white(scene: Scene, solved: Solved, root: F2, run: CaseRun, predicted_mm: F
     columns = np.column_stack([gap, scene.base.linear(data, solved.theta)[1] @ root, FREE_MM * free]) * keep[:, None]
     white = unscaled(columns, [p.n], [p.kind], scene.colours) / scene.colours[p.kind].sd_mm
     return np.asarray(white[keep > 0]), free.shape[1]
+
+
+def _worse(white: F2, free: int, known: _Noise) -> tuple[float, float] | None:
+    """Rms over what is allowed, and p, reading by reading or in sums, whichever is farther off; None where neither can be tested."""
+    tests = [_tested(white, free, known, 1.0, known.spread), _tested(_sums(white), free, known, known.long, 1.0)]
+    told = [t for t in tests if t is not None]
+    if not told:
+        return None
+    times, p = min(told, key=lambda t: t[1])
+    return times, min(1.0, len(told) * p)
 
 
 def _sums(white: F2) -> F2:
@@ -115,14 +139,17 @@ def _sums(white: F2) -> F2:
 def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float) -> tuple[float, float] | None:
     """Rms over what is allowed, and how often chance gives as much; None where too few values are left to tell.
 
-    ``variance`` of the values' noise over that of a reading; ``spread`` as in `_Noise`.
+    ``free`` of the columns, the last, are the run's own: they take as many degrees of freedom as the values tell of them (a circle about
+    its cup three and not four, sums over whole turns hardly any). ``variance`` of the values' noise over that of a reading; ``spread`` as
+    in `_Noise`.
     """
-    freedom = float(len(white) - free)
-    if freedom < 1.0:
-        return None
     y, known = white[:, 0] / np.sqrt(variance), white[:, 1:] / np.sqrt(variance)
     inner = known.T @ known
     inner.flat[:: len(inner) + 1] += 1.0
-    b = known.T @ y
-    ratio = float(y @ y - b @ linalg.solve(inner, b, assume_a="pos")) / (freedom * noise.variance)
+    b, own = known.T @ y, len(inner) - free
+    solution = linalg.solve(inner, np.column_stack([b, np.eye(len(inner))[:, own:]]), assume_a="pos")
+    freedom = len(white) - free + float(np.trace(solution[own:, 1:]))
+    if freedom < 1.0:
+        return None
+    ratio = float(y @ y - b @ solution[:, 0]) / (freedom * noise.variance)
     return float(np.sqrt(max(ratio, 0.0))), float(stats.f.sf(ratio, freedom / spread, noise.freedom / spread))

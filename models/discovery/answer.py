@@ -127,6 +127,14 @@ class Agreement:
 
 
 @dataclass(frozen=True)
+class Unjudged:
+    """One run that was never fitted and that nothing can be said of: its label, and ``why``."""
+
+    run: str
+    why: str
+
+
+@dataclass(frozen=True)
 class Discovery:
     """Everything one discovery found.
 
@@ -143,7 +151,7 @@ class Discovery:
     noise_mm : one reading of each run's instrument, by "bar", "laser".
     p_value : of the whole finding (how often noise alone gives as much).
     theta, theta_names, theta_covariance : the refitted model without the effects.
-    agreement : of runs that only judge, where nothing was found; the worst first.
+    agreement : of runs that only judge, where nothing was found; the worst first. unjudged : those of them that cannot be judged.
     unseen : where nothing was found: what these runs could not have shown.
     """
 
@@ -165,4 +173,5 @@ class Discovery:
     confounded_with: tuple[str, ...] = ()
     beside: tuple[tuple[str, float], ...] = ()
     agreement: tuple[Agreement, ...] = ()
+    unjudged: tuple[Unjudged, ...] = ()
     unseen: tuple[Unseen, ...] = ()

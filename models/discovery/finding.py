@@ -61,6 +61,7 @@ def finding(
     seen = {r.path.setup for r in scene.runs}
     judged = [r for r in case.runs if r.deviation_mm is not None]
     residuals = [{r.path.label: left_over(r, p[r.path.label], seen) for r in judged} for p in predicted]
+    agreement, unjudged = agreements(scene, solved, predicted[0]) if told.verdict == "none" else ((), ())
     where = locate(plain.paths, tuple(plain.by_run(plain.space.residual)))
     if told.verdict == "unknown":
         where = replace(unnamed[0].where, table=where.table)
@@ -82,7 +83,8 @@ def finding(
         rejected=told.rejected,
         confounded_with=_confounded(told.effects) if is_named else (),
         beside=tuple((u.label, u.evidence) for u in unnamed) if is_named else (),
-        agreement=agreements(scene, solved, predicted[0]) if told.verdict == "none" else (),
+        agreement=agreement,
+        unjudged=unjudged,
         unseen=unseen(case) if told.verdict == "none" else (),
     )
 

@@ -27,6 +27,8 @@ ARM_MM = 100.0
 LATE_S = 3.0 * 3600.0
 GAP_S = 900.0
 FEED_MM_MIN = 1500.0
+OTHER_FEED = 1.3
+"""Feeds that differ by a smaller factor are one feed: what grows with the feed then changes too little to be told from geometry."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,22 @@ def offers(case: Case) -> tuple[Offer, ...]:
     return tuple(out)
 
 
+def one_feed(bars: list[Path]) -> bool:
+    """Whether ball-bar runs, one or more, have one feed."""
+    feeds = [float(np.round(np.median(p.feed_mm_min))) for p in bars]
+    return max(feeds) < OTHER_FEED * min(feeds)
+
+
+def one_way(bars: list[Path]) -> bool:
+    """Whether ball-bar runs go one way round."""
+    return len({float(np.sign(p.direction[0])) for p in bars}) < 2
+
+
+def one_radius(bars: list[Path]) -> bool:
+    """Whether ball-bar runs have one radius."""
+    return len({round(p.radius_mm) for p in bars}) < 2
+
+
 def _minutes(runs: tuple[CaseRun, ...]) -> float:
     return sum(float(np.ptp(r.path.at.t_s)) / 60.0 + RUN_MIN for r in runs)
 
@@ -78,14 +96,14 @@ def _minutes(runs: tuple[CaseRun, ...]) -> float:
 def _bar_variants(bars: list[Path], start: float) -> list[Offer]:
     out, first = [], bars[0]
     feeds = {float(np.round(np.median(p.feed_mm_min))) for p in bars}
-    if max(feeds) < 1.3 * min(feeds):
+    if one_feed(bars):
         other = max(feeds) * (0.4 if max(feeds) > 1500.0 else 2.5)
         both = _with_back(first, bars, lambda q, t, label: _bar(first, q, other, t, label), start, "next_feed")
         out.append(Offer("second_feed", both, BAR_MIN + _minutes(both), f"the same path at {other:.0f} mm/min"))
-    if len({float(np.sign(p.direction[0])) for p in bars}) < 2:
+    if one_way(bars):
         again = (_bar(first, first.at.q_mm[::-1], min(feeds), start, "next_back"),)
         out.append(Offer("opposite_direction", again, BAR_MIN + _minutes(again), "the same path the other way round"))
-    if len({round(p.radius_mm) for p in bars}) < 2:
+    if one_radius(bars):
         radius = first.radius_mm * (2.0 / 3.0 if first.radius_mm > 100.0 else 1.5)
         if _fits(first.machine, first.centre_mm, radius):
             shape = (first.at.q_mm - first.centre_mm) * (radius / first.radius_mm) + first.centre_mm
@@ -104,7 +122,7 @@ def _with_back(
     """A path and, where the campaign goes both ways, its way back."""
     q = like.at.q_mm if q_mm is None else q_mm
     out = [make(q, start, label)]
-    if len({float(np.sign(p.direction[0])) for p in bars}) > 1:
+    if not one_way(bars):
         out.append(
             replace(
                 make(q[::-1], start + 300.0, f"{label}_back"), path=_same_setup(make(q[::-1], start + 300.0, f"{label}_back").path, out[0])

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from models.arrays import F1
 from models.discovery.answer import Unseen
 from models.discovery.case import Case
+from models.discovery.next_offers import one_feed, one_radius, one_way
 from models.effects.path import Path
 
 LATE_S = 3600.0
 """A repeat this long after the first time is a late one: axes and spindle warm up within 20 minutes to two hours (effects.md, thermal)."""
-OTHER_FEED = 1.3
-"""Feeds that differ by less are one feed."""
+SAME_MM = 2.0
+"""Paths that reach as far to this in every direction are one path: run again at another feed, its readings lie elsewhere along it."""
+SAME_LOOK = 0.01
+"""Beams whose unit vectors differ by less in every direction are parallel."""
 GROWS = "what grows with the feed (lag, servo mismatch, vibration of the drives) looks like geometry"
 TURNS = "what differs between the way there and the way back over the same points (lost motion, lateral play) looks like geometry"
 LENGTH = "what belongs to the bar (its length, its balls, its temperature) looks like an error of the machine"
 SLOW = "what comes slowly (axes, spindle and air that warm up) looks like geometry, or like a set-up"
-SCALE = "an error of all scales together is told by the bar's own length alone, and the bar's length by nothing"
+SCALE = "an error of all scales together is told by the bar's own length alone, and the search does not use the bar's certificate"
 MOVING = "what shows in motion on a curve only (reversals of two axes, servo mismatch, lag) leaves no trace"
 
 
@@ -33,12 +37,11 @@ def unseen(case: Case) -> tuple[Unseen, ...]:
     if not bars:
         out.append(Unseen(MOVING, "no ball-bar run was fitted", "ballbar"))
     else:
-        feeds = [float(np.median(p.feed_mm_min)) for p in bars]
-        if max(feeds) < OTHER_FEED * min(feeds):
+        if one_feed(bars):
             out.append(Unseen(GROWS, "all ball-bar runs have one feed", "second_feed"))
-        if len({float(np.sign(p.direction[0])) for p in bars}) < 2:
+        if one_way(bars):
             out.append(Unseen(TURNS, "all ball-bar runs go one way round", "opposite_direction"))
-        if len({round(p.radius_mm) for p in bars}) < 2:
+        if one_radius(bars):
             out.append(Unseen(LENGTH, "all ball-bar runs have one radius", "second_radius"))
     if not lasers:
         out.append(Unseen(SCALE, "no laser run was fitted", "laser_diagonals"))
@@ -48,11 +51,23 @@ def unseen(case: Case) -> tuple[Unseen, ...]:
 
 
 def _late(paths: list[Path]) -> bool:
-    """Whether some path was run again long after its first time."""
-    first: dict[tuple[object, ...], float] = {}
+    """Whether some path was run again, either way, long after its first time."""
+    first: list[tuple[str, F1, float]] = []
     for p in sorted(paths, key=lambda p: float(p.at.t_s[0])):
-        place = tuple(np.round(p.centre_mm)) if p.kind == "bar" else tuple(np.round(np.abs(p.look[0]), 2))
-        began = first.setdefault((p.test, round(p.radius_mm), place), float(p.at.t_s[0]))
-        if float(p.at.t_s[0]) - began >= LATE_S:
+        place, began = _place(p), float(p.at.t_s[0])
+        before = next((t for test, known, t in first if test == p.test and np.all(np.abs(place - known) <= SAME_MM)), None)
+        if before is None:
+            first.append((p.test, place, began))
+        elif began - before >= LATE_S:
             return True
     return False
+
+
+def _place(path: Path) -> F1:
+    """Where a path runs, whichever way: how far it reaches along every axis, a bar's cup and radius, mm; a beam's look on that scale."""
+    reach = [path.at.q_mm.min(axis=0), path.at.q_mm.max(axis=0)]
+    if path.kind == "bar":
+        return np.concatenate([*reach, path.centre_mm, [path.radius_mm]])
+    beam = path.look[0]
+    back = beam[np.flatnonzero(np.abs(beam) > 0.1)[0]] < 0.0
+    return np.concatenate([*reach, (-beam if back else beam) * SAME_MM / SAME_LOOK])

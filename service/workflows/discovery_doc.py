@@ -46,6 +46,7 @@ def finding_doc(
         "rejected": [list(pair) for pair in found.rejected],
         "confounded_with": list(found.confounded_with),
         "agreement": [{"run": a.run, "times": a.times, "p": a.p} for a in found.agreement],
+        "unjudged": [asdict(u) for u in found.unjudged],
         "unseen": [asdict(u) for u in found.unseen],
         "thinning": None if thinning is None else thinning.doc(),
         "answer": answer_doc(found, case, thinning),

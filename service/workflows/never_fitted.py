@@ -15,27 +15,29 @@ def disagreeing(finding: dict[str, Any]) -> list[dict[str, Any]]:
     return [a for a in finding.get("agreement", []) if a["p"] < ALARM]
 
 
-def unjudged(finding: dict[str, Any]) -> list[str]:
-    """Runs that were never fitted and that nothing could be said of: the noise of their instrument is not known."""
-    judged = {a["run"] for a in finding.get("agreement", [])}
-    return [
-        label for label, r in finding.get("runs", {}).items() if r["role"] == "holdout" and "rms_before_um" in r and label not in judged
-    ]
-
-
 def told_missing(finding: dict[str, Any]) -> str:
     """What is explained where nothing is missing in the fitted runs: the runs that were never fitted too, or which of them not."""
-    off, open_ = disagreeing(finding), unjudged(finding)
-    if not off and open_:
-        more = f" and {len(open_) - SHOWN} more" if len(open_) > SHOWN else ""
-        names = ", ".join(open_[:SHOWN]) + more
-        return f"the present model explains the fitted runs to their noise; not judged, for their noise is not known: {names}"
-    if not off:
+    off, open_ = disagreeing(finding), _unjudged(finding)
+    if not off and not open_:
         return "the present model explains all runs to their noise"
-    runs = ", ".join(f"{a['run']} {a['times']:.2g} times" for a in off[:SHOWN]) + (
-        f" and {len(off) - SHOWN} more" if len(off) > SHOWN else ""
-    )
-    return (
-        f"the present model explains the fitted runs to their noise; of the runs that were never fitted {runs} what noise and the "
-        f"prediction's own uncertainty allow (chance gives as much in {off[0]['p']:.1g} of such campaigns)"
-    )
+    told = "the present model explains the fitted runs to their noise"
+    if off:
+        runs = _few([f"{a['run']} {a['times']:.2g} times" for a in off])
+        told += (
+            f"; of the runs that were never fitted {runs} what noise and the prediction's own uncertainty allow "
+            f"(chance gives as much in {off[0]['p']:.1g} of such campaigns)"
+        )
+    return told + open_
+
+
+def _unjudged(finding: dict[str, Any]) -> str:
+    """Runs that were never fitted and that nothing could be said of, by the reason why; empty where there are none."""
+    by_reason: dict[str, list[str]] = {}
+    for u in finding.get("unjudged", []):
+        by_reason.setdefault(u["why"], []).append(u["run"])
+    return "".join(f"; not judged, for {why}: {_few(runs)}" for why, runs in by_reason.items())
+
+
+def _few(told: list[str]) -> str:
+    """The first of them, and how many more there are."""
+    return ", ".join(told[:SHOWN]) + (f" and {len(told) - SHOWN} more" if len(told) > SHOWN else "")

@@ -9,6 +9,8 @@ import numpy as np
 
 MOST_READINGS = 20000
 """Ball-bar readings of a campaign that are searched one by one; more become means of so many neighbours that about as many are left."""
+FEWEST = 3
+"""A run of fewer blocks stays as it is: one or two values would say nothing of its path."""
 GAP = 1.5
 """A block that takes this much longer than usual has lost readings."""
 STILL_MM = 1e-6
@@ -48,8 +50,10 @@ class Thinning:
     def not_seen(self) -> tuple[str, ...]:
         """What the shorter runs cannot show, one sentence each."""
         if self.means:
+            # A spike of one interval lies across two values as a rule; one of two fills a value wherever it begins.
             spikes = (
-                f"a spike at a reversal keeps its height from {self.interval_s:.2g} s on, one of a single reading is 1/{self.each} as high"
+                f"a spike at a reversal keeps its height from {2.0 * self.interval_s:.2g} s on, "
+                f"one of a single reading is 1/{self.each} as high"
             )
             sides = f"in {self.turning} means an axis turns round, and both sides of its lost motion are mixed there"
             fast = f"vibration above {self.hertz:.2g} Hz is averaged down, or looks like a slower one"
@@ -82,10 +86,22 @@ def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Thinn
     if not changed:
         return None
     readings, kept = (sum(len(r["columns"]["t_s"]) for r in some) for some in zip(*pairs, strict=True))
-    each = max(round(len(b["columns"]["t_s"]) / len(a["columns"]["t_s"])) for b, a in changed)
     interval = float(np.median(np.concatenate([np.diff(a["columns"]["t_s"]) for _, a in changed])))
-    means = any(not np.isin(a["columns"]["deviation_mm"], b["columns"]["deviation_mm"]).all() for b, a in changed)
+    means = any(not np.isin(_finite(a), _finite(b)).all() for b, a in changed)
+    each = -(-readings // MOST_READINGS) if means else _step(*changed[0])
     return Thinning(readings, kept, each, means, interval, sum(_turning(b, each) for b, _ in changed))
+
+
+def _step(before: dict[str, Any], after: dict[str, Any]) -> int:
+    """Readings from one value that was picked to the next."""
+    first, second = np.searchsorted(before["columns"]["t_s"], after["columns"]["t_s"][:2])
+    return int(second - first)
+
+
+def _finite(run: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Readings that are numbers; a flagged one need not be."""
+    values = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
+    return np.asarray(values[np.isfinite(values)])
 
 
 def _turning(run: dict[str, Any], each: int) -> int:
@@ -116,7 +132,7 @@ def picked(runs: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     """Runs with about ``most`` measured ball-bar readings, each as it was read: the middle one of every block.
 
     Means have less noise. But a mean over a turn of an axis is half of either side, and lost motion or friction that is large against
-    the noise then looks like nothing that has a formula.
+    the noise then looks like nothing that has a formula. A run shorter than `FEWEST` blocks stays as it is.
     """
     total = sum(len(r["columns"]["t_s"]) for r in runs if _measured_bar(r))
     block = -(-total // most)
@@ -124,6 +140,8 @@ def picked(runs: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
 
 
 def _picks(run: dict[str, Any], block: int) -> dict[str, Any]:
+    if len(run["columns"]["t_s"]) < FEWEST * block:
+        return run
     return run | {"columns": {k: v if v is None else v[block // 2 :: block] for k, v in run["columns"].items()}}
 
 
@@ -138,7 +156,7 @@ def _means(run: dict[str, Any], block: int) -> dict[str, Any]:
     """
     columns = run["columns"]
     count = len(columns["t_s"]) // block
-    if count < 3:
+    if count < FEWEST:
         return run
     rows = np.arange(count * block).reshape(count, block)
     t = np.asarray(columns["t_s"], dtype=np.float64)[rows]
@@ -151,6 +169,7 @@ def _means(run: dict[str, Any], block: int) -> dict[str, Any]:
     weight = np.where(some[:, None], valid, 1.0)
     nominal = _nominal_mm(run)
     off = (np.asarray(columns["deviation_mm"], dtype=np.float64) - nominal)[rows]
+    off = np.where(weight > 0.0, off, 0.0)  # a flagged reading need not be a number
     out["deviation_mm"] = ((off * weight).sum(axis=1) / weight.sum(axis=1) + nominal[middle]).tolist()
     if "valid" in columns:
         out["valid"] = some.astype(int).tolist()

@@ -9,11 +9,12 @@ import pytest
 
 from models.discovery.answer import Where
 from models.discovery.generic import generic_rivals
+from models.discovery.next_offers import offers
 from models.discovery.next_unnamed import propose_unnamed
 from models.discovery.unnamed import Structure
 from models.discovery.unseen import unseen
 from models.effects.path import Path
-from tests.physics.discovery_paths import bar, campaign, case_of_paths, circle
+from tests.physics.discovery_paths import bar, campaign, case_of_paths, circle, laser
 
 INCLUDES = ("rigid6", "setup_centre_offset", "bar_length_error", "mirror_tilt")
 
@@ -99,4 +100,37 @@ def test_what_is_measured_is_no_longer_unseen_but_only_if_it_is_fitted() -> None
     assert unseen(case) == ()
     judges = replace(case, runs=tuple(replace(r, role="identify" if r.path.label == first.label else "holdout") for r in case.runs))
     assert len(unseen(judges)) == 5
-    assert np.all(late.at.t_s > first.at.t_s)
+    early = replace(case, runs=tuple(r for r in case.runs if r.path.label != "l"))
+    assert [u.adds for u in unseen(early)] == ["longer_session"]
+
+
+def late_repeat(first: Path, again: Path) -> bool:
+    """Whether a path that is run 4000 s after another one counts as the same one, run late."""
+    late = replace(again, label="late", at=replace(again.at, t_s=again.at.t_s - again.at.t_s[0] + first.at.t_s[0] + 4000.0))
+    return "longer_session" not in {u.adds for u in unseen(case_of_paths((first, late), *INCLUDES))}
+
+
+def test_only_the_same_path_run_late_tells_what_comes_slowly() -> None:
+    xy, yz, zx = one_way()
+    assert late_repeat(xy, xy)
+    assert late_repeat(xy, bar("back", circle((0, 1)), 0.0, back=True))
+    assert late_repeat(xy, bar("fewer", circle((0, 1), n=50), 0.0))  # the same circle, its readings lie elsewhere
+    assert not late_repeat(xy, yz)
+    assert not late_repeat(xy, zx)
+    assert not late_repeat(xy, bar("small", circle((0, 1), radius=100.0), 0.0))
+    ppp, npp = laser("a", "ppp", 0.0), laser("b", "npp", 0.0)
+    assert late_repeat(ppp, ppp)
+    assert late_repeat(ppp, replace(ppp, look=-ppp.look))  # the interferometer at the other end
+    assert not late_repeat(ppp, npp)
+    beside = replace(ppp, at=replace(ppp.at, q_mm=ppp.at.q_mm + np.array([0.0, 15.0, 0.0])))
+    assert not late_repeat(ppp, beside)
+
+
+def test_what_is_proposed_and_what_is_said_to_be_unseen_agree_on_what_one_feed_is() -> None:
+    first = one_way()[0]
+    for factor, one in ((1.0, True), (1.29, True), (1.31, False)):
+        case = case_of_paths((first, replace(first, label="f", feed_mm_min=factor * first.feed_mm_min)), *INCLUDES)
+        assert ("second_feed" in {u.adds for u in unseen(case)}) is one
+        assert ("second_feed" in {o.adds for o in offers(case)}) is one
+    lengths = {u.adds: u.what for u in unseen(case_of_paths((first,), *INCLUDES))}
+    assert lengths["laser_diagonals"].endswith("the search does not use the bar's certificate")

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from models.discovery.answer import Agreement, Gap, NextTest, Unseen
+from models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
 from service.errors import CampaignRefused, NotObservable, StoreError
 from service.events import ignore_progress
 from service.storage.store import Store
@@ -144,22 +144,30 @@ def changed(search: Search, **changes: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("agreement", "sign", "words"),
+    ("agreement", "unjudged", "sign", "words"),
     [
         (
             (Agreement("r03", 1.82, 3e-7),),
+            (),
             "open",
             "the fitted runs to their noise; of the runs that were never fitted r03 1.8 times what noise",
         ),
-        ((Agreement("r03", 1.12, 0.03),), "ok", "explains all runs to their noise"),
-        ((), "ok", "explains the fitted runs to their noise; not judged, for their noise is not known: r03"),
+        ((Agreement("r03", 1.12, 0.03),), (), "ok", "explains all runs to their noise"),
+        ((), (Unjudged("r03", "nobody knows"),), "ok", "explains the fitted runs to their noise; not judged, for nobody knows: r03"),
+        (
+            (Agreement("r03", 1.82, 3e-7),),
+            tuple(Unjudged(label, why) for label, why in (("a", "one"), ("b", "two"), *((f"c{k}", "one") for k in range(5)))),
+            "open",
+            "of such campaigns); not judged, for one: a, c0, c1, c2 and 2 more; not judged, for two: b",
+        ),
+        ((), (), "ok", "explains all runs to their noise"),  # the repeats of one axis judge themselves
     ],
 )
 def test_runs_that_were_never_fitted_are_asked_before_nothing_is_said_to_be_missing(
-    folder: Path, agreement: tuple[Agreement, ...], sign: str, words: str
+    folder: Path, agreement: tuple[Agreement, ...], unjudged: tuple[Unjudged, ...], sign: str, words: str
 ) -> None:
     journal = Journal()
-    finding = discover(job_of(folder), journal, changed(Search("none"), agreement=agreement), ignore_progress)
+    finding = discover(job_of(folder), journal, changed(Search("none"), agreement=agreement, unjudged=unjudged), ignore_progress)
     told = verdict_of(finding)
     assert told[0] == sign
     assert words in told[2]

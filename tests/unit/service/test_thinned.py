@@ -57,6 +57,42 @@ def test_a_block_over_lost_readings_is_left_out(monkeypatch: pytest.MonkeyPatch)
     assert len(whole["t_s"]) == 20
 
 
+def test_lost_readings_do_not_change_how_many_one_value_stands_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 20)
+    run = circle(1, "identify")
+    for pause in (8, 38, 68):  # three of its blocks have a gap
+        run["columns"]["t_s"] = [t + 1000.0 * (i >= pause) for i, t in enumerate(run["columns"]["t_s"])]
+    run["columns"] = {name: values[:118] for name, values in run["columns"].items()}
+    short = thinned([run])
+    told = thinning([run], short)
+    assert told is not None
+    assert len(short[0]["columns"]["t_s"]) == 16
+    assert told.each == 6  # 118 readings over 16 values are 7
+
+
+def test_a_flagged_reading_that_is_no_number_leaves_its_mean_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 40)
+    run = circle(1, "identify")
+    run["columns"]["valid"] = [1] * 4 + [0] + [1] * 115
+    run["columns"]["deviation_mm"][4] = float("nan")
+    columns = thinned([run])[0]["columns"]  # blocks of three
+    assert columns["deviation_mm"][1] == pytest.approx(np.mean([run["columns"]["deviation_mm"][i] for i in (3, 5)]))
+    assert columns["valid"] == [1] * 40
+    told = thinning([run], picked([run], 40))
+    assert told is not None
+    assert not told.means  # a reading that is no number is not another one
+
+
+def test_a_short_run_beside_long_ones_keeps_its_readings() -> None:
+    long, short = circle(1, "identify"), circle(2, "identify")
+    short["columns"] = {name: values[:4] for name, values in short["columns"].items()}
+    few = picked([long, short], 10)  # one of 13: the middle one would be the seventh
+    assert few[1] is short
+    told = thinning([long, short], few)
+    assert told is not None
+    assert (told.each, told.kept) == (13, 13)
+
+
 def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_READINGS", 100)
     runs = [circle(1, "identify"), circle(2, "holdout"), circle(4, "sealed")]
@@ -74,6 +110,7 @@ def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch)
     assert f"in {told.turning} means an axis turns round" in hidden
     assert f"vibration above {told.hertz:.2g} Hz" in hidden
     assert "is 1/3 as high" in hidden
+    assert f"keeps its height from {6.0 * step:.2g} s on" in hidden  # half as long, it lies in two means
     assert "--without RUN" in remedy
 
 
