@@ -13,7 +13,8 @@ from models.machine import AXES
 UM = 1e-3
 """Columns are mm per micrometre."""
 SMOOTH_ORDERS = (2, 3, 4, 5, 6)
-ODD_ORDERS = (0, 1, 2, 3)
+ODD_ORDERS = (1, 2, 3)
+"""Without the constant: a jump to the side at every turn has a name, and a structure that holds it too would take its place."""
 ARM_MM = 300.0
 """Rotations of a slip are stated as what they move at this distance, so that all its columns are micrometres."""
 
@@ -24,7 +25,7 @@ def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """The same times the direction in which the axis last moved, orders 0 to 3."""
+    """The same times the direction in which the axis last moved, orders 1 to 3."""
 
     def deviation(p: Path, at: Places) -> F3:
         return _along(key[1], at.sign[:, AXES.index(key[2]), None] * _orders(p, at, key[2], ODD_ORDERS))
