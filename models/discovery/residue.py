@@ -21,7 +21,7 @@ KIN_SHARE = 0.03
 CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
 SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
 """Effects that live on the same clock, or are curves over the same positions: what one's formula leaves, off by a sixth (3 % squared),
-is shaped like another. Counted on 345 cases: ten false names of these kinds at 0.2 to 2.8 % of the strong one, one true one, at 9 %."""
+is shaped like another. Counted on 345 cases: nine false names of these kinds at 0.2 to 2.5 % of the strong one, one true one, at 9 %."""
 
 
 def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
