@@ -2,6 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+NO_RUN = "no run"
+_RUN: ContextVar[str] = ContextVar("run", default=NO_RUN)
+
+
+@contextmanager
+def on_behalf_of(run: str) -> Iterator[None]:
+    """Name the run that everything in this block (and in tasks started in it) happens for: its errors and records say so."""
+    token = _RUN.set(run)
+    try:
+        yield
+    finally:
+        _RUN.reset(token)
+
 
 class DriverError(Exception):
     """A device could not do what was asked.
@@ -16,6 +33,11 @@ class DriverError(Exception):
         What happened.
     remedy : str, optional
         What a person can do about it.
+
+    Attributes
+    ----------
+    run : str
+        The run that it happened to (``on_behalf_of``).
     """
 
     code = "DRV-000"
@@ -26,6 +48,7 @@ class DriverError(Exception):
         self.operation = operation
         self.detail = detail
         self.remedy = remedy
+        self.run = _RUN.get()
         super().__init__(f"{device}: {operation}: {detail}" + (f" ({remedy})" if remedy else ""))
 
 
@@ -77,3 +100,21 @@ class Rebooted(DriverError):
     """The device restarted (new boot id): nothing measured before may be joined to what comes after."""
 
     code = "DRV-008"
+
+
+class Backpressure(DriverError):
+    """This computer does not keep up with the device: the motion is stopped before a sample is lost."""
+
+    code = "DRV-009"
+
+
+class SettingsChanged(DriverError):
+    """The device's own settings (unit, range, zero) are not those that were accepted: readings before and after must not be joined."""
+
+    code = "DRV-010"
+
+
+class LossyLine(DriverError):
+    """More than 0.1 % of the samples of a run were lost on the line: what is left is too little to be trusted."""
+
+    code = "DRV-011"

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from drivers.api import BallBar, Controller, DisplacementMeter, Fixture
+from drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture
 from drivers.ballbar.driver import SerialBallBar
 from drivers.cnc.driver import ModbusController
-from drivers.errors import BadUrl
+from drivers.errors import BadUrl, WrongDevice
 from drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
 from drivers.laser.driver import ModbusLaser
-from drivers.links.modbus import ModbusLink
+from drivers.links.modbus_line import Canary
+from drivers.links.modbus_link import ModbusLink
 from drivers.links.serial_link import ByteLink
 from drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
+
+HEARTBEAT_S = 1.0
+"""A controller or laser that nobody asks anything is asked for its canary so often, so that a lost one is known within 3 s."""
 
 
 async def open_ballbar(url: str) -> BallBar:
@@ -48,8 +52,15 @@ async def open_laser(url: str) -> DisplacementMeter:
     return laser
 
 
-async def open_controller(url: str) -> Controller:
+async def open_controller(url: str, *, commissioned: str = "") -> Controller:
     """Open the controller behind a ``modbus+tcp://`` (or ``modbus+rtu://``) URL.
+
+    Parameters
+    ----------
+    url : str
+        The URL as the user wrote it.
+    commissioned : str
+        What ``identify().firmware`` said when this machine was commissioned; another answer is refused. Empty: any map of this version.
 
     Raises
     ------
@@ -61,7 +72,11 @@ async def open_controller(url: str) -> Controller:
         The wire.
     """
     controller = ModbusController(await _modbus(url, "a controller"))
-    await _identify_or_close(controller)
+    info = await _identify_or_close(controller)
+    if commissioned and info.firmware != commissioned:
+        await controller.close()
+        detail = f"its register map is not the commissioned one: {info.firmware} instead of {commissioned}"
+        raise WrongDevice(controller.name, "identify", detail, "another firmware or another machine: commission it anew")
     return controller
 
 
@@ -96,17 +111,17 @@ async def _modbus(url: str, what: str) -> ModbusLink:
     parsed = parse_url(url)
     if not isinstance(parsed, ModbusTcpUrl | ModbusRtuUrl):
         raise _wrong_scheme(url, what, "modbus+tcp:// or modbus+rtu://")
-    return await ModbusLink.connect(parsed)
+    return await ModbusLink.connect(parsed, canary=Canary(), heartbeat_s=HEARTBEAT_S)
 
 
 def _wrong_scheme(url: str, what: str, schemes: str) -> BadUrl:
     return BadUrl(ascii(url), "read device URL", f"this is not the URL of {what}", f"write {schemes}")
 
 
-async def _identify_or_close(device: BallBar | DisplacementMeter | Controller) -> None:
+async def _identify_or_close(device: BallBar | DisplacementMeter | Controller) -> DeviceInfo:
     """Ask who is there; whatever goes wrong, or a cancellation, leaves no open link behind."""
     try:
-        await device.identify()
+        return await device.identify()
     except BaseException:
         await device.close()
         raise

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from simulators.cnc.log import Command, TableAccess
 from simulators.scenario import AXES
 from simulators.world import World
 
@@ -24,6 +25,14 @@ class Box(Protocol):
 
     def ledger(self) -> Answer:
         """Samples sent and dropped since the last start."""
+        ...
+
+    def commands(self) -> list[Command]:
+        """What the controller was told so far."""
+        ...
+
+    def table_accesses(self) -> list[TableAccess]:
+        """Every attempt to change the controller's tables so far."""
         ...
 
     async def unplug(self) -> None:
@@ -52,7 +61,14 @@ class Fixture:
             "estop": self._estop,
             "door": self._door,
             "beam": self._beam,
+            "switch": self._switched,
+            "reset": self._reset,
+            "bar_out": self._bar_out,
+            "commands": self._commands,
+            "tables": self._tables,
             "drift": self._drift,
+            "air": self._air,
+            "program": self._program,
             "unplug_ballbar": self._unplug,
             "plug_ballbar": self._plug,
             "ledger": self._ledger,
@@ -160,6 +176,65 @@ class Fixture:
     async def _beam(self, request: Answer) -> Answer:
         self._world.laser.block(blocked=_switch(request, "blocked"))
         return {}
+
+    async def _switched(self, request: Answer) -> Answer:
+        controller, name, on = self._world.controller, request.get("name"), _switch(request, "on")
+        if name == "remote":
+            controller.switches.remote = on
+        elif name == "program":
+            controller.switches.program_running = on
+        elif name == "alarm" and on:
+            controller.raise_alarm()
+        elif name == "drives" and not on:
+            controller.drives_off()
+        else:
+            raise FixtureError("name: remote or program, alarm (on) or drives (off) is expected")
+        return {}
+
+    async def _reset(self, request: Answer) -> Answer:
+        """The person at the panel: everything released, alarm reset, drives on."""
+        controller = self._world.controller
+        controller.set_estop(pressed=False)
+        controller.set_door(is_open=False)
+        controller.switches.remote, controller.switches.program_running = True, False
+        controller.reset_alarm()
+        return {}
+
+    async def _bar_out(self, request: Answer) -> Answer:
+        self._world.ballbar.push(out=_switch(request, "on"))
+        return {}
+
+    async def _commands(self, request: Answer) -> Answer:
+        log = self._box.commands()
+        return {"commands": [[c.time_s, c.kind, list(c.args), c.moving] for c in log]}
+
+    async def _tables(self, request: Answer) -> Answer:
+        """What happened to banks, active table and lease, from the entry number ``since`` on."""
+        since = request.get("since", 0)
+        if not isinstance(since, int) or since < 0:
+            raise FixtureError("since: 0 or the number of an entry is expected")
+        found = self._box.table_accesses()[since:]
+        return {"accesses": [[a.time_s, a.kind, a.bank, a.first, list(a.words), a.by, a.taken, a.owner, a.active, a.gen] for a in found]}
+
+    async def _air(self, request: Answer) -> Answer:
+        """Somebody opens the gate: the air is warmer by so much from now on."""
+        self._world.warm_air(_number(request, "plus_c"))
+        return {}
+
+    async def _program(self, request: Answer) -> Answer:
+        """The operator starts an NC program: ``blocks`` of ["go", x, y, z, feed in mm/min] and ["rest", seconds]."""
+        controller = self._world.controller
+        here, blocks = controller.position_mm, []
+        for block in request.get("blocks") or []:
+            numbers = [float(v) for v in block[1:]]
+            place = np.array(numbers[:3]) if block[0] == "go" else here
+            seconds = float(np.linalg.norm(place - here)) / (numbers[3] / 60.0) if block[0] == "go" else numbers[0]
+            blocks.append((place, seconds))
+            here = place
+        result = controller.run_program(blocks) if blocks else None
+        if not blocks or result != 0:
+            raise FixtureError(f"the program cannot be started: {result!r}")
+        return {"seconds": sum(seconds for _, seconds in blocks)}
 
     async def _drift(self, request: Answer) -> Answer:
         axis = request.get("axis")

@@ -8,6 +8,7 @@ from typing import Any
 
 from simulators.ballbar.port import BytePort, PtyPort, TcpPort
 from simulators.ballbar.wire import BallbarWire
+from simulators.cnc.log import Command, TableAccess
 from simulators.cnc.wire import CncRegisters
 from simulators.fixture import Fixture
 from simulators.laser.wire import LaserRegisters
@@ -33,7 +34,7 @@ class Site:
         self._port = port
         self._plugged = False
         self.box = BallbarWire(self.world.ballbar, port, secrets.randbits(32), lambda: self.world.time_s)
-        cnc = CncRegisters(self.world.controller, secrets.randbits(32), self.advance)
+        self.registers = cnc = CncRegisters(self.world.controller, secrets.randbits(32), self.advance)
         laser = LaserRegisters(
             self.world.laser, secrets.randbits(32), self.advance, self.world.tool_position, clock_offset_us=LASER_CLOCK_US
         )
@@ -100,7 +101,15 @@ class Site:
             self._plugged = True
         return self._port.url
 
+    def commands(self) -> list[Command]:
+        """What the controller was told so far."""
+        return self.registers.log
+
+    def table_accesses(self) -> list[TableAccess]:
+        """Every attempt to change the controller's tables so far."""
+        return self.registers.table_log
+
     def ledger(self) -> dict[str, Any]:
-        """Samples sent and dropped since the last start."""
+        """Samples sent and dropped since the last start; ``fates``: (stream, first, last, fate) of every sample since the box was made."""
         self.box.flush()
-        return {"samples_sent": self.box.samples_sent, "samples_dropped": self.box.samples_dropped}
+        return {"samples_sent": self.box.samples_sent, "samples_dropped": self.box.samples_dropped, "fates": self.box.ledger.runs}

@@ -36,7 +36,8 @@ class World:
         # a host's lease lives in wall time, see Compensation
         self.controller = Controller(geometry, lease_scale=scenario.speed)
         self.ballbar = BallbarDevice(self.draws, scenario.magnitudes, self.locate, clock_offset_us=BALLBAR_CLOCK_US)
-        self.laser = LaserDevice(self.draws, laser_sizes(scenario), Air(scenario.seed), self.locate)
+        self.air = Air(scenario.seed)
+        self.laser = LaserDevice(self.draws, laser_sizes(scenario), self.air, self.locate)
         if self.hidden is not None:
             self.laser.too_much = self.hidden.laser_mm
             self.ballbar.too_much = self.hidden.bar_mm
@@ -81,6 +82,11 @@ class World:
         self.ballbar.settle()
         self.laser.output()
         self.machine.extra_scale[axis] += scale
+
+    def warm_air(self, plus_c: float) -> None:
+        """Let the air become warmer (K) from now on; what was sampled before is not changed."""
+        self.laser.output()
+        self.air.warmer_c += plus_c
 
     def _axes(self, times_s: F) -> F:
         """Where the axes stand at n instants from now on, in order: lost motion and hidden effects remember what went before, (n, 3) mm."""

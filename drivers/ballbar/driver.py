@@ -3,78 +3,30 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 
-from drivers.api import BarBatch, BarSample, DeviceInfo
+from drivers.api import BarBatch, BarTap, DeviceInfo
 from drivers.ballbar import frames
-from drivers.ballbar.sequence import Run, SequenceRestart, SequenceTracker
-from drivers.errors import BadFrame, DriverError, LinkDown, Rebooted, Refused, ReplyTimeout
+from drivers.ballbar.box import Box
+from drivers.ballbar.conversation import Conversation
+from drivers.ballbar.framing import BarCounters, Framing
+from drivers.ballbar.sequence import SegmentEnd
+from drivers.ballbar.stream import SLOW, Stream
+from drivers.errors import Backpressure, DriverError, LinkDown, LossyLine, Rebooted, Refused, ReplyTimeout, SettingsChanged, WrongDevice
+from drivers.links.backoff import Backoff
+from drivers.links.incidents import Incidents
+from drivers.links.reading import Ring
 from drivers.links.serial_link import ByteLink
 from drivers.links.shielded import run_to_end
 
 _ANSWER_S = 1.0
+_SILENCE_S = 1.0
 _BUFFER_S = 30.0
-_READ_BYTES = 65536
-_PUMP_S = 3600.0
-
-
-@dataclass(slots=True)
-class BarCounters:
-    """What went wrong on the wire so far, for diagnostics; none of it reaches the data."""
-
-    bad_bytes: int = 0
-    duplicates: int = 0
-    overflow: int = 0
-
-
-class _Stream:
-    """The buffer between the wire and a consumer who may be slow: bounded, and what does not fit is reported as missing."""
-
-    def __init__(self, rate_hz: int) -> None:
-        self.tracker = SequenceTracker(rate_hz)
-        self._room = int(_BUFFER_S * rate_hz)
-        self._batches: deque[BarBatch] = deque()
-        self._lost = 0
-        self._error: DriverError | None = None
-        self._news = asyncio.Event()
-
-    def put(self, host_s: float, runs: list[Run]) -> int:
-        """Take what arrived; return how many samples did not fit."""
-        dropped = 0
-        for run in runs:
-            if len(run.samples) > self._room:
-                self._lost += run.missing + len(run.samples)
-                dropped += len(run.samples)
-                continue
-            self._room -= len(run.samples)
-            self._batches.append(BarBatch(host_s, run.samples, run.missing + self._lost))
-            self._lost = 0
-        if self._batches:
-            self._news.set()
-        return dropped
-
-    def fail(self, error: DriverError) -> None:
-        """End the stream after what is already buffered."""
-        if self._error is None:
-            self._error = error
-        self._news.set()
-
-    async def get(self, timeout_s: float) -> BarBatch:
-        """Wait for the next batch; TimeoutError when none comes."""
-        if not self._batches and self._error is None:
-            async with asyncio.timeout(timeout_s):
-                await self._news.wait()
-        if self._batches:
-            batch = self._batches.popleft()
-            self._room += len(batch.samples)
-            if not self._batches and self._error is None:
-                self._news.clear()
-            return batch
-        assert self._error is not None
-        raise self._error
+_FRAME_BYTES = 24
+_DRAIN_S = 10.0
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 2.0
+_MAX_RATE_HZ = 1000
 
 
 class SerialBallBar:
@@ -83,18 +35,22 @@ class SerialBallBar:
     Parameters
     ----------
     link : ByteLink
-        Where the box is; opened on first use, and again after the device was lost.
+        Where the box is; opened on first use, and again after the device was lost. The first box that answers is the one from then on:
+        another serial number is refused, as is one that is not the serial number in the URL.
+    ring_s : float
+        How many seconds of bytes at full rate may wait to be framed and stored.
     """
 
-    def __init__(self, link: ByteLink) -> None:
+    def __init__(self, link: ByteLink, *, ring_s: float = _BUFFER_S) -> None:
         self._link = link
         self.name = link.name
         self.counters = BarCounters()
-        self._pump: asyncio.Task[None] | None = None
-        self._answers: dict[int, asyncio.Future[frames.Info | frames.Ack]] = {}
-        self._tag = 0
-        self._boot_id: int | None = None
-        self._stream: _Stream | None = None
+        self._ring_bytes = int(ring_s * _MAX_RATE_HZ * _FRAME_BYTES)
+        self._framing: Framing | None = None
+        self.incidents = Incidents()
+        self._talk = Conversation(self.name, self._send, self.counters, lambda: _ANSWER_S, lambda: self.backlog)
+        self._box = Box(self.name, self._talk, link.serial_no)
+        self._stream: Stream | None = None
         self._streaming = False
 
     async def open(self) -> None:
@@ -103,41 +59,139 @@ class SerialBallBar:
         Raises
         ------
         LinkDown
-            The port cannot be opened.
+            The port cannot be opened or read.
         """
-        if self._pump is not None and not self._pump.done():
+        if self._link.is_open and self._framing is not None and self._framing.runs:
             return
-        await self._link.close()
+        await self._hang_up()
         await self._link.open()
-        self._pump = asyncio.get_running_loop().create_task(self._read_forever(), name=f"read {self.name}")
+        ring = Ring(self._ring_bytes)
+        try:
+            self._framing = Framing(self.name, ring, self.counters, self._answer, self._restarted, self._broken)
+            self._link.start_reading(ring, self._fail)
+        except (LinkDown, OSError, RuntimeError) as error:  # lost at once, or no more descriptors or threads
+            ring.end()
+            await self._hang_up()
+            if isinstance(error, LinkDown):
+                raise
+            remedy = "end other programs, or raise the limit of open files"
+            raise LinkDown(self.name, "open", f"the line cannot be read: {error}", remedy) from error
 
     async def identify(self) -> DeviceInfo:
-        """Ask the box who it is, and accept its boot id as the one that counts from now on.
+        """Ask the box who it is and how it reads, and accept its boot id as the one that counts from now on.
 
         Raises
         ------
-        LinkDown, ReplyTimeout
-            Nobody there, or no answer.
+        WrongDevice
+            Another box than the one that was here before, or than the URL says.
+        LinkDown, ReplyTimeout, BadFrame
+            Nobody there, no answer, or nothing that can be understood.
         """
-        info = await self._who()
-        self._boot_id = info.boot_id
+        try:
+            info = await self._box.accept()
+        except DriverError as error:
+            self.incidents.note(error, latched=isinstance(error, _LATCHED))
+            raise
+        self.incidents.accepted()
         firmware = f"{info.firmware >> 8:x}.{info.firmware & 0xFF:x}"
         return DeviceInfo("ballbar", info.model, str(info.serial_no), info.boot_id, firmware)
 
+    async def peek_boot_id(self) -> int | None:
+        """Boot id of the box that answers now, without accepting it as the one that counts; None if nobody answers."""
+        try:
+            return await self._box.peek()
+        except DriverError:
+            return None
+
+    async def recover(self, *, within_s: float) -> DeviceInfo:
+        """Wait until the same box answers again, for example after its cable was pulled; the line is opened anew as often as needed.
+
+        Parameters
+        ----------
+        within_s : float
+            How long to try. The waits between attempts grow from 0.1 to 2 s.
+
+        Raises
+        ------
+        WrongDevice
+            Another box answers: it is refused at once.
+        LinkDown, ReplyTimeout, BadFrame
+            Of the last attempt, when the time is over.
+        """
+        clock = asyncio.get_running_loop().time
+        until_s, backoff = clock() + within_s, Backoff(_FIRST_WAIT_S, _LONGEST_WAIT_S)
+        while True:
+            backoff.attempted()
+            try:
+                return await self.identify()
+            except WrongDevice:
+                raise
+            except DriverError:
+                if clock() + backoff.left_s() > until_s:
+                    raise
+            await self._hang_up()  # a line that answers nothing may be stuck: a fresh one costs nothing
+            await backoff.due()
+
+    async def make_ready(self, *, within_s: float) -> DeviceInfo:
+        """Before a new stream: the same box, found again if need be, and reading as at first if it was switched on anew meanwhile.
+
+        What was measured before and what comes now are streams of their own: nothing here joins them.
+
+        Parameters
+        ----------
+        within_s : float
+            How long to look for it; as for ``recover``.
+
+        Raises
+        ------
+        Rebooted
+            It was switched on anew and does not tell how it reads (firmware 1.0): a person has to look.
+        WrongDevice, Refused, LinkDown, ReplyTimeout, BadFrame
+            As for ``recover`` and ``restore_settings``.
+        """
+        known = self._box.boot_id
+        info = await self.recover(within_s=within_s)
+        if known in (None, info.boot_id):
+            return info
+        error = self._box.rebooted(f"boot id {info.boot_id:#x} instead of {known:#x}")
+        self.incidents.note(error, latched=True)
+        if self._box.settings is None:
+            self._box.boot_id = known  # nobody has accepted it
+            raise error
+        await self.restore_settings()
+        self.incidents.accepted()
+        return info
+
+    async def restore_settings(self) -> None:
+        """Give the box the unit, range and zero back that it had when this driver first met it.
+
+        Raises
+        ------
+        Refused
+            The box does not take them.
+        LinkDown, ReplyTimeout, BadFrame, WrongDevice
+            As for ``identify``.
+        """
+        await self._box.restore()
+
     @asynccontextmanager
-    async def stream(self, rate_hz: int) -> AsyncIterator[AsyncIterator[BarBatch]]:
+    async def stream(self, rate_hz: int, tap: BarTap | None = None) -> AsyncIterator[AsyncIterator[BarBatch]]:
         """Stream samples while the context is open; the box is told to stop when it ends, however it ends.
 
         Parameters
         ----------
         rate_hz : int
             Samples per second of device time; must divide 1000.
+        tap : BarTap, optional
+            Takes every sample until the box has stopped, before the consumer and however slow he is.
 
         Yields
         ------
         AsyncIterator of BarBatch
             ``missing`` counts samples that the wire lost or that a consumer more than 30 s behind let go. The iterator
-            raises ``Rebooted`` when the box restarted, ``ReplyTimeout`` after max(1 s, 50 periods) of silence, ``LinkDown``.
+            raises ``Rebooted`` when the box restarted, ``ReplyTimeout`` after max(1 s, 50 periods) of silence, ``LinkDown``; with a tap
+            ``Backpressure`` as soon as the ring, or the consumer's buffer, is 80 % full. ``SettingsChanged`` when unit, range or zero of
+            the box were changed, ``LossyLine`` when more is lost than a run may lose.
 
         Raises
         ------
@@ -145,35 +199,87 @@ class SerialBallBar:
             The box does not accept this rate, or is already streaming to somebody here.
         Rebooted
             The box has restarted since ``identify``.
+        SettingsChanged
+            The box reads otherwise than when this driver first met it: ``restore_settings``.
+        LossyLine
+            At the end: the whole stream lost more than 0.1 % of its samples.
+        Backpressure
+            At the end: samples that had arrived did not get through to the tap in 10 s.
         """
         if rate_hz <= 0 or 1000 % rate_hz:
             raise Refused(self.name, "start stream", f"{rate_hz} Hz does not divide 1000", "choose 1000, 500, 250, 200, 125, 100 ...")
         if self._streaming:
             raise Refused(self.name, "start stream", "a stream is already running", "leave it first")
-        self._streaming = True
+        self._streaming = through = True
         try:
-            await self._check_boot()
-            # A box left streaming by a crashed program still sends: stop it, so that old samples cannot enter the new stream.
-            await self._command(frames.STOP, None)
-            stream = self._stream = _Stream(rate_hz)
-            await self._command(frames.START, rate_hz)
-            yield self._batches(stream, max(1.0, 50 / rate_hz))
+            await self._ready()
+            stream = Stream(self.name, rate_hz, _BUFFER_S, tap, self._box.boot_id or 0, reads=self._box.reads)
+            bad_bytes = self.counters.bad_bytes
+            self._attach(stream)
+            self.incidents.good()
+            await self._talk.command(frames.START, lambda tag: frames.start_command(tag, rate_hz))
+            yield self._batches(stream, max(_SILENCE_S, 50 / rate_hz))
+            self._judge(stream, self.counters.bad_bytes - bad_bytes)
+        except DriverError as error:
+            if error.device == self.name:  # whoever measures may fail at another device
+                self.incidents.note(error, latched=isinstance(error, _LATCHED))
+            raise
         finally:
-            self._stream = None
+            if self._stream is not None:
+                self._stream.leave()
             try:
                 await run_to_end(self._stop_quietly())
+                if self._stream is not None:
+                    through = await run_to_end(self._given_on())
+                    await run_to_end(asyncio.to_thread(self._stream.finish))
             finally:
+                self._attach(None)
                 self._streaming = False
+        if not through:  # with another error on its way the run is not complete anyway
+            waited = Backpressure(self.name, "end stream", f"samples still waited {_DRAIN_S:g} s after the box had stopped", SLOW)
+            self.incidents.note(waited)
+            raise waited
+
+    async def _given_on(self) -> bool:
+        """Whatever ended the stream, what had arrived by then is given to the tap; after an answer to STOP all of it is already."""
+        return self._framing is None or self._stream is None or self._stream.tap is None or await self._framing.drained(_DRAIN_S)
 
     async def close(self) -> None:
         """Close the line. Closing twice does nothing."""
-        pump, self._pump = self._pump, None
-        if pump is not None:
-            pump.cancel()
-            await asyncio.wait([pump])
-        await self._link.close()
+        await self._hang_up()
+        self.incidents.closed()
 
-    async def _batches(self, stream: _Stream, silence_s: float) -> AsyncIterator[BarBatch]:
+    async def _hang_up(self) -> None:
+        framing, self._framing = self._framing, None
+        await self._link.close()  # what was read until now is framed and given to the stream; what the kernel holds is read before
+        if framing is not None:
+            await framing.ended()
+
+    def _attach(self, stream: Stream | None) -> None:
+        self._stream = stream
+        if self._framing is not None:
+            self._framing.stream = stream
+
+    @property
+    def state(self) -> str:
+        """``ready``, ``streaming``, ``down`` (the next call opens it), ``aborted: CODE`` until a stream begins or it is identified."""
+        if self.incidents.open is not None:
+            return f"aborted: {self.incidents.open.code}"
+        if not self._link.is_open:
+            return "down"
+        return "streaming" if self._streaming else "ready"
+
+    @property
+    def settings(self) -> frames.Settings | None:
+        """Unit, range and zero of the box as it told them last; None before it was identified, and of firmware 1.0, which does not tell."""
+        return self._box.settings
+
+    @property
+    def backlog(self) -> float:
+        """How full the ring between reading and storing is, 0 to 1."""
+        return 0.0 if self._framing is None else self._framing.ring.fill
+
+    async def _batches(self, stream: Stream, silence_s: float) -> AsyncIterator[BarBatch]:
         while True:
             try:
                 batch = await stream.get(silence_s)
@@ -181,105 +287,54 @@ class SerialBallBar:
                 break
             yield batch
         # Silence: a box that restarted sits there idle. Ask, so that the user hears the true reason.
-        await self._check_boot()
+        await self._box.check_boot()
         raise ReplyTimeout(self.name, "read samples", f"no sample for {silence_s:g} s", "box switched off, or stopped by another program?")
 
+    async def _ready(self) -> None:
+        await self._box.check_boot()
+        self._box.check_settings()
+        # A box left streaming by a crashed program still sends: stop it, so that old samples cannot enter the new stream.
+        await self._talk.command(frames.STOP, frames.stop_command)
+
+    def _judge(self, stream: Stream, bad_bytes: int) -> None:
+        verdict = stream.verdict(bad_bytes)
+        if isinstance(verdict, LossyLine):
+            raise verdict
+        if verdict is not None:  # noted and over: every gap is recorded
+            self.incidents.note(verdict)
+            self.incidents.good()
+
     async def _stop_quietly(self) -> None:
+        if not self._link.is_open:
+            return  # what is plugged in next may be another box: it is asked first, and stopped before it is started
         try:
-            await self._command(frames.STOP, None)
+            await self._talk.command(frames.STOP, frames.stop_command)
         except DriverError:
             # The box is gone or mute: the reason already reaches the user from the stream itself, and the next stream stops it first.
-            self._answers.clear()
+            self._talk.forget()
 
-    async def _check_boot(self) -> None:
-        info = await self._who()
-        if self._boot_id is None:
-            self._boot_id = info.boot_id
-        if info.boot_id != self._boot_id:
-            raise self._rebooted(f"boot id {info.boot_id:#x} instead of {self._boot_id:#x}")
-
-    async def _who(self) -> frames.Info:
-        tag = self._next_tag()
-        answer = await self._ask(tag, frames.identify_command(tag), "identify")
-        if not isinstance(answer, frames.Info):
-            raise BadFrame(self.name, "identify", "an ACK came instead of the INFO", "is this a ball-bar box of protocol version 1?")
-        return answer
-
-    async def _command(self, kind: int, rate_hz: int | None) -> None:
-        tag = self._next_tag()
-        operation = "start stream" if kind == frames.START else "stop stream"
-        data = frames.stop_command(tag) if rate_hz is None else frames.start_command(tag, rate_hz)
-        answer = await self._ask(tag, data, operation)
-        if not isinstance(answer, frames.Ack) or answer.command != kind:
-            raise BadFrame(self.name, operation, "the answer belongs to another command", "is another program talking to this box?")
-        if answer.result:
-            raise Refused(
-                self.name, operation, frames.ACK_TEXT.get(answer.result, f"result {answer.result}"), "is the rate one the box can do?"
-            )
-
-    def _next_tag(self) -> int:
-        self._tag = self._tag % 0xFFFF + 1
-        return self._tag
-
-    async def _ask(self, tag: int, data: bytes, operation: str) -> frames.Info | frames.Ack:
+    async def _send(self, data: bytes) -> None:
         await self.open()
-        future: asyncio.Future[frames.Info | frames.Ack] = asyncio.get_running_loop().create_future()
-        self._answers[tag] = future
-        try:
-            await self._link.write(data, timeout_s=_ANSWER_S)
-            async with asyncio.timeout(_ANSWER_S):
-                return await future
-        except TimeoutError as error:
-            if isinstance(error, DriverError):
-                raise
-            raise ReplyTimeout(self.name, operation, f"no answer within {_ANSWER_S:g} s", "box on? baud rate and port right?") from None
-        finally:
-            self._answers.pop(tag, None)
+        await self._link.write(data, timeout_s=_ANSWER_S)
 
-    async def _read_forever(self) -> None:
-        decoder = frames.FrameDecoder()
-        try:
-            while True:
-                try:
-                    host_s, data = await self._link.read(_READ_BYTES, timeout_s=_PUMP_S)
-                except ReplyTimeout:
-                    continue  # silence is judged by those who wait for something
-                self._sort(host_s, decoder.feed(data))
-        except LinkDown as error:
-            self._fail(error)
+    def _answer(self, frame: frames.Answer) -> None:
+        if isinstance(frame, frames.Info) and self._stream is not None and self._box.boot_id not in (None, frame.boot_id):
+            self._stream.fail(self._box.rebooted(f"boot id {frame.boot_id:#x} instead of {self._box.boot_id:#x}"))
+            if self._framing is not None:
+                self._framing.stream = None  # nothing more of it may reach the tap
+        self._talk.answered(frame)
 
-    def _sort(self, host_s: float, received: list[frames.Frame]) -> None:
-        samples: list[BarSample] = []
-        for frame in received:
-            if isinstance(frame, BarSample):
-                samples.append(frame)
-            elif isinstance(frame, frames.Bad):
-                self.counters.bad_bytes += frame.n_bytes
-            else:
-                self._answer(frame)
-        stream = self._stream
-        if stream is None or not samples:
-            return
-        before = stream.tracker.duplicates
-        try:
-            self.counters.overflow += stream.put(host_s, stream.tracker.accept(samples))
-        except SequenceRestart as event:
-            stream.fail(self._rebooted(str(event)))
-        self.counters.duplicates += stream.tracker.duplicates - before
+    def _restarted(self, stream: Stream, why: SegmentEnd) -> None:
+        stream.fail(self._box.error_of(why))
 
-    def _answer(self, frame: frames.Info | frames.Ack) -> None:
-        if isinstance(frame, frames.Info) and self._stream is not None and self._boot_id not in (None, frame.boot_id):
-            self._stream.fail(self._rebooted(f"boot id {frame.boot_id:#x} instead of {self._boot_id:#x}"))
-        future = self._answers.get(frame.tag)
-        if future is not None and not future.done():
-            future.set_result(frame)
+    def _broken(self, error: Exception) -> None:
+        self._fail(LinkDown(self.name, "read", f"the program could not go on: {error!r}", "report this"))
 
     def _fail(self, error: LinkDown) -> None:
-        for future in self._answers.values():
-            if not future.done():
-                future.set_exception(error)
+        self.incidents.note(error)
+        self._talk.fail(error)
         if self._stream is not None:
             self._stream.fail(error)
 
-    def _rebooted(self, detail: str) -> Rebooted:
-        return Rebooted(self.name, "stream", detail, "the box restarted: call identify, then measure this test again")
+
+_LATCHED = (WrongDevice, Rebooted, SettingsChanged)

@@ -8,6 +8,7 @@ from drivers.api import CompStatus
 from drivers.cnc import registers as reg
 from drivers.cnc.session import ControllerSession
 from drivers.errors import BadFrame, DeviceFault, Refused
+from drivers.links.modbus_policy import Op
 from drivers.links.numbered import next_number, run_numbered
 from drivers.links.words import bytes_of, words_of
 
@@ -16,6 +17,9 @@ _SEQLOCK_TRIES = 4
 _HEADER_WORDS = 24
 _LENGTH_WORD = 3
 _MAGIC = 0xABBE
+_TRIES = 4
+_SEALED = (2, 3)
+_LEASED = 7
 
 
 class Banks:
@@ -36,7 +40,7 @@ class Banks:
         """See ``ModbusController.comp_status``."""
         for _ in range(_SEQLOCK_TRIES):
             before = await self._seqlock()
-            words = await self._session.link.read(reg.COMP_STATUS.base, reg.COMP_STATUS.count)
+            words = await self._session.link.read_block(reg.COMP_STATUS)
             if await self._seqlock() == before:
                 boot_id, gen = before
                 return reg.decode_comp_status(words, boot_id=boot_id, gen=gen)
@@ -50,7 +54,7 @@ class Banks:
             raise Refused(self._name, "write bank", f"{len(image)} bytes are not an image of 1..{reg.BANK_REGISTERS} registers")
         words = words_of(image)
         for first in range(0, len(words), _WINDOW):
-            await self._session.link.write(base + first, words[first : first + _WINDOW])
+            await self._session.link.write(base + first, words[first : first + _WINDOW], Op.NUMBERED)
 
     async def read(self, bank: int, n_bytes: int | None) -> bytes:
         """See ``ModbusController.read_bank``."""
@@ -63,16 +67,26 @@ class Banks:
             count = n_bytes // 2
         words: list[int] = []
         for first in range(0, count, _WINDOW):
-            words += await self._session.link.read(base + first, min(_WINDOW, count - first))
+            words += await self._session.link.read(base + first, min(_WINDOW, count - first), lead=first)
         return bytes_of(words)
 
-    async def lease(self, owner: int, lease_ms: int) -> None:
-        """See ``ModbusController.lease``."""
-        await self._command(reg.LEASE, "take the lease", owner=owner, lease_ms=lease_ms)
+    async def write_part(self, bank: int, first: int, data: bytes) -> None:
+        """See ``ModbusController.write_part``."""
+        base = self._part(bank, "write part of bank", first, len(data))
+        await self._session.link.write(base + first, words_of(data), Op.NUMBERED)
 
-    async def release(self, owner: int) -> None:
+    async def read_part(self, bank: int, first: int, n_bytes: int) -> bytes:
+        """See ``ModbusController.read_part``."""
+        base = self._part(bank, "read part of bank", first, n_bytes)
+        return bytes_of(await self._session.link.read(base + first, n_bytes // 2, lead=first))
+
+    async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
+        """See ``ModbusController.lease``."""
+        await self._command(reg.LEASE, "take the lease", anyway=anyway, owner=owner, lease_ms=lease_ms)
+
+    async def release(self, owner: int, *, anyway: bool = False) -> None:
         """See ``ModbusController.release``."""
-        await self._command(reg.RELEASE, "release the lease", owner=owner)
+        await self._command(reg.RELEASE, "release the lease", anyway=anyway, owner=owner)
 
     async def seal(self, bank: int, owner: int) -> None:
         """See ``ModbusController.seal``."""
@@ -88,34 +102,53 @@ class Banks:
         if active != bank:
             raise DeviceFault(self._name, operation, f"acknowledged, but bank {active} is active", "do not measure; look at the controller")
 
-    async def _command(self, command: int, operation: str, **fields: int) -> None:
+    async def _command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
+        """Send a command and find out what became of it.
+
+        Two programs can take the same number: the controller executes the first and passes over the second, and its acknowledge looks the
+        same to both. So what the acknowledge says is held against who has the lease. A command that was passed over was certainly not
+        executed and never will be; it is sent again under another number, but for ACTIVATE: whoever asked decides about that.
+        """
         async with self._commands:
-            await self._session.check_boot()
-            number = next_number((await self._comp_counts())["COMP_ACK_SEQ"])
-            try:
-                words = reg.encode_comp(number, command, **fields)
-            except ValueError as error:
-                raise Refused(self._name, operation, str(error)) from None
-
-            async def write() -> None:
-                await self._session.link.write(reg.COMP_ADDRESS, words)
-
-            result = await run_numbered(self._name, operation, number, write, self._acknowledge)
+            for _ in range(1 if command == reg.ACTIVATE else _TRIES):
+                result, counts = await self._once(command, operation, fields, anyway=anyway)
+                if not _passed_over(command, result, counts, fields):
+                    break
+            else:
+                detail = "another program's command took its number: it was not executed"
+                raise DeviceFault(self._name, operation, detail, "let one program at a time push; read the status again, then decide")
         if result:
             raise Refused(self._name, operation, reg.COMP_RESULT.get(result, f"result {result}"), "read the status again, then decide")
 
-    async def _acknowledge(self) -> tuple[int, int]:
-        connection = self._session.link.connections
+    async def _once(self, command: int, operation: str, fields: dict[str, int], *, anyway: bool) -> tuple[int, dict[str, int]]:
+        await self._session.check_boot()
         counts = await self._comp_counts()
-        if connection != self._session.link.connections:
-            await self._session.check_boot()  # after a restart the numbers begin anew and would prove nothing
-        return counts["COMP_ACK_SEQ"], counts["COMP_RESULT"]
+        if not anyway and command in (reg.LEASE, reg.RELEASE) and counts["LEASE_OWNER"] not in (0, fields["owner"]):
+            return _LEASED, counts  # asking all the same would take the number from under a command of whoever has it
+        number = next_number(counts["COMP_ACK_SEQ"])
+        try:
+            words = reg.encode_comp(number, command, **fields)
+        except ValueError as error:
+            raise Refused(self._name, operation, str(error)) from None
+
+        async def write() -> None:
+            await self._session.link.write(reg.COMP_ADDRESS, words, Op.NUMBERED)
+
+        async def acknowledge() -> tuple[int, int]:
+            nonlocal counts
+            connection = self._session.link.connections
+            counts = await self._comp_counts()
+            if connection != self._session.link.connections:
+                await self._session.check_boot()  # after a restart the numbers begin anew and would prove nothing
+            return counts["COMP_ACK_SEQ"], counts["COMP_RESULT"]
+
+        return await run_numbered(self._name, operation, number, write, acknowledge), counts
 
     async def _comp_counts(self) -> dict[str, int]:
-        return reg.COMP_STATUS.counts(await self._session.link.read(reg.COMP_STATUS.base, reg.COMP_STATUS.count))
+        return reg.COMP_STATUS.counts(await self._session.link.read_block(reg.COMP_STATUS))
 
     async def _seqlock(self) -> tuple[int, int]:
-        counts = reg.SEQLOCK.counts(await self._session.link.read(reg.SEQLOCK.base, reg.SEQLOCK.count))
+        counts = reg.SEQLOCK.counts(await self._session.link.read_block(reg.SEQLOCK))
         return counts["BOOT_ID"], counts["GEN"]
 
     async def _length(self, bank: int, base: int) -> int:
@@ -126,7 +159,25 @@ class Banks:
             raise BadFrame(self._name, "read bank", detail, "empty or half written: give the number of bytes to read it all the same")
         return length
 
+    def _part(self, bank: int, operation: str, first: int, n_bytes: int) -> int:
+        base = self._base(bank, operation)
+        if n_bytes % 2 or first % 2 or not 0 < n_bytes <= 2 * _WINDOW or not 0 <= first <= reg.BANK_REGISTERS - n_bytes // 2:
+            raise Refused(self._name, operation, f"registers {first}.. with {n_bytes} bytes are not 1..{_WINDOW} registers of a bank")
+        return base
+
     def _base(self, bank: int, operation: str) -> int:
         if bank not in (0, 1):
             raise Refused(self._name, operation, f"there is no bank {bank}", "use 0 or 1")
         return reg.BANK_BASE[bank]
+
+
+def _passed_over(command: int, result: int, counts: dict[str, int], fields: dict[str, int]) -> bool:
+    """Whether an acknowledge is that of another program's command: what it says does not go with who has the lease."""
+    owner, holder = fields["owner"], counts["LEASE_OWNER"]
+    if result == _LEASED:
+        return holder == owner or (command in (reg.LEASE, reg.RELEASE) and holder == 0)
+    if result:
+        return False
+    if command == reg.SEAL:
+        return counts[f"BANK_STATE_{fields['bank']}"] not in _SEALED
+    return (holder != owner) if command == reg.LEASE else (command == reg.RELEASE and holder == owner)

@@ -9,7 +9,7 @@ from drivers.cnc import registers as reg
 from drivers.cnc.banks import Banks
 from drivers.cnc.motion import Motion
 from drivers.cnc.session import ControllerSession
-from drivers.links.modbus import ModbusLink
+from drivers.links.modbus_link import ModbusLink
 
 
 class ModbusController:
@@ -30,6 +30,8 @@ class ModbusController:
         self._motion = Motion(self._session)
         self._banks = Banks(self._session)
         self.name = link.name
+        self.incidents = link.incidents
+        """Account of what went wrong on the link: one entry when it was noticed, one when it was over."""
 
     async def identify(self) -> DeviceInfo:
         """Ask the controller who it is, and accept its boot id as the one that counts from now on.
@@ -139,25 +141,27 @@ class ModbusController:
         """
         return await self._banks.status()
 
-    async def lease(self, owner: int, lease_ms: int) -> None:
+    async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
         """Take (or prolong) the right to change banks for ``lease_ms`` ms; ``owner`` is any u32 but 0.
 
-        Raises
-        ------
-        Refused
-            Another owner has it.
-        """
-        await self._banks.lease(owner, lease_ms)
-
-    async def release(self, owner: int) -> None:
-        """Give the lease back.
+        While the status says that another owner has it, nothing is sent, unless ``anyway``: a trial of whether the controller refuses.
 
         Raises
         ------
         Refused
             Another owner has it.
         """
-        await self._banks.release(owner)
+        await self._banks.lease(owner, lease_ms, anyway=anyway)
+
+    async def release(self, owner: int, *, anyway: bool = False) -> None:
+        """Give the lease back; ``anyway`` as for `lease`.
+
+        Raises
+        ------
+        Refused
+            Another owner has it.
+        """
+        await self._banks.release(owner, anyway=anyway)
 
     async def write_bank(self, bank: int, image: bytes) -> None:
         """Write an image into the inactive bank, in windows that never split a value. Read it back before trusting it.
@@ -178,6 +182,20 @@ class ModbusController:
             The bank holds no image and no length was given.
         """
         return await self._banks.read(bank, n_bytes)
+
+    async def write_part(self, bank: int, first: int, data: bytes) -> None:
+        """Write the registers of the inactive bank from ``first`` on, in one request: at most 100, an even number.
+
+        Raises
+        ------
+        Refused
+            The bank is active, or the registers are not within it.
+        """
+        await self._banks.write_part(bank, first, data)
+
+    async def read_part(self, bank: int, first: int, n_bytes: int) -> bytes:
+        """Read the registers of a bank from ``first`` on, whatever they hold, in one request: at most 100."""
+        return await self._banks.read_part(bank, first, n_bytes)
 
     async def seal(self, bank: int, owner: int) -> None:
         """Let the controller check the bank's image and compute its CRC.

@@ -11,11 +11,14 @@ from drivers.cnc import registers as reg
 from drivers.cnc.registers import Bit
 from drivers.cnc.session import ControllerSession
 from drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
+from drivers.links.modbus_policy import Op
 from drivers.links.numbered import next_number, run_numbered
 from drivers.links.shielded import run_to_end
 
 _POLL_S = 0.003
-_HOLD_S = 5.0
+_HOLD_S = 3.0
+_HOLD_AGAIN_S = 0.05
+_INTERLOCK = 2
 _STOP_S = 5.0
 
 
@@ -37,13 +40,14 @@ class Motion:
         """See ``ModbusController.move``."""
         target = self._counts(target_mm, "move")
         try:
-            async with asyncio.timeout(timeout_s), self._hold_on_trouble():
+            async with self._hold_on_trouble(), asyncio.timeout(timeout_s):
                 number = await self._command(reg.MOVE, "move", target, feed_mm_min)
                 status = await self._done(number)
         except TimeoutError as error:
             if isinstance(error, DriverError):
                 raise
-            raise ReplyTimeout(self._name, "move", f"not in position after {timeout_s:g} s, feed hold set", "override at 0?") from None
+            late = ReplyTimeout(self._name, "move", f"not in position after {timeout_s:g} s, feed hold set", "override at 0?")
+            raise _with_notes(late, error) from None
         if self._counts(status.position_mm, "move") != target:
             detail = f"the move ended at {status.position_mm} instead of {tuple(target_mm)}: aborted"
             raise DeviceFault(self._name, "move", detail, "start again when the reason is known")
@@ -73,13 +77,8 @@ class Motion:
         await self._command(reg.RESET_ALARM, "reset alarm")
 
     async def request_hold(self, level: int) -> None:
-        """Write the level of HOLD_REQUEST. It is a level, not an event: writing it again changes nothing, so it may be repeated."""
-        try:
-            await self._session.link.write(reg.HOLD_ADDRESS, (level,))
-        except DriverError as error:
-            if not error.retryable:
-                raise
-            await self._session.link.write(reg.HOLD_ADDRESS, (level,))
+        """Write the level of HOLD_REQUEST. It is a level, not an event: writing it again changes nothing, so the link may repeat it."""
+        await self._session.link.write(reg.HOLD_ADDRESS, (level,), Op.LEVEL)
 
     async def abort(self) -> None:
         """See ``ModbusController.abort``."""
@@ -115,11 +114,21 @@ class Motion:
         async def hold() -> None:
             try:
                 async with asyncio.timeout(_HOLD_S):
-                    await self.request_hold(reg.HOLD)
+                    await self._hold_again_and_again()
             except (DriverError, TimeoutError) as error:
                 reason.add_note(f"and the feed hold could not be sent: {error}")
 
         await run_to_end(hold())
+
+    async def _hold_again_and_again(self) -> None:
+        """A controller that is gone may be back in a moment, and its axes with it: the hold is tried as often as the link lets us."""
+        while True:
+            try:
+                return await self.request_hold(reg.HOLD)
+            except DriverError as error:
+                if not error.retryable:
+                    raise
+            await asyncio.sleep(_HOLD_AGAIN_S)
 
     async def _command(self, command: int, operation: str, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> int:
         async with self._commands:
@@ -134,7 +143,7 @@ class Motion:
                 raise Refused(self._name, operation, str(error)) from None
 
             async def write() -> None:
-                await self._session.link.write(reg.MOTION_ADDRESS, words)
+                await self._session.link.write(reg.MOTION_ADDRESS, words, Op.NUMBERED)
 
             async def acknowledge() -> tuple[int, int]:
                 now = await self._session.status()
@@ -143,7 +152,9 @@ class Motion:
             result = await run_numbered(self._name, operation, number, write, acknowledge)
         if result:
             detail = reg.MOTION_RESULT.get(result, f"result {result}") + (f": {', '.join(reasons)}" if reasons else "")
-            raise Refused(self._name, operation, detail, "look at the machine, then try again")
+            # HOLD_REQUEST left at 2 forbids motion without a bit of the status saying so
+            unseen = "was an abort not finished? call abort again; else " if result == _INTERLOCK and not reasons else ""
+            raise Refused(self._name, operation, detail, f"{unseen}look at the machine, then try again")
         return number
 
     async def _done(self, number: int) -> ControllerStatus:
@@ -174,7 +185,7 @@ class Motion:
             number = next_number((await self._session.status()).fifo_ack_seq)
 
             async def write() -> None:
-                await self._session.link.write(reg.FIFO_ADDRESS, reg.encode_fifo(number, points))
+                await self._session.link.write(reg.FIFO_ADDRESS, reg.encode_fifo(number, points), Op.NUMBERED)
 
             async def acknowledge() -> tuple[int, int]:
                 now = await self._session.status()
@@ -189,6 +200,13 @@ class Motion:
             return reg.position_counts(point_mm)
         except ValueError as error:
             raise Refused(self._name, operation, str(error)) from None
+
+
+def _with_notes(error: DriverError, former: BaseException) -> DriverError:
+    """An error that says what its forerunner had to add: that the feed hold is not set after all, for one."""
+    for note in getattr(former, "__notes__", ()):
+        error.add_note(note)
+    return error
 
 
 class _Stopped(DeviceFault):

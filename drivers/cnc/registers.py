@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
 
 from drivers.api import CompStatus, ControllerStatus, Point
@@ -30,7 +30,7 @@ IDENTITY = Block(
         Register(12, "u16", "FIFO_SIZE"),
     ),
 )
-SEQLOCK = Block(5, 4, (Register(5, "u32", "BOOT_ID"), Register(7, "u32", "GEN")))
+SEQLOCK = Block(5, 4, (Register(5, "u32", "BOOT_ID"), Register(7, "u32", "GEN")), lead=5)
 
 STATUS = Block(
     16,
@@ -54,6 +54,7 @@ STATUS = Block(
         Register(48, "u16", "FIFO_ACK_SEQ"),
         Register(49, "u16", "FIFO_RESULT"),
     ),
+    lead=16,
 )
 
 COMP_STATUS = Block(
@@ -75,6 +76,7 @@ COMP_STATUS = Block(
 MOTION_ADDRESS, HOLD_ADDRESS, FIFO_ADDRESS, COMP_ADDRESS = 64, 80, 96, 230
 BANK_BASE = (1000, 6000)
 BANK_REGISTERS = 4800
+AXES = 3
 
 MOVE, PATH_CLEAR, PATH_START, RESET_ALARM = 1, 2, 3, 4
 RUN, HOLD, ABORT = 0, 1, 2
@@ -95,6 +97,7 @@ COMP_RESULT = {
     5: "the bank is active",
     6: "the bank holds no valid image",
     7: "the lease is held by another owner, or by nobody",
+    8: "staged: it acts after the control's restart, until then the other bank does",
 }
 ALARM = {1: "e-stop", 2: "stroke limit", 3: "path ran empty"}
 
@@ -128,6 +131,20 @@ _MUST_BE_SET = {
     Bit.REFERENCED: "the axes are not referenced",
     Bit.DRIVES_ON: "the drives are off",
 }
+
+
+def fingerprint(counts: Mapping[str, int]) -> str:
+    """Say in words what the identity block tells of the register map: whatever of it changes, the map is another one.
+
+    Parameters
+    ----------
+    counts : mapping
+        Decoded identity block.
+    """
+    return (
+        f"map {counts['MAP_VER']}, {counts['N_AXES']} axes, table unit {counts['TABLE_LSB_NM']} nm, "
+        f"bank of {counts['BANK_SIZE']} registers, FIFO of {counts['FIFO_SIZE']} points"
+    )
 
 
 def interlocks(bits: int) -> list[str]:

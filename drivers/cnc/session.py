@@ -6,9 +6,9 @@ import time
 
 from drivers.api import ControllerStatus, DeviceInfo, TableFormat
 from drivers.cnc import registers as reg
-from drivers.errors import Rebooted
-from drivers.links.identity import check_identity
-from drivers.links.modbus import ModbusLink
+from drivers.errors import Rebooted, WrongDevice
+from drivers.links.identity import check_clock, check_identity
+from drivers.links.modbus_link import ModbusLink
 
 
 class ControllerSession:
@@ -25,6 +25,7 @@ class ControllerSession:
         self.name = link.name
         self.fifo_size = 0
         self._boot_id: int | None = None
+        self._map = ""
         self._connection = link.connections
         self._last_us = -1
 
@@ -34,14 +35,23 @@ class ControllerSession:
         Raises
         ------
         WrongDevice
-            Canary registers or map version are not those of docs/protocols/cnc.md.
+            Canary registers or register map are not those of docs/protocols/cnc.md.
         LinkDown, ReplyTimeout, BadFrame
             The wire.
         """
+        self._map = ""
         counts = await self._identity()
+        status = reg.decode_status(await self.link.read_block(reg.STATUS), time.monotonic())
+        try:
+            check_clock(self.name, status.ctrl_us)
+        except WrongDevice as error:
+            self.link.incidents.note(error, latched=True)
+            raise
         self._boot_id = counts["BOOT_ID"]
+        self._connection = self.link.connections
         self._last_us = -1
-        return DeviceInfo("cnc", f"{counts['N_AXES']}-axis controller", "", counts["BOOT_ID"], f"map {counts['MAP_VER']}")
+        self.link.incidents.accepted()
+        return DeviceInfo("cnc", f"{counts['N_AXES']}-axis controller", "", counts["BOOT_ID"], self._map)
 
     async def check_boot(self) -> None:
         """Make sure that it is still the run of the controller that ``identify`` saw.
@@ -56,7 +66,12 @@ class ControllerSession:
             self._boot_id = counts["BOOT_ID"]
         if counts["BOOT_ID"] != self._boot_id:
             detail = f"boot id {counts['BOOT_ID']:#x} instead of {self._boot_id:#x}"
-            raise Rebooted(self.name, "check boot id", detail, "the controller restarted: call identify, check its tables, measure again")
+            remedy = "the controller restarted: call identify, check its tables, measure again"
+            error = Rebooted(self.name, "check boot id", detail, remedy)
+            self.link.incidents.note(error, latched=True)
+            raise error
+        # Only now: as long as this fails, every status asks again, and nothing is done with a device that nobody has accepted.
+        self._connection = self.link.connections
 
     async def status(self) -> ControllerStatus:
         """Read the status block in one request.
@@ -68,7 +83,7 @@ class ControllerSession:
         LinkDown, ReplyTimeout, BadFrame
             The wire.
         """
-        words = await self.link.read(reg.STATUS.base, reg.STATUS.count)
+        words = await self.link.read_block(reg.STATUS)
         status = reg.decode_status(words, time.monotonic())
         # The boot id is not in this block: a clock that went back, or a new connection, is the reason to ask for it.
         if self._boot_id is None or status.ctrl_us < self._last_us or self._connection != self.link.connections:
@@ -82,9 +97,24 @@ class ControllerSession:
         return TableFormat(counts["TABLE_LSB_NM"], counts["BANK_SIZE"])
 
     async def _identity(self) -> dict[str, int]:
-        words = await self.link.read(reg.IDENTITY.base, reg.IDENTITY.count)
-        self._connection = self.link.connections
-        counts = reg.IDENTITY.counts(words)
-        check_identity(self.name, counts, reg.MAP_VERSION)
+        counts = reg.IDENTITY.counts(await self.link.read_block(reg.IDENTITY))
+        try:
+            check_identity(self.name, counts, reg.MAP_VERSION)
+            self._check_map(counts)
+        except WrongDevice as error:
+            self.link.incidents.note(error, latched=True)
+            raise
         self.fifo_size = counts["FIFO_SIZE"]
         return counts
+
+    def _check_map(self, counts: dict[str, int]) -> None:
+        """Refuse a register map that this driver was not written for, or that changed while we were connected."""
+        found = reg.fingerprint(counts)
+        for name, expected in (("N_AXES", reg.AXES), ("BANK_SIZE", reg.BANK_REGISTERS)):
+            if counts[name] != expected:
+                detail = f"{name} is {counts[name]} instead of {expected} ({found})"
+                raise WrongDevice(self.name, "identify", detail, "install the matching firmware, or the matching version of this program")
+        if self._map and found != self._map:
+            detail = f"its register map changed: {found}, it was {self._map}"
+            raise WrongDevice(self.name, "identify", detail, "another firmware: identify it anew, check its tables")
+        self._map = found

@@ -6,10 +6,11 @@ import asyncio
 import time
 
 from drivers.api import DeviceInfo, LaserReading
-from drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout
+from drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
 from drivers.laser import registers as reg
-from drivers.links.identity import check_identity
-from drivers.links.modbus import ModbusLink
+from drivers.links.identity import check_clock, check_identity
+from drivers.links.modbus_link import ModbusLink
+from drivers.links.modbus_policy import Op
 from drivers.links.numbered import next_number, run_numbered
 
 _POLL_S = 0.005
@@ -30,6 +31,8 @@ class ModbusLaser:
     def __init__(self, link: ModbusLink, *, read_timeout_s: float = _READ_S) -> None:
         self._link = link
         self.name = link.name
+        self.incidents = link.incidents
+        """Account of what went wrong on the link: one entry when it was noticed, one when it was over."""
         self._read_timeout_s = read_timeout_s
         self._boot_id: int | None = None
         self._connection = link.connections
@@ -47,12 +50,18 @@ class ModbusLaser:
         LinkDown, ReplyTimeout, BadFrame
             The wire.
         """
-        counts = reg.IDENTITY.counts(await self._link.read(reg.IDENTITY.base, reg.IDENTITY.count))
-        check_identity(self.name, counts, reg.MAP_VERSION)
+        counts = await self._identity()
+        clock_us = reg.decode_reading(await self._link.read_block(reg.READING), time.monotonic()).device_us
+        try:
+            check_clock(self.name, clock_us)
+        except WrongDevice as error:
+            self._link.incidents.note(error, latched=True)
+            raise
         self._boot_id = counts["BOOT_ID"]
         self._connection = self._link.connections
         self._last_us = -1
         self._shown_at_command = None
+        self._link.incidents.accepted()
         return DeviceInfo("laser", "LDDM", str(counts["SERIAL_NO"]), counts["BOOT_ID"], f"map {counts['MAP_VER']}")
 
     async def zero(self) -> None:
@@ -123,12 +132,22 @@ class ModbusLaser:
         self._check_beam(reading.status)
         return reading
 
+    async def peek(self) -> LaserReading:
+        """Read the current output sample as it is, without waiting for a newer one and without judging its beam: for who watches.
+
+        Raises
+        ------
+        Rebooted, LinkDown, ReplyTimeout, BadFrame
+            The meter restarted, or the wire.
+        """
+        return await self._read_once()
+
     async def close(self) -> None:
         """Close the link. Closing twice does nothing."""
         await self._link.close()
 
     async def _read_once(self) -> LaserReading:
-        words = await self._link.read(reg.READING.base, reg.READING.count)
+        words = await self._link.read_block(reg.READING)
         reading = reg.decode_reading(words, time.monotonic())
         if reading.device_us < self._last_us or self._connection != self._link.connections:
             await self._check_boot()
@@ -136,14 +155,25 @@ class ModbusLaser:
         return reading
 
     async def _check_boot(self) -> None:
-        counts = reg.IDENTITY.counts(await self._link.read(reg.IDENTITY.base, reg.IDENTITY.count))
+        counts = await self._identity()
         if self._boot_id is None:
-            check_identity(self.name, counts, reg.MAP_VERSION)
             self._boot_id = counts["BOOT_ID"]
         if counts["BOOT_ID"] != self._boot_id:
             detail = f"boot id {counts['BOOT_ID']:#x} instead of {self._boot_id:#x}"
-            raise Rebooted(self.name, "read", detail, "the meter restarted: call identify and zero, then measure this test again")
+            error = Rebooted(self.name, "read", detail, "the meter restarted: call identify and zero, then measure this test again")
+            self._link.incidents.note(error, latched=True)
+            raise error
         self._connection = self._link.connections
+
+    async def _identity(self) -> dict[str, int]:
+        """The identity block, proven to be this map's: asked again at every new connection, because another device may be there now."""
+        counts = reg.IDENTITY.counts(await self._link.read_block(reg.IDENTITY))
+        try:
+            check_identity(self.name, counts, reg.MAP_VERSION)
+        except WrongDevice as error:
+            self._link.incidents.note(error, latched=True)
+            raise
+        return counts
 
     def _check_beam(self, status: int) -> None:
         if status & (reg.BEAM_LOST | reg.NO_REFLECTOR):
@@ -159,7 +189,7 @@ class ModbusLaser:
             number = next_number(acknowledged)
 
             async def write() -> None:
-                await self._link.write(reg.COMMAND_ADDRESS, (number, command, argument))
+                await self._link.write(reg.COMMAND_ADDRESS, (number, command, argument), Op.NUMBERED)
 
             result = await run_numbered(self.name, operation, number, write, self._read_ack)
         if result:
@@ -167,7 +197,7 @@ class ModbusLaser:
         self._shown_at_command = (await self._read_once()).sample_count
 
     async def _read_ack(self) -> tuple[int, int]:
-        counts = reg.ACKNOWLEDGE.counts(await self._link.read(reg.ACKNOWLEDGE.base, reg.ACKNOWLEDGE.count))
+        counts = reg.ACKNOWLEDGE.counts(await self._link.read_block(reg.ACKNOWLEDGE))
         return counts["CMD_ACK_SEQ"], counts["CMD_RESULT"]
 
 

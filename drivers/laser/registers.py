@@ -35,9 +35,10 @@ READING = Block(
         Register(25, "u16", "HUMIDITY", 10.0, "%"),
         Register(26, "u32", "REFRACTIVITY", 1e10),
     ),
+    lead=10,
 )
 
-ACKNOWLEDGE = Block(43, 2, (Register(43, "u16", "CMD_ACK_SEQ"), Register(44, "u16", "CMD_RESULT")))
+ACKNOWLEDGE = Block(43, 2, (Register(43, "u16", "CMD_ACK_SEQ"), Register(44, "u16", "CMD_RESULT")), lead=3)
 
 COMMAND_ADDRESS = 40
 ZERO, CLEAR_BEAM, ENVIRONMENT = 1, 2, 3

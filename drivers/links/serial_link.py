@@ -1,6 +1,7 @@
-"""Bytes over a serial port or a raw TCP socket, read and written by the event loop itself (the only file with pyserial).
+"""Bytes over a serial port or a raw TCP socket (the only file with pyserial).
 
-No thread: cancelling a read really ends it, and an unplugged adapter is noticed at once.
+The event loop reads and writes by itself: cancelling a read really ends it, and an unplugged adapter is noticed at once. Who measures lets
+a thread read instead (`start_reading`), so that a busy loop costs no byte.
 """
 
 from __future__ import annotations
@@ -12,30 +13,48 @@ import socket
 import termios
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import serial
+from serial.tools import list_ports
 
 from drivers.errors import LinkDown, ReplyTimeout
+from drivers.links.adapters import Adapter, adapter_at, path_to_open
+from drivers.links.raw_tcp import connected
+from drivers.links.reading import ReadingThread, Ring
 from drivers.links.urls import SerialUrl, SocketUrl
 
-_CONNECT_S = 5.0
+_DRAIN_S = 0.5
+_POLL_S = 0.01
+_PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 _UNPLUGGED = "cable or adapter unplugged? check it, then try again"
 
 
 class ByteLink:
-    """A byte pipe to one device.
+    """A byte pipe to one device, which may come back at another place.
 
     Parameters
     ----------
     url : SerialUrl or SocketUrl
         Where the device is. A serial port is locked: a second program (or a second link) cannot open it.
+    adapters : callable, optional
+        Lists the serial adapters that are plugged in. An adapter with a serial number is found again wherever it was plugged in, and
+        no other one is taken for it.
     """
 
-    def __init__(self, url: SerialUrl | SocketUrl) -> None:
+    def __init__(self, url: SerialUrl | SocketUrl, adapters: Callable[[], list[Adapter]] | None = None) -> None:
         self._url = url
+        self._adapters = adapters or plugged_in
+        self._adapter: Adapter | None = None
         self.name = str(url)
         self._port: serial.Serial | socket.socket | None = None
         self._waiting: set[asyncio.Future[None]] = set()
+        self._reading: ReadingThread | None = None
+
+    @property
+    def serial_no(self) -> int | None:
+        """Serial number of the device that the URL demands, if it does."""
+        return self._url.serial_no
 
     @property
     def is_open(self) -> bool:
@@ -49,9 +68,11 @@ class ByteLink:
         ------
         LinkDown
             Missing, forbidden, busy or unreachable; the text says which and what to do.
+        WrongDevice
+            Another adapter is where the one was that was opened before.
         """
         if self._port is None:
-            self._port = _open_serial(self._url) if isinstance(self._url, SerialUrl) else await _open_socket(self._url)
+            self._port = self._open_serial(self._url) if isinstance(self._url, SerialUrl) else await connected(self._url)
 
     async def read(self, max_bytes: int, *, timeout_s: float) -> tuple[float, bytes]:
         """Wait for bytes and return all that are there, at least one.
@@ -87,6 +108,34 @@ class ByteLink:
         if not data:
             raise self._lost("read", None)
         return time.monotonic(), data
+
+    def start_reading(self, ring: Ring, on_lost: Callable[[LinkDown], None]) -> None:
+        """From now on a thread reads every byte into ``ring``, until ``close``; ``read`` must not be used meanwhile.
+
+        Parameters
+        ----------
+        ring : Ring
+            Where bytes go with the monotonic time of their arrival; it ends when the thread ends.
+        on_lost : callable
+            Called in the event loop when the device has gone; the port is closed then.
+
+        Raises
+        ------
+        LinkDown
+            The port is not open.
+        """
+        descriptor = self._descriptor("read")
+        loop = asyncio.get_running_loop()
+
+        def lost(error: OSError | None) -> None:
+            with suppress(RuntimeError):  # the loop has been closed: nobody is left to tell
+                loop.call_soon_threadsafe(tell, error)
+
+        def tell(error: OSError | None) -> None:
+            if self._reading is reading:  # else somebody closed the port meanwhile and knows
+                on_lost(self._lost("read", error))
+
+        reading = self._reading = ReadingThread(descriptor, ring, lost, self.name)
 
     async def write(self, data: bytes, *, timeout_s: float = 1.0) -> None:
         """Send all bytes.
@@ -130,8 +179,34 @@ class ByteLink:
                 raise self._lost("drop input", error) from error
 
     async def close(self) -> None:
-        """Close the port; whoever waits in ``read`` or ``write`` gets ``LinkDown``. Closing twice does nothing."""
+        """Close the port; whoever waits in ``read`` or ``write`` gets ``LinkDown``. Closing twice does nothing.
+
+        What was written leaves first, half a second at the most; what has arrived goes into the ring of `start_reading`.
+        """
+        await self._drain()
         self._release()
+
+    async def _drain(self) -> None:
+        port = self._port
+        if not isinstance(port, serial.Serial):
+            return
+        clock = asyncio.get_running_loop().time
+        until_s = clock() + _DRAIN_S
+        with suppress(OSError, termios.error):
+            while port.is_open and port.out_waiting and clock() < until_s:  # noqa: ASYNC110 - the system does not tell when it is empty
+                await asyncio.sleep(_POLL_S)
+            if port.is_open:
+                port.reset_output_buffer()  # else a line that is held (XOFF) makes the close itself wait half a minute
+
+    def _open_serial(self, url: SerialUrl) -> serial.Serial:
+        listed = self._adapters()
+        path = path_to_open(self.name, url.path, self._adapter, listed)
+        try:
+            port = serial.serial_for_url(path, baudrate=url.baud, parity=_PARITY[url.parity], timeout=0, write_timeout=0, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError, termios.error is not
+            raise LinkDown(self.name, "open", str(error), serial_remedy(path, error)) from error
+        self._adapter = adapter_at(path, listed) or self._adapter
+        return port
 
     def _descriptor(self, operation: str) -> int:
         if self._port is None:
@@ -155,8 +230,11 @@ class ByteLink:
 
     def _release(self) -> None:
         port, self._port = self._port, None
+        reading, self._reading = self._reading, None
         if port is None:
             return
+        if reading is not None:
+            reading.stop()
         loop = asyncio.get_running_loop()
         loop.remove_reader(port.fileno())
         loop.remove_writer(port.fileno())
@@ -171,45 +249,13 @@ def _wake(waiter: asyncio.Future[None]) -> None:
         waiter.set_result(None)
 
 
-def _open_serial(url: SerialUrl) -> serial.Serial:
-    try:
-        port = serial.serial_for_url(url.path, baudrate=url.baud, timeout=0, write_timeout=0, exclusive=True)
-    except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError, termios.error is not
-        raise LinkDown(str(url), "open", str(error), serial_remedy(url.path, error)) from error
-    return port
-
-
-async def _open_socket(url: SocketUrl) -> socket.socket:
-    # pyserial's own socket:// connects blockingly, which would freeze every other device of the service for seconds
-    try:
-        async with asyncio.timeout(_CONNECT_S):
-            return await _connect_any(url)
-    except TimeoutError:
-        raise LinkDown(str(url), "open", f"no connection within {_CONNECT_S:g} s", "address right? device and network on?") from None
-    except OSError as error:
-        raise LinkDown(str(url), "open", str(error), "address and port right? device server running?") from error
-
-
-async def _connect_any(url: SocketUrl) -> socket.socket:
-    # a name may stand for several addresses (localhost: ::1 and 127.0.0.1) of which only one is served
-    loop = asyncio.get_running_loop()
-    refused = OSError(f"{url.host} has no address")
-    for family, kind, protocol, _, address in await loop.getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM):
-        sock = socket.socket(family, kind, protocol)
-        connected = False
-        try:
-            sock.setblocking(False)
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            await loop.sock_connect(sock, address)
-            connected = True
-        except OSError as error:
-            refused = error
-        finally:
-            if not connected:
-                sock.close()
-        if connected:
-            return sock
-    raise refused
+def plugged_in() -> list[Adapter]:
+    """The serial adapters of this computer."""
+    return [
+        Adapter(port.device, f"{port.vid:04x}:{port.pid:04x}", port.serial_number or "")
+        for port in list_ports.comports()
+        if port.vid is not None and port.pid is not None
+    ]
 
 
 def serial_remedy(path: str, error: Exception) -> str:

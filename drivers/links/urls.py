@@ -2,7 +2,8 @@
 
 ======================================================  =======================================================
 ``serial:///dev/ttyUSB0?baud=460800``                   a serial line, 8N1
-``socket://10.0.0.5:4001``                              the same bytes over raw TCP (serial device server)
+``serial:///dev/ttyUSB0?parity=even&serial_no=4711``    with parity; only the box with this serial number is accepted
+``socket://10.0.0.5:4001``                              the same bytes over raw TCP (serial device server); serial_no as above
 ``modbus+tcp://10.0.0.6:502?unit=1``                    Modbus TCP
 ``modbus+rtu:///dev/ttyS0?baud=115200&unit=1``          Modbus RTU, 8N1
 ``fixture+tcp://10.0.0.7:9000``                         a remote fixture (docs/protocols/fixture.md)
@@ -22,28 +23,39 @@ SERIAL_BAUD = 460_800
 RTU_BAUD = 115_200
 _MAX_BAUD = 12_000_000
 _MAX_UNIT = 247
+_MAX_SERIAL_NO = 0xFFFFFFFF
+PARITIES = ("none", "even", "odd")
 
 
 @dataclass(frozen=True, slots=True)
 class SerialUrl:
-    """A serial port by its device path; ``baud`` in bit/s, always 8N1."""
+    """A serial port by its device path; ``baud`` in bit/s, 8 bits, 1 stop bit; ``parity`` none, even or odd.
+
+    ``serial_no``: only the device with this number is accepted there.
+    """
 
     path: str
     baud: int = SERIAL_BAUD
+    parity: str = "none"
+    serial_no: int | None = None
 
     def __str__(self) -> str:
-        return f"serial://{quote(self.path)}?baud={self.baud}"
+        parity = "" if self.parity == "none" else f"&parity={self.parity}"
+        number = "" if self.serial_no is None else f"&serial_no={self.serial_no}"
+        return f"serial://{quote(self.path)}?baud={self.baud}{parity}{number}"
 
 
 @dataclass(frozen=True, slots=True)
 class SocketUrl:
-    """Raw bytes over TCP."""
+    """Raw bytes over TCP; ``serial_no`` as of a serial port."""
 
     host: str
     port: int
+    serial_no: int | None = None
 
     def __str__(self) -> str:
-        return f"socket://{_netloc(self.host, self.port)}"
+        number = "" if self.serial_no is None else f"?serial_no={self.serial_no}"
+        return f"socket://{_netloc(self.host, self.port)}{number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,13 +137,20 @@ def parse_url(text: str) -> DeviceUrl:
 
 
 def _serial(text: str, parts: SplitResult) -> SerialUrl:
-    query = _query(text, parts, {"baud"})
-    return SerialUrl(_path(text, parts), _number(text, query, "baud", SERIAL_BAUD, _MAX_BAUD))
+    query = _query(text, parts, {"baud", "parity", "serial_no"})
+    parity = query.get("parity", "none")
+    if parity not in PARITIES:
+        raise _bad(text, f"parity={parity!a} is none of {', '.join(PARITIES)}")
+    return SerialUrl(_path(text, parts), _number(text, query, "baud", SERIAL_BAUD, _MAX_BAUD), parity, _serial_no(text, query))
 
 
 def _socket(text: str, parts: SplitResult) -> SocketUrl:
-    _query(text, parts, set())
-    return SocketUrl(*_address(text, parts))
+    query = _query(text, parts, {"serial_no"})
+    return SocketUrl(*_address(text, parts), _serial_no(text, query))
+
+
+def _serial_no(text: str, query: Mapping[str, str]) -> int | None:
+    return _number(text, query, "serial_no", 1, _MAX_SERIAL_NO) if "serial_no" in query else None
 
 
 def _modbus_tcp(text: str, parts: SplitResult) -> ModbusTcpUrl:

@@ -13,6 +13,8 @@ _SIZE: dict[Kind, int] = {"u16": 1, "i16": 1, "u32": 2, "i32": 2, "u64": 4, "i64
 CANARY_I32 = 0x01020304
 CANARY_F32_BITS = 0x449A5000
 """The float 1234.5 as it must stand in two registers; compared as bits, so that any word or byte order mistake shows."""
+CANARY_WORDS = (0x0102, 0x0304, 0x449A, 0x5000)
+"""Both as they stand in registers 0..3 of every device of docs/protocols."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +52,14 @@ class Block:
         First register and number of registers of the request.
     registers : tuple of Register
         What lies in it.
+    lead : int
+        Registers before ``base`` that the device lets one read in the same request (ModbusLink.read says what for).
     """
 
     base: int
     count: int
     registers: tuple[Register, ...]
+    lead: int = 0
     _by_name: dict[str, Register] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

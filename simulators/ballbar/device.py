@@ -12,6 +12,7 @@ from simulators.truth.draws import STREAM_BAR_NOISE, STREAM_CUP, Draws, generato
 RANGE_MM = 1.0
 MAX_RATE_HZ = 1000
 OUT_OF_RANGE, OVERRUN, SYNC, NO_BAR = 1, 4, 8, 16
+MM_PER_INCH = 25.4
 
 Locate = Callable[[F, F], F]
 """Times (n,) s and axis positions (n, 3) mm to actual tool positions (n, 3) mm."""
@@ -37,12 +38,25 @@ class _Taken:
     sync: B
 
 
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How the box reads: a person changes unit, range and zero at its panel. ``number`` counts the changes since it was switched on."""
+
+    number: int = 1
+    inch: bool = False
+    range_mm: float = RANGE_MM
+    zero_mm: float = 0.0
+
+
 class BallbarDevice:
     """Samples on its own clock, which runs ``clock_offset_us`` ahead of the world's: it was switched on earlier."""
 
     def __init__(self, draws: Draws, sizes: Magnitudes, locate: Locate, *, clock_offset_us: int = 0) -> None:
         self._draws, self._sizes, self._locate = draws, sizes, locate
         self.offset_us = clock_offset_us
+        self.settings = Settings()
+        self.tells_settings = False
+        """Whether bits 8 to 15 of the status carry the number of the settings (firmware 1.1)."""
         self.rate_hz = 0
         self._start_us = 0
         self._next = 0
@@ -51,6 +65,7 @@ class BallbarDevice:
         self._bar_in = False
         self._hung_in_s = 0.0
         self._mounts = 0
+        self._pushed = False
         self.too_much: Callable[[F, float, float], F] | None = None
         """What a hidden effect adds: instants (n,) s, when the bar was hung in, and its nominal length in mm to (n,) mm."""
         self._noise = generator(draws.seed, STREAM_BAR_NOISE)
@@ -87,6 +102,27 @@ class BallbarDevice:
         """Take the bar away."""
         self.settle()
         self._cup_mm, self._bar_in = None, False
+
+    def switch(self, *, inch: bool | None = None, range_mm: float | None = None, zero_mm: float | None = None) -> None:
+        """Change the settings from the next sample on; what is not given stays."""
+        self.settle()
+        old = self.settings
+        self.settings = Settings(
+            old.number % 255 + 1,
+            old.inch if inch is None else inch,
+            old.range_mm if range_mm is None else range_mm,
+            old.zero_mm if zero_mm is None else zero_mm,
+        )
+
+    def forget_settings(self) -> None:
+        """Have the settings of a box just switched on."""
+        self.settle()
+        self.settings = Settings()
+
+    def push(self, *, out: bool) -> None:
+        """Somebody leans on the bar, so that it is out of its range, or lets go."""
+        self.settle()
+        self._pushed = out
 
     # ---- commands ------------------------------------------------------------------------------------------------
 
@@ -145,6 +181,9 @@ class BallbarDevice:
         noise = self._noise.normal(size=len(seq)) * self._draws.bar_noise_mm
         status = np.where(sync, SYNC, 0)
         reading_mm = np.zeros(len(seq))
+        setting = self.settings
+        if self.tells_settings:
+            status |= setting.number << 8
         if self._cup_mm is None or not self._bar_in:
             status |= NO_BAR
         else:
@@ -153,7 +192,8 @@ class BallbarDevice:
             free = distance - self._radius_mm + self._draws.bar_length_error_mm + noise
             if self.too_much is not None:
                 free = free + self.too_much(times_s, self._hung_in_s, self._radius_mm)
-            reading_mm[:] = np.clip(free, -RANGE_MM, RANGE_MM)
-            status |= np.where(np.abs(free) > RANGE_MM, OUT_OF_RANGE, 0)
-        reading_nm = np.rint(reading_mm * 1e6).astype(np.int64)
+            reading_mm[:] = np.clip(free - setting.zero_mm, -setting.range_mm, setting.range_mm)
+            status |= np.where((np.abs(free - setting.zero_mm) > setting.range_mm) | self._pushed, OUT_OF_RANGE, 0)
+        # in inches the box counts tenths of a microinch instead of nanometres
+        reading_nm = np.rint(reading_mm * (1e7 / MM_PER_INCH if setting.inch else 1e6)).astype(np.int64)
         self._ready.append(Samples(seq, time_us + self.offset_us, reading_nm, status.astype(np.int64)))

@@ -44,10 +44,11 @@ class BytePort(Protocol):
 
 
 class PtyPort:
-    """A serial line: a pseudo terminal, at a stable path when ``link`` is given."""
+    """A serial line: a pseudo terminal, at a stable path when ``link`` is given; the box keeps ``buffer_bytes`` for a host who is late."""
 
-    def __init__(self, link: Path | None) -> None:
+    def __init__(self, link: Path | None, buffer_bytes: int = BUFFER_BYTES) -> None:
         self._link = link
+        self._buffer_bytes = buffer_bytes
         self._serial: PseudoSerial | None = None
 
     @property
@@ -58,7 +59,7 @@ class PtyPort:
 
     def room(self) -> int:
         """Room in the buffer; none while unplugged."""
-        return 0 if self._serial is None else max(0, BUFFER_BYTES - self._serial.backlog)
+        return 0 if self._serial is None else max(0, self._buffer_bytes - self._serial.backlog)
 
     def send(self, data: bytes) -> None:
         """Send bytes."""

@@ -6,18 +6,21 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.ballbar.device import MAX_RATE_HZ, OVERRUN, BallbarDevice, Samples
+from simulators.ballbar.device import MAX_RATE_HZ, OVERRUN, BallbarDevice, Samples, Settings
+from simulators.ballbar.ledger import CORRUPTED, SENT, SUPPRESSED, BoxLedger
 from simulators.ballbar.port import BytePort
 
 SYNC_BYTES = b"\xa5\x5a"
-SAMPLE, INFO, ACK = 0x01, 0x02, 0x03
-IDENTIFY, START, STOP = 0x81, 0x82, 0x83
+SAMPLE, INFO, ACK, SETTINGS = 0x01, 0x02, 0x03, 0x04
+IDENTIFY, START, STOP, READ_SETTINGS, CONFIGURE = 0x81, 0x82, 0x83, 0x84, 0x85
 MAX_PAYLOAD = 32
 OK, BAD_ARGUMENT, UNKNOWN_COMMAND = 0, 1, 2
 FIRMWARE_BCD = 0x0100
+WITH_SETTINGS_BCD = 0x0101
 SERIAL_NO = 4711
 MODEL = b"ABB-1"
 SAMPLE_BYTES = 24
+MAX_RANGE_NM = 10_000_000
 
 _SAMPLE_DTYPE = np.dtype(
     [
@@ -77,9 +80,15 @@ def encode_samples(samples: Samples) -> bytes:
     return frames.tobytes()
 
 
-def encode_info(tag: int, boot_id: int, rate_hz: int) -> bytes:
+def encode_info(tag: int, boot_id: int, rate_hz: int, serial_no: int = SERIAL_NO, firmware: int = FIRMWARE_BCD) -> bytes:
     """INFO frame."""
-    return encode(INFO, struct.pack("<HIIHHH12s", tag, boot_id, SERIAL_NO, FIRMWARE_BCD, MAX_RATE_HZ, rate_hz, MODEL))
+    return encode(INFO, struct.pack("<HIIHHH12s", tag, boot_id, serial_no, firmware, MAX_RATE_HZ, rate_hz, MODEL))
+
+
+def encode_settings(tag: int, settings: Settings) -> bytes:
+    """SETTINGS frame."""
+    nm = (round(settings.range_mm * 1e6), round(settings.zero_mm * 1e6))
+    return encode(SETTINGS, struct.pack("<HBBIi", tag, settings.number, settings.inch, *nm))
 
 
 def encode_ack(tag: int, command: int, result: int) -> bytes:
@@ -119,12 +128,26 @@ class Parser:
 class BallbarWire:
     """The box's conversation: answers commands, writes the samples that are due, drops whole samples when nobody reads."""
 
-    def __init__(self, device: BallbarDevice, port: BytePort, boot_id: int, now_s: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        device: BallbarDevice,
+        port: BytePort,
+        boot_id: int,
+        now_s: Callable[[], float],
+        *,
+        serial_no: int = SERIAL_NO,
+        firmware: int = FIRMWARE_BCD,
+    ) -> None:
+        self._serial_no, self._firmware = serial_no, firmware
+        device.tells_settings = firmware >= WITH_SETTINGS_BCD
         self._device, self._port, self._boot_id, self._now_s = device, port, boot_id, now_s
         self._parser = Parser()
         self._overrun = False
         self.samples_sent = 0
         self.samples_dropped = 0
+        self.ledger = BoxLedger()
+        self.spoil_every = 0
+        """Every so manieth sample gets a bit flipped on its way; 0: none."""
 
     def received(self, data: bytes) -> None:
         """Take bytes from the host. The world must be up to date."""
@@ -142,32 +165,65 @@ class BallbarWire:
             if self._overrun:
                 status[0] |= OVERRUN
                 self._overrun = False
-            self._port.send(encode_samples(Samples(samples.seq[:kept], samples.time_us[:kept], samples.reading_nm[:kept], status)))
+            frames = encode_samples(Samples(samples.seq[:kept], samples.time_us[:kept], samples.reading_nm[:kept], status))
+            self._port.send(self._spoilt(frames, samples.seq[:kept].tolist()))
             self.samples_sent += kept
         if kept < count:
             self._overrun = True
             self.samples_dropped += count - kept
+            self.ledger.note(samples.seq[kept:].tolist(), SUPPRESSED)
+
+    def _spoilt(self, frames: bytes, seqs: list[int]) -> bytes:
+        """The frames as the line delivers them, and what became of each in the ledger."""
+        if not self.spoil_every:
+            self.ledger.note(seqs, SENT)
+            return frames
+        spoilt = bytearray(frames)
+        begin = 0
+        for k, seq in enumerate(seqs):
+            if seq % self.spoil_every == self.spoil_every // 2:
+                spoilt[SAMPLE_BYTES * k + 5 + seq % (SAMPLE_BYTES - 6)] ^= 1 << seq % 8
+                self.ledger.note(seqs[begin:k], SENT)
+                self.ledger.note([seq], CORRUPTED)
+                begin = k + 1
+        self.ledger.note(seqs[begin:], SENT)
+        return bytes(spoilt)
 
     def restart(self, boot_id: int) -> None:
-        """Power cycle of the box: new boot id, not streaming, nothing remembered."""
+        """Power cycle of the box: new boot id, not streaming, nothing remembered, settings as from the factory."""
         self._device.stop()
+        self._device.forget_settings()
         self._device.take()
         self._boot_id, self._parser, self._overrun = boot_id, Parser(), False
 
     def _answer(self, kind: int, payload: bytes) -> bytes:
         tag = struct.unpack_from("<H", payload)[0] if len(payload) >= 2 else 0
         if kind == IDENTIFY and len(payload) == 2:
-            return encode_info(tag, self._boot_id, self._device.rate_hz)
+            return encode_info(tag, self._boot_id, self._device.rate_hz, self._serial_no, self._firmware)
         if kind == START and len(payload) == 4:
             return encode_ack(tag, START, self._start(struct.unpack_from("<H", payload, 2)[0]))
         if kind == STOP and len(payload) == 2:
             self._device.stop()
             return encode_ack(tag, STOP, OK)
+        if self._firmware >= WITH_SETTINGS_BCD and (answer := self._answer_settings(kind, tag, payload)):
+            return answer
         return encode_ack(tag, kind, BAD_ARGUMENT if kind in (IDENTIFY, START, STOP) else UNKNOWN_COMMAND)
+
+    def _answer_settings(self, kind: int, tag: int, payload: bytes) -> bytes:
+        if kind == READ_SETTINGS and len(payload) == 2:
+            return encode_settings(tag, self._device.settings)
+        if kind != CONFIGURE or len(payload) != 12:
+            return encode_ack(tag, kind, BAD_ARGUMENT) if kind in (READ_SETTINGS, CONFIGURE) else b""
+        _, _, unit, range_nm, zero_nm = struct.unpack("<HBBIi", payload)
+        if unit > 1 or not 0 < range_nm <= MAX_RANGE_NM or abs(zero_nm) > MAX_RANGE_NM:
+            return encode_ack(tag, kind, BAD_ARGUMENT)
+        self._device.switch(inch=bool(unit), range_mm=range_nm * 1e-6, zero_mm=zero_nm * 1e-6)
+        return encode_ack(tag, kind, OK)
 
     def _start(self, rate_hz: int) -> int:
         if not self._device.start(rate_hz, self._now_s()):
             return BAD_ARGUMENT
         self.samples_sent = self.samples_dropped = 0
         self._overrun = False
+        self.ledger.start()
         return OK

@@ -8,6 +8,7 @@ import numpy as np
 from simulators.arrays import B, F
 from simulators.cnc.compensation import Compensation
 from simulators.cnc.motion import Motion
+from simulators.cnc.timetable import Timetable
 from simulators.truth.machine import Geometry
 
 FIFO_SIZE = 8192
@@ -33,7 +34,7 @@ class Hold(IntEnum):
     ABORT = 2
 
 
-ALARM_NONE, ALARM_ESTOP = 0, 1
+ALARM_NONE, ALARM_ESTOP, ALARM_STROKE = 0, 1, 2
 
 
 @dataclass(slots=True)
@@ -70,7 +71,7 @@ class Controller:
         self.path_end_s = 0.0
         self._path_points = 0
         self._fifo: list[tuple[float, float, float]] = []
-        self._motion: Motion | None = None
+        self._motion: Motion | Timetable | None = None
 
     # ---- reading -------------------------------------------------------------------------------------------------
 
@@ -167,6 +168,19 @@ class Controller:
         self._start(vertices, feed_mm_min)
         return Result.OK
 
+    def run_program(self, blocks: list[tuple[F, float]]) -> Result:
+        """What the operator starts at the panel: places (3,) mm with the seconds to get there; "NC program running" until it ends."""
+        if self.moving:
+            return Result.BUSY
+        if not self.may_move():
+            return Result.INTERLOCK
+        if not self._inside(np.array([place for place, _ in blocks])):
+            return Result.STROKE_LIMIT
+        self.switches.program_running = True
+        self._motion, self.in_position = Timetable(self.position_mm, blocks, self.now_s), False
+        self._apply_speed()
+        return Result.OK
+
     def fifo_push(self, points_mm: F) -> Result:
         """Store path points (n, 3); a running path is extended by them."""
         if not self._inside(points_mm):
@@ -209,15 +223,29 @@ class Controller:
     def set_estop(self, *, pressed: bool) -> None:
         """Press or release the emergency stop: motion ends where it is and does not count as done."""
         self.switches.estop = pressed
-        if not pressed:
-            return
-        self.alarm, self.drives_on, self.in_position = ALARM_ESTOP, False, False
+        if pressed:
+            self.drives_on = False
+            self.raise_alarm(ALARM_ESTOP)
+
+    def raise_alarm(self, code: int = ALARM_STROKE) -> None:
+        """Any alarm: motion ends where it is and does not count as done."""
+        self.alarm = code
+        self._end_here()
+
+    def drives_off(self) -> None:
+        """The drives drop out: motion ends where it is and does not count as done."""
+        self.drives_on = False
+        self._end_here()
+
+    # ---- inner ---------------------------------------------------------------------------------------------------
+
+    def _end_here(self) -> None:
+        self.in_position = False
         self._fifo.clear()
         if self._motion is not None:
             self._end_path(self.path_points_done)
+            self._end_program()
             self._motion = None
-
-    # ---- inner ---------------------------------------------------------------------------------------------------
 
     def _refuse(self, feed_mm_min: float, points_mm: F) -> Result:
         """Checks common to MOVE and PATH_START; OK = go."""
@@ -247,9 +275,14 @@ class Controller:
     def _finish(self, points_done: int) -> None:
         """Count the motion as done, here and now."""
         self._end_path(points_done)
+        self._end_program()
         self._motion = None
         self.in_position, self.in_position_s = True, self.now_s
         self.motions_done += 1
+
+    def _end_program(self) -> None:
+        if isinstance(self._motion, Timetable):
+            self.switches.program_running = False
 
     def _end_path(self, points_done: int) -> None:
         if self.path_running:

@@ -8,6 +8,7 @@ import numpy as np
 from simulators.cnc.bank import BANK_WORDS, LSB_NM
 from simulators.cnc.compensation import CompResult
 from simulators.cnc.device import FIFO_SIZE, Controller, Hold, Result
+from simulators.cnc.log import HOLDS, Command, TableAccess
 
 MAP_VERSION = 1
 UNIT_MM = 1e-5  # positions count 10 nm
@@ -45,6 +46,10 @@ class CncRegisters:
         self._waiting: tuple[int, int] | None = None  # (command number, value of motions_done that means finished)
         self._fifo_ack, self._fifo_result = 0, Result.OK
         self._comp_ack, self._comp_result = 0, CompResult.OK
+        self.log: list[Command] = []
+        """Every command that carried a new number, and every hold request, in order."""
+        self.table_log: list[TableAccess] = []
+        """Every attempt to change banks, active table or lease, in order, refused ones too."""
 
     # ---- reading -------------------------------------------------------------------------------------------------
 
@@ -139,7 +144,7 @@ class CncRegisters:
         end = address + len(values)
         for number, base in enumerate(_BANKS_AT):
             if base <= address and end <= base + BANK_WORDS:
-                return self._cnc.comp.write(number, address - base, values)
+                return self._take_bank(number, address - base, values)
         if address == _FIFO_AT and len(values) <= 2 + 6 * _FIFO_POINTS:
             self._take_fifo(values)
         elif address == _HOLD_AT and len(values) == 1:
@@ -154,9 +159,25 @@ class CncRegisters:
             return False
         return True
 
+    def _take_bank(self, number: int, offset: int, values: list[int]) -> bool:
+        """Write into a bank. The log keeps refused ones too: whoever writes without the right to is found by it."""
+        comp = self._cnc.comp
+        owner = comp.owner(self._cnc.now_s)
+        taken = comp.write(number, offset, values)
+        self._note_table("write", number, offset, tuple(values), 0, owner, taken=taken)
+        return taken
+
+    def _note_table(self, kind: str, bank: int, first: int, words: tuple[int, ...], by: int, owner: int, *, taken: bool) -> None:
+        comp = self._cnc.comp
+        self.table_log.append(TableAccess(self._cnc.now_s, kind, bank, first, words, by, taken, owner, comp.active, comp.generation))
+
+    def _note(self, kind: str, *args: int) -> None:
+        self.log.append(Command(self._cnc.now_s, kind, args, self._cnc.moving))
+
     def _take_hold(self, value: int) -> bool:
         if value not in tuple(Hold):
             return False
+        self._note(HOLDS[value])
         self._cnc.request_hold(Hold(value))
         return True
 
@@ -165,6 +186,7 @@ class CncRegisters:
         number, command, x, y, z, feed = struct.unpack(">HHiiiI", struct.pack(f">{_MOTION_WORDS}H", *self._motion))
         if number != (self._motion_ack + 1) & 0xFFFF:
             return
+        self._note({1: "move", 2: "path_clear", 3: "path_start", 4: "reset_alarm"}.get(command, "?"), x, y, z, feed)
         self._done_number()  # the number of an earlier motion must not be lost under this one
         done_before = self._cnc.motions_done
         speed = feed * FEED_UNIT
@@ -187,6 +209,7 @@ class CncRegisters:
         """Store a chunk of path points if it carries the next number."""
         if values[0] != (self._fifo_ack + 1) & 0xFFFF:
             return
+        self._note("fifo", *values[1:])
         count = values[1] if len(values) > 1 else 0
         result = Result.BAD_ARGUMENT
         if 1 <= count <= _FIFO_POINTS and len(values) == 2 + 6 * count:
@@ -197,9 +220,11 @@ class CncRegisters:
     def _take_comp(self) -> None:
         """Execute the compensation block if it carries the next number."""
         number, command, bank, crc, generation, owner, lease_ms = struct.unpack(">HHHIIII", struct.pack(f">{_COMP_WORDS}H", *self._comp))
-        if number != (self._comp_ack + 1) & 0xFFFF:
-            return
         comp, now_s = self._cnc.comp, self._cnc.now_s
+        holder = comp.owner(now_s)
+        if number != (self._comp_ack + 1) & 0xFFFF:
+            self._note_table("stale", bank, 0, (number, command), owner, holder, taken=False)
+            return
         result = CompResult.BAD_ARGUMENT
         if command == 1:
             result = comp.seal(bank, owner, now_s)
@@ -211,6 +236,8 @@ class CncRegisters:
         elif command == 4:
             result = comp.release(owner, now_s)
         self._comp_ack, self._comp_result = number, result
+        kind = {1: "seal", 2: "activate", 3: "lease", 4: "release"}.get(command, "?")
+        self._note_table(kind, bank, 0, (number, int(result)), owner, holder, taken=result == CompResult.OK)
 
 
 def _us(time_s: float) -> int:

@@ -54,7 +54,7 @@ def motion_columns(machine: PerfectMachine, run: Run, carriage: int, component: 
     out = moved[:, None] * at
     if component >= 3:  # the mirror turns with the tool
         lever = (track.q_mm - track.q_mm[0]) @ np.cross(np.eye(3)[component - 3], track.look[0])
-        out = out + lever[:, None] * (at - at_reference)
+        out = out + lever[:, None] * at
     return np.asarray(out - out[0])
 
 

@@ -74,7 +74,11 @@ class Rig:
         return np.asarray(np.linalg.norm(tool - cup, axis=1) - run.track.radius_mm + bend.reading)
 
     def laser(self, run: Run) -> F:
-        """Growth of the path to where the mirror's plane meets the beam, minus the nominal one."""
+        """Growth of the path to where the mirror's plane meets the beam, minus the nominal one.
+
+        The mirror is square to the beam where nothing turns the tool, as the maker's reference has it; how it turns with the tool counts in
+        full. Who lines it up where the run begins has put it askew by what the tool is turned there: that is a tilt.
+        """
         track = run.track
         bend = self.bend(track)
         tool, turned = self.machine.locate(track.q_mm, bend)
@@ -83,7 +87,7 @@ class Rig:
         beam = nominal + bend.beam[0] * first + bend.beam[1] * second
         beam /= np.linalg.norm(beam)
         normal = np.tile(nominal + bend.tilt[0] * first + bend.tilt[1] * second, (track.n, 1))
-        normal = rotate(turned - turned[0], normal)
+        normal = rotate(turned, normal)
         path = np.einsum("ij,ij->i", tool - track.q_mm[0], normal) / (normal @ beam)
         return np.asarray(path - path[0] - track.reach_mm + bend.reading - bend.reading[0])
 

@@ -135,6 +135,11 @@ class LaserDevice:
         if blocked:
             self._lost, self._zeroed = True, False
 
+    def weaken(self, permille: int) -> None:
+        """Let less light come back, as from a dirty mirror; it still counts."""
+        self.output()
+        self._signal = permille
+
     # ---- commands ------------------------------------------------------------------------------------------------
 
     def zero(self, position_mm: F) -> LaserResult:

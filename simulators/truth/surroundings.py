@@ -34,11 +34,14 @@ class Air:
         self._swing = np.array([0.4, 120.0, 3.0])
         self._period_s = 60.0 * rng.uniform(20.0, 90.0, 3)
         self._phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+        self.warmer_c = 0.0
+        """Added to the temperature: the gate of the shop was opened."""
 
     def at(self, time_s: float) -> AirState:
         """State of the air; refractivity by the shop-floor form of the Edlén equation (NIST, engineering metrology toolbox)."""
         angle = 2.0 * np.pi * time_s / self._period_s + self._phase
         temperature, pressure, humidity = (float(v) for v in self._middle + self._swing * np.sin(angle))
+        temperature += self.warmer_c
         dry = 7.86e-4 * (pressure / 1000.0) / (273.0 + temperature)
         wet = 1.5e-11 * humidity * (temperature * temperature + 160.0)
         return AirState(temperature, pressure, humidity, dry - wet)

@@ -1,0 +1,158 @@
+"""When an answer on a Modbus line may be believed. TCP numbers its transactions; an RTU line has to prove that it is in step."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+
+from drivers.errors import BadFrame, LinkDown, ReplyTimeout
+from drivers.links.modbus import READ_HOLDING, READ_INPUT, WRITE, Answer, Request, Wire
+from drivers.links.words import CANARY_WORDS
+
+_BABBLE_LIMIT = 5
+_PROOFS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Canary:
+    """Registers whose content is known: what proves that a line carries this device's answers, and these in the right order.
+
+    Parameters
+    ----------
+    address : int
+        First register.
+    words : tuple of int
+        What stands there.
+    readable : int
+        Registers that may be read from ``address`` on in one request: reads of different lengths cannot be taken for one another.
+    """
+
+    address: int = 0
+    words: tuple[int, ...] = CANARY_WORDS
+    readable: int = 12
+
+
+class Line:
+    """A wire with a memory of what went wrong on it.
+
+    On RTU, after whatever was not answered as it should be: silence for a whole reply timeout, then the canary, and only then the next
+    request. And behind every answer the canary once more: if a stale reply passed for the answer, the true one comes now and does not fit.
+
+    Parameters
+    ----------
+    wire : Wire
+        The connection.
+    timeout_s : float
+        Longest wait for one reply.
+    canary : Canary or None
+        Without one a disturbed RTU line is only waited silent.
+    """
+
+    def __init__(self, wire: Wire, timeout_s: float, canary: Canary | None) -> None:
+        self._wire, self._timeout_s = wire, timeout_s
+        self._canary = canary if wire.rtu else None
+        self._name = wire.name
+        self._known: tuple[int, ...] | None = None
+        self._turn = 0
+        self.closing = False
+        """Somebody wants an end of it: no more waiting for silence."""
+        self.dirty = False
+        """The next request has to wait until the line is proven."""
+        self.foreign_bytes = 0
+        """Bytes that came when nothing was asked: noise, late replies, or a second master."""
+
+    async def open(self) -> None:
+        """Make a new connection; errors as of ``Wire.open``."""
+        self._known = None
+        await self._wire.open(self._timeout_s)
+
+    async def ready(self) -> None:
+        """Come to a state in which the next answer can be believed.
+
+        Raises
+        ------
+        LinkDown
+            The line is never silent, or never proves itself.
+        """
+        await self._wire.gap()
+        if self._wire.strays:
+            self.foreign_bytes += self._wire.strays
+            self._wire.forget()
+            self.dirty = self.dirty or self._wire.rtu
+        if self.dirty:
+            await self._quarantine()
+
+    def formed(self, request: Request, lead: int) -> tuple[Request, int]:
+        """The request in the form that this turn has, and how many of the registers read stand before those asked for.
+
+        With a canary: functions 3 and 4 in turn, and up to ``lead`` registers more, so that a reply to an earlier read looks different.
+        """
+        if self._canary is None or request.function == WRITE:
+            return request, 0
+        skip = self._turn // 2 % (lead + 1)
+        return Request(self._function(), request.address - skip, request.count + skip), skip
+
+    async def ask(self, request: Request) -> Answer:
+        """Send a request once; on RTU believe its answer only when the canary behind it is answered too. Errors as of ``Wire.ask``."""
+        answer = await self._asked(request)
+        if self._canary is not None:
+            await self._wire.gap()
+            if self._wire.strays or not await self._proven(self._canary, 0):
+                self.dirty = True
+                detail = "an answer came, but the canary asked behind it was not answered as it must be: it may have been a stale one"
+                raise BadFrame(self._name, str(request), detail, "second master on the line, line noise, or a slow device?")
+        return answer
+
+    async def _asked(self, request: Request) -> Answer:
+        try:
+            return await self._wire.ask(request, self._timeout_s)
+        except BaseException as error:
+            # RTU has no transaction number: what was not answered may be answered any time. TCP: a new connection has no past.
+            self.dirty = self._wire.rtu
+            if not self._wire.rtu or isinstance(error, LinkDown):
+                await self._wire.drop()
+            raise
+
+    async def _quarantine(self) -> None:
+        """Let whatever is late come and go, then prove with the canary that answers belong to questions again."""
+        for proof in range(_PROOFS):
+            await self._silence()
+            self._wire.forget()
+            if self._canary is None or await self._proven(self._canary, proof):
+                self.dirty = False
+                return
+            if not self._wire.up:
+                break
+        detail = f"the canary registers were not answered as they must be, {_PROOFS} times"
+        raise LinkDown(self._name, "prove the line after a disturbance", detail, "second master on the line, or device off?")
+
+    async def _silence(self) -> None:
+        clock = asyncio.get_running_loop().time
+        start = clock()
+        while (left_s := max(start, self._wire.heard_at) + self._timeout_s - clock()) > 0:
+            if self.closing or clock() - start > _BABBLE_LIMIT * self._timeout_s:
+                await self._wire.drop()
+                detail, remedy = "the line never falls silent", "second master on the line, or wrong baud rate?"
+                raise LinkDown(self._name, "wait for silence", detail, remedy)
+            await asyncio.sleep(left_s)
+
+    async def _proven(self, canary: Canary, proof: int) -> bool:
+        """Ask the canary. What it has to be is what it was at this connection, twice; whether it is right is for the identification."""
+        words = await self._sung(canary, proof)
+        if words and self._known is None:
+            self._known = words if await self._sung(canary, proof + 1) == words else None
+        return bool(words) and words == self._known and not self._wire.strays
+
+    async def _sung(self, canary: Canary, proof: int) -> tuple[int, ...]:
+        """What stands in the canary registers, read in another form each time; empty when no such answer came."""
+        longer = (self._turn // 2 + proof) % (canary.readable - len(canary.words) + 1)
+        try:
+            answer = await self._asked(Request(self._function(), canary.address, len(canary.words) + longer))
+        except (ReplyTimeout, BadFrame):
+            return ()
+        await self._wire.gap()
+        return answer.registers[: len(canary.words)]
+
+    def _function(self) -> int:
+        self._turn += 1
+        return READ_INPUT if self._turn % 2 else READ_HOLDING

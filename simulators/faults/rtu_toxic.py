@@ -1,0 +1,93 @@
+"""A Modbus RTU device on a pty whose line does what a scenario says: late, doubled, cut, noisy replies, echoes, a second master."""
+
+import asyncio
+from pathlib import Path
+
+from simulators.faults.modbus_frames import RTU, Cutter, Frame, answer, parts
+from simulators.faults.modbus_toxics import Act, Toxics
+from simulators.faults.scenario import FaultScenario
+from simulators.modbus_wire import RegisterMap
+from simulators.pseudo_serial import PseudoSerial
+
+BAUD = 115200
+
+
+class ToxicRtuLine:
+    """A register map at the end of a bad line. Like a device on a real line it does one thing at a time.
+
+    Parameters
+    ----------
+    registers : RegisterMap
+        What the device shows.
+    scenario : FaultScenario
+        May be exchanged while it runs (``play``).
+    link : Path, optional
+        Stable path of the host's terminal.
+    unit : int
+        Other units are not answered.
+    """
+
+    def __init__(self, registers: RegisterMap, scenario: FaultScenario | None = None, link: Path | None = None, unit: int = 1) -> None:
+        self._registers, self._unit = registers, unit
+        self._link = link
+        self._host: PseudoSerial | None = None
+        self._cutter = Cutter(RTU, requests=True)
+        self._loop = asyncio.get_running_loop()
+        self._timers: set[asyncio.TimerHandle] = set()
+        self.requests = 0
+        self._toxics = Toxics(scenario or FaultScenario(), RTU)
+
+    def play(self, scenario: FaultScenario) -> None:
+        """Begin a scenario: requests are counted anew."""
+        self._toxics = Toxics(scenario, RTU, self._toxics.free_at_s)
+
+    @property
+    def url(self) -> str:
+        """What a host writes to reach the device."""
+        path = "" if self._host is None else self._host.path
+        return f"modbus+rtu://{path}?baud={BAUD}&unit={self._unit}"
+
+    def start(self) -> str:
+        """Open the line; gives the URL."""
+        self._cutter = Cutter(RTU, requests=True)
+        self._host = PseudoSerial(self._received, self._link)
+        return self.url
+
+    def stop(self) -> None:
+        """Hang up; ``start`` begins again, maybe at another path."""
+        for timer in self._timers:
+            timer.cancel()
+        self._timers.clear()
+        if self._host is not None:
+            self._host.close()
+            self._host = None
+
+    def say(self, data: bytes) -> None:
+        """Put bytes on the line that nobody asked for: noise, or another master's traffic."""
+        if self._host is not None:
+            self._host.send(data)
+
+    def _received(self, data: bytes) -> None:
+        for frame in self._cutter.feed(data):
+            self.requests += 1
+            passed, acts = self._toxics.request(frame)
+            self._do(acts)
+            asked = parts(passed, RTU) if passed else None
+            if asked is not None and asked.unit == self._unit:
+                reply = Frame(self._unit, answer(self._registers, asked.pdu)).bytes(RTU)
+                self._do(self._toxics.reply(reply, self._loop.time()))
+
+    def _do(self, acts: list[Act]) -> None:
+        for act in acts:
+            if act.after_s > 0:
+                self._later(act)
+            else:
+                self.say(act.data)
+
+    def _later(self, act: Act) -> None:
+        def send() -> None:
+            self._timers.discard(timer)
+            self.say(act.data)
+
+        timer = self._loop.call_later(act.after_s, send)
+        self._timers.add(timer)

@@ -1,0 +1,191 @@
+"""A ball-bar's box on a bad line, with a time of its own: samples come when somebody lets it run, so no test has to wait for a clock."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from simulators.ballbar.device import NO_BAR, OUT_OF_RANGE
+from simulators.ballbar.port import BAUD, Received
+from simulators.ballbar.wire import SERIAL_NO, START, WITH_SETTINGS_BCD, BallbarWire, Parser
+from simulators.faults.serial_bytes import Sample, cut, sample_of
+from simulators.faults.serial_line import FaultyLine
+from simulators.faults.serial_uart import Uart
+from simulators.scenario import DEFAULT_PATH, load
+from simulators.world import World
+
+RADIUS_MM = 100.0
+_PIECE = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Samples ``begin`` to ``end - 1`` of a stream are not measurements: the box sets these status bits."""
+
+    begin: int
+    end: int
+    bits: int = OUT_OF_RANGE
+
+    def applied(self, sample: Sample) -> Sample:
+        """The sample as the box sends it."""
+        if not self.begin <= sample.seq < self.end:
+            return sample
+        return replace(sample, status=sample.status | self.bits, reading_nm=0 if self.bits & NO_BAR else 1_000_000)
+
+
+class _Tapped:
+    """The line as the box sees it: what the box says is noted, and its windows are put in, before the line spoils it."""
+
+    def __init__(self, box: "FaultyBox", line: FaultyLine) -> None:
+        self._box, self._line = box, line
+
+    @property
+    def url(self) -> str:
+        return self._line.url
+
+    def room(self) -> int:
+        return self._line.room()
+
+    def send(self, data: bytes) -> None:
+        self._line.send(b"".join(self._box.said(frame) for frame in cut(data)))
+
+    def pump(self) -> None:
+        self._line.pump()
+
+    async def open(self, received: Received) -> None:
+        await self._line.open(received)
+
+    async def close(self) -> None:
+        await self._line.close()
+
+
+class FaultyBox:
+    """The box.
+
+    Parameters
+    ----------
+    link : Path
+        Where the host finds it.
+    serial_no, firmware, boot_id : int
+        Who it is.
+    uart : Uart
+        Its baud rate and parity.
+    """
+
+    def __init__(
+        self,
+        link: Path,
+        *,
+        serial_no: int = SERIAL_NO,
+        firmware: int = WITH_SETTINGS_BCD,
+        boot_id: int = 0xCAFE0001,
+        uart: Uart | None = None,
+    ) -> None:
+        self.world = World(load(DEFAULT_PATH))
+        self.world.ballbar.mount(RADIUS_MM, self.world.tool_position() + np.array([RADIUS_MM, 0.0, 0.0]), 0.0)
+        self.line = FaultyLine(link, uart or Uart(BAUD))
+        self.boot_id, self.serial_no = boot_id, serial_no
+        self.sent: dict[tuple[int, int], list[Sample]] = {}
+        """Every sample that the box sent, by boot id and number of the stream since boot."""
+        self.commands: list[int] = []
+        self.windows: list[Window] = []
+        self.rate_factor = 1.0
+        self.ppm = 0.0
+        """How fast the box's clock is."""
+        self.on_start: Callable[[], None] = lambda: None
+        self.before: Callable[[int], bool] = lambda kind: False
+        """Is asked with the type of every command; True: the box does not get it."""
+        self._streams = 0
+        self._late_us = self._taken = 0
+        self._first_s = 0.0
+        self._parser = Parser()
+        self._wire = BallbarWire(
+            self.world.ballbar, _Tapped(self, self.line), boot_id, lambda: self.world.time_s, serial_no=serial_no, firmware=firmware
+        )
+
+    @property
+    def url(self) -> str:
+        """Where a host finds it."""
+        return self.line.url
+
+    async def plug(self) -> None:
+        """Put the cable in."""
+        await self.line.open(self._received)
+
+    async def unplug(self) -> None:
+        """Pull the cable; the box has a battery and goes on."""
+        await self.line.close()
+
+    async def run(self, samples: int) -> None:
+        """Let the box take so many samples, as fast as the line takes them; nothing comes of it when it is not streaming."""
+        left = samples
+        while left > 0:
+            piece, left = min(left, _PIECE), left - _PIECE
+            self.advance(piece)
+            while self.line.plugged and self.line.room() < _PIECE * 24:  # noqa: ASYNC110 - the terminal does not tell
+                await asyncio.sleep(0.001)
+            await asyncio.sleep(0)
+
+    def advance(self, samples: int) -> None:
+        """Let the time of so many samples go by and send what was sampled."""
+        rate_hz = self.world.ballbar.rate_hz
+        self._taken += samples
+        # to the middle between two samples, so that rounding never decides
+        until_s = self._first_s + (self._taken - 0.5) / rate_hz if rate_hz else self.world.time_s + samples * 1e-3
+        self.world.advance(until_s)
+        self._wire.flush()
+
+    def _begun(self) -> None:
+        self._streams += 1
+        self._taken = 0
+        self._first_s = self.world.time_s + 1.0 / self.world.ballbar.rate_hz
+        if self.rate_factor != 1.0:
+            self.world.ballbar.rate_hz = round(self.world.ballbar.rate_hz * self.rate_factor)
+
+    def pause(self, seconds: float) -> None:
+        """Have taken no samples for a while in which the box's clock ran on."""
+        self._late_us += round(seconds * 1e6)
+
+    def reboot(self) -> None:
+        """Lose power for a moment: another boot id, nothing streaming, settings as from the factory."""
+        self.boot_id += 1
+        self._streams = self._late_us = 0
+        self._wire.restart(self.boot_id)
+
+    def begin_anew(self, rate_hz: int = 1000) -> None:
+        """Start a stream that nobody here asked for, as another program would."""
+        self.world.ballbar.start(rate_hz, self.world.time_s)
+        self._begun()
+
+    def said(self, frame: bytes) -> bytes:
+        """Note what the box says; gives the frame with its windows."""
+        sample = sample_of(frame)
+        if sample is None:
+            return frame
+        sample = replace(sample, device_us=round(sample.device_us * (1.0 + self.ppm * 1e-6)) + self._late_us)
+        for window in self.windows:
+            sample = window.applied(sample)
+        self.sent.setdefault((self.boot_id, self._streams), []).append(sample)
+        return sample.frame()
+
+    def _received(self, data: bytes) -> None:
+        kinds = [kind for kind, _ in self._parser.feed(data)]
+        if any(self.before(kind) for kind in kinds):
+            return
+        self._wire.received(data)
+        self.commands += kinds
+        if START in kinds:
+            self._begun()
+            asyncio.get_running_loop().call_soon(self.on_start)
+
+    @property
+    def stream(self) -> tuple[int, int]:
+        """Boot id, and number of the stream since boot."""
+        return self.boot_id, self._streams
+
+    @property
+    def starts(self) -> int:
+        """How often a host started a stream."""
+        return self.commands.count(START)

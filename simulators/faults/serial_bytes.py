@@ -1,0 +1,98 @@
+"""What a bad line does to bytes and frames of the ball-bar's box: pure functions, drawn from a generator that the caller seeds."""
+
+import random
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from simulators.ballbar.wire import SAMPLE, SYNC_BYTES, encode
+
+GARBAGE = ("random", "ones", "sync", "header")
+_SAMPLE = struct.Struct("<IQiH")
+_OVERHEAD = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What is in a SAMPLE frame."""
+
+    seq: int
+    device_us: int
+    reading_nm: int
+    status: int
+
+    def frame(self) -> bytes:
+        """Its bytes."""
+        return encode(SAMPLE, _SAMPLE.pack(self.seq & 0xFFFFFFFF, self.device_us, self.reading_nm, self.status))
+
+
+def sample_of(frame: bytes) -> Sample | None:
+    """What is in a whole frame, None when it is not a SAMPLE."""
+    return Sample(*_SAMPLE.unpack_from(frame, 4)) if frame[2] == SAMPLE else None
+
+
+def cut(data: bytes) -> list[bytes]:
+    """The frames in honest bytes, as the box writes them."""
+    found, at = [], 0
+    while at < len(data):
+        end = at + data[at + 3] + _OVERHEAD
+        found.append(data[at:end])
+        at = end
+    return found
+
+
+def garbage(kind: str, size: int, draw: random.Random) -> bytes:
+    """``size`` bytes that are no frame: ``random``, all ``ones``, ``sync`` patterns, or a ``header`` that promises the longest payload."""
+    if kind == "random":
+        return draw.randbytes(size)
+    if kind == "ones":
+        return b"\xff" * size
+    if kind == "sync":
+        return (SYNC_BYTES * (size // 2 + 1))[:size]
+    return (SYNC_BYTES + b"\x01\xff" + draw.randbytes(size))[:size]
+
+
+def flipped(frame: bytes, *bits: int) -> bytes:
+    """The frame with these bits turned over (bit 0 is the lowest of the first byte)."""
+    damaged = bytearray(frame)
+    for bit in bits:
+        damaged[bit // 8] ^= 1 << bit % 8
+    return bytes(damaged)
+
+
+def burst(frame: bytes, draw: random.Random) -> bytes:
+    """The frame after an electric burst: two to six bytes in a row are something else."""
+    size = draw.randint(2, 6)
+    at = draw.randrange(len(frame) - size)
+    other = bytes(byte ^ draw.randint(1, 255) for byte in frame[at : at + size])
+    return frame[:at] + other + frame[at + size :]
+
+
+def every_nth(frames: list[bytes], n: int, draw: random.Random) -> Iterator[bytes]:
+    """All frames, every n-th one (the n-th, the 2n-th ...) hit by a burst."""
+    for number, frame in enumerate(frames, 1):
+        yield burst(frame, draw) if number % n == 0 else frame
+
+
+def repeated(frames: list[bytes], at: int, count: int) -> list[bytes]:
+    """Frames ``at - count`` to ``at - 1`` come a second time before frame ``at``."""
+    return frames[:at] + frames[max(0, at - count) : at] + frames[at:]
+
+
+def delayed(frames: list[bytes], at: int, by: int) -> list[bytes]:
+    """Frame ``at`` comes ``by`` places late."""
+    rest = frames[:at] + frames[at + 1 :]
+    return [*rest[: at + by], frames[at], *rest[at + by :]]
+
+
+def swapped(frames: list[bytes], at: int, distance: int) -> list[bytes]:
+    """Frames ``at`` and ``at + distance`` have changed places."""
+    out = list(frames)
+    out[at], out[at + distance] = out[at + distance], out[at]
+    return out
+
+
+def sliced(data: bytes, size: int) -> Iterator[bytes]:
+    """The bytes in pieces of ``size``."""
+    for at in range(0, len(data), size):
+        yield data[at : at + size]

@@ -1,0 +1,155 @@
+"""A serial line that can be pulled out, held, slowed and spoilt, between a box and whoever opens the terminal at the stable path."""
+
+import asyncio
+import os
+import termios
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from simulators.ballbar.port import BUFFER_BYTES, Received
+from simulators.faults.serial_uart import Uart, heard
+from simulators.pseudo_serial import PseudoSerial
+
+Spoil = Callable[[bytes], Iterable[bytes]]
+"""Honest bytes to the pieces that arrive, in order; every piece is written by itself."""
+
+
+_BAUD = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
+
+
+class _Terminal(PseudoSerial):
+    """The pty with what a line needs: it goes on by itself when the host reads, and can be held."""
+
+    def pump(self) -> None:
+        """Pass on what waits, and come back when there is room."""
+        super().pump()
+        loop = asyncio.get_running_loop()
+        loop.remove_writer(self._master)
+        if self.backlog:
+            loop.add_writer(self._master, self.pump)
+
+    def close(self) -> None:
+        """Hang up."""
+        asyncio.get_running_loop().remove_writer(self._master)
+        super().close()
+
+    def hold(self, held: bool) -> None:
+        """Take (or take again) bytes from the host, like a device that sent XOFF (XON)."""
+        termios.tcflow(self._slave, termios.TCOOFF if held else termios.TCOON)
+
+    def stuff(self) -> int:
+        """Fill what the terminal keeps for the device, which reads nothing any more; how many bytes it took."""
+        asyncio.get_running_loop().remove_reader(self._master)
+        taken = 0
+        os.set_blocking(self._slave, False)
+        with suppress(BlockingIOError):
+            while True:
+                taken += os.write(self._slave, bytes(256))
+        return taken
+
+    def unstuff(self) -> None:
+        """Let the device read again; the stuffing is thrown away."""
+        termios.tcflush(self._slave, termios.TCOFLUSH)
+        with suppress(BlockingIOError):
+            while os.read(self._master, 65536):
+                pass
+        asyncio.get_running_loop().add_reader(self._master, self._readable)
+
+    def host_baud(self) -> int:
+        """What the host has set."""
+        return _BAUD.get(termios.tcgetattr(self._slave)[5], 0)
+
+
+class FaultyLine:
+    """A line of a ball-bar's box (a ``BytePort``) at a stable path.
+
+    Parameters
+    ----------
+    link : Path
+        Where the host finds it, whatever terminal it is.
+        It may be changed while the line is not plugged in: that is another socket of the computer.
+    box : Uart
+        Baud rate and parity of the box. The host's baud rate is what it has really set; terminals keep no parity, so the host's is said
+        in ``host_parity``.
+    """
+
+    def __init__(self, link: Path, box: Uart) -> None:
+        self.link, self._box = link, box
+        self._terminal: _Terminal | None = None
+        self._received: Received = lambda data: None
+        self.host_parity = box.parity
+        self.spoil: Spoil | None = None
+        self._held_back: list[bytes] | None = None
+
+    @property
+    def url(self) -> str:
+        """Where a host finds it."""
+        return f"serial://{self.link.absolute()}?baud={self._box.baud}"
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the cable is in."""
+        return self._terminal is not None
+
+    @property
+    def terminal(self) -> _Terminal:
+        """The terminal of a line that is plugged in."""
+        if self._terminal is None:
+            raise RuntimeError("the line is not plugged in")
+        return self._terminal
+
+    def room(self) -> int:
+        """Room in the buffer; none while unplugged."""
+        return 0 if self._terminal is None else max(0, BUFFER_BYTES - self._terminal.backlog)
+
+    def send(self, data: bytes) -> None:
+        """Send bytes to the host, after whatever the line does to them."""
+        if self._terminal is None or not data:
+            return
+        for piece in self.spoil(data) if self.spoil is not None else (data,):
+            if self._terminal is None:  # pulled in the middle of it
+                return
+            arrives = heard(piece, self._box, self._host())
+            if self._held_back is not None:
+                self._held_back.append(arrives)
+            elif arrives:
+                self._terminal.send(arrives)
+
+    def pump(self) -> None:
+        """Pass on what waits."""
+        if self._terminal is not None:
+            self._terminal.pump()
+
+    def stall(self) -> None:
+        """Let nothing arrive at the host until ``resume``; nothing is lost."""
+        self._held_back = []
+
+    def resume(self) -> None:
+        """Let everything arrive that was held back."""
+        held, self._held_back = self._held_back or [], None
+        if self._terminal is not None:
+            self._terminal.send(b"".join(held))
+
+    async def open(self, received: Received) -> None:
+        """Be plugged in: a new terminal, the same path."""
+        self._received = received
+        self._terminal = _Terminal(self._hear, self.link)
+
+    async def close(self) -> None:
+        """Be pulled out."""
+        self.pull()
+
+    def pull(self) -> None:
+        """Pull the cable out, now: both ends of the terminal are closed, the path is gone."""
+        terminal, self._terminal, self._held_back = self._terminal, None, None
+        if terminal is not None:
+            terminal.close()
+
+    def _host(self) -> Uart:
+        baud = self._terminal.host_baud() if self._terminal is not None else 0
+        # a terminal that nobody has opened yet has the speed of a modem; nobody hears it either
+        return Uart(baud, self.host_parity) if baud > 38400 else self._box
+
+    def _hear(self, data: bytes) -> None:
+        self._received(heard(data, self._host(), self._box))

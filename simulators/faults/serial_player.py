@@ -1,0 +1,66 @@
+"""Plays a scenario of faults (see `simulators.faults.scenario`) on a serial line; events are the frames that the box sends, counted from 0.
+
+==========  ==========================================================================================
+kind        what happens at the frames that it hits
+==========  ==========================================================================================
+garbage     ``value`` drawn bytes (or ``data``) come before the frame
+truncate    only the first ``value`` bytes arrive
+flip        bit ``value`` is turned over
+burst       two to six bytes in a row are something else
+drop        the frame does not arrive
+repeat      it arrives ``value`` times more
+stall       from it on nothing arrives for ``seconds``, then everything does
+unplug      the cable is pulled before it
+==========  ==========================================================================================
+"""
+
+import asyncio
+import random
+from collections.abc import Callable, Iterator
+
+from simulators.faults.scenario import Fault, FaultScenario
+from simulators.faults.serial_bytes import burst, cut, flipped, garbage
+from simulators.faults.serial_line import FaultyLine
+
+Change = Callable[[bytes, Fault, random.Random], bytes]
+_CHANGES: dict[str, Change] = {
+    "garbage": lambda frame, fault, draw: (bytes.fromhex(fault.data) or garbage("random", fault.value, draw)) + frame,
+    "truncate": lambda frame, fault, draw: frame[: fault.value],
+    "flip": lambda frame, fault, draw: flipped(frame, fault.value % (8 * len(frame))),
+    "burst": lambda frame, fault, draw: burst(frame, draw),
+    "drop": lambda frame, fault, draw: b"",
+    "repeat": lambda frame, fault, draw: frame * (1 + fault.value),
+}
+KINDS = (*_CHANGES, "stall", "unplug")
+
+
+def play(line: FaultyLine, scenario: FaultScenario) -> None:
+    """Let the line do what the scenario says, from the next frame on, instead of whatever it did before.
+
+    Raises
+    ------
+    FaultScenarioError
+        A kind that a serial line does not know.
+    """
+    scenario.check(KINDS)
+    draw, number = random.Random(scenario.seed), -1
+
+    def spoil(data: bytes) -> Iterator[bytes]:
+        nonlocal number
+        for frame in cut(data):
+            number += 1
+            yield _changed(line, frame, [fault for fault in scenario.faults if fault.hits(number)], draw)
+
+    line.spoil = spoil
+
+
+def _changed(line: FaultyLine, frame: bytes, faults: list[Fault], draw: random.Random) -> bytes:
+    for fault in faults:
+        if fault.kind == "stall":
+            line.stall()
+            asyncio.get_running_loop().call_later(fault.seconds, line.resume)
+        elif fault.kind == "unplug":
+            line.pull()
+        elif len(frame) > 8:  # what an earlier fault has left too short is spoilt enough
+            frame = _CHANGES[fault.kind](frame, fault, draw)
+    return frame
