@@ -67,7 +67,7 @@ _ODD = _Plan(
     "the same places from the other side: what turns its sign with the direction turns again",
 )
 _PLANS = {
-    "step": _AGAIN, "slip": _AGAIN, "settling": _AGAIN, "burst": _AGAIN, "surge": _PERIOD, "wave": _PERIOD,
+    "step": _AGAIN, "slip": _AGAIN, "settling": _AGAIN, "burst": _AGAIN, "place": _AGAIN, "surge": _PERIOD, "wave": _PERIOD,
     "bump": _BUMP, "lobes": _LOBES, "smooth": _SMOOTH, "odd": _ODD,
 }  # fmt: skip
 

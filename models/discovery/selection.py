@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -159,7 +160,7 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
             picks[form[0]] = form[1]
         elif new is not None:
             picks.append(new.pick)
-            picks = dropped(contest, swapped(contest, picks))
+            picks = dropped(contest, joined(contest, swapped(contest, picks)))
         else:
             break
     return weighed(contest, dropped(contest, picks))
@@ -180,6 +181,25 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
         score = gain - contest.price(own)
         rival = contest.next([p for j, p in enumerate(picks) if j != i], rows, without=[picks[i].label], beat=score + 1.0)
         picks[i] = own if rival is None else rival.pick
+    return picks
+
+
+def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
+    """Two names of one kind put in question by one: where only Y trails, X and Z that lead it by as much say nearly the same."""
+    for i, j in combinations(range(len(picks)), 2):
+        a, b = picks[i], picks[j]
+        if a.effect.name != b.effect.name or a.unnamed:
+            continue
+        rest = [p for k, p in enumerate(picks) if k not in (i, j)]
+        rows = rows_for(contest.scene, rest)
+        both = gain_of(contest.scene, a, rows) + gain_of(contest.scene, b, rows_for(contest.scene, [*rest, a]))
+        beat = both - contest.price(a) - contest.price(b)
+        others_of_kind = contest.shortlist(rows, [a.label, b.label, *(p.label for p in rest)], most=len(contest.widths))
+        one = (refined(contest.scene, f.pick, rows) for f in others_of_kind if f.pick.effect.name == a.effect.name)
+        tried = [Found(pick, gain, gain - contest.price(pick)) for pick, gain in one]
+        best = max(tried, key=lambda f: f.score, default=None)
+        if best is not None and best.score > beat:
+            return joined(contest, [*rest, best.pick])
     return picks
 
 

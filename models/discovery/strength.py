@@ -26,6 +26,10 @@ TRUE_TO_FORM_OF = {
     "dead_path": 0.1,  # nor does its air warm up at one rate
 }
 """The same of effects that are less like their formula than their family."""
+CARRYING = ("modulated", "sensor")
+"""Forms of effects that do not warm up which hold part of their size."""
+OFFSET = "offset"
+"""A form that begins so has a constant first: what a sensor followed counts from where it began, and that is no part of a swing."""
 TIME_TRUE_TO_FORM = 0.3
 """The same of a time constant: what has several of them looks quicker than it is in a campaign that ends before the slow one does."""
 
@@ -45,8 +49,8 @@ def shape_of(pick: Pick, u: Mapping[str, float]) -> dict[str, tuple[float, float
 def strength_of(scene: Scene, pick: Pick, c: F1, cov: F2) -> tuple[float, float]:
     """Strength and its standard uncertainty, in the effect's unit, from its coefficients (forms last) and their covariance.
 
-    Three parts of the uncertainty: that of the coefficients (the non-linear parameters free), that of the form, and what the present
-    simulation swallows of the effect whatever it is (`Effect.unseen`).
+    Four parts of the uncertainty: that of the coefficients (the non-linear parameters free), that of the form, what the present simulation
+    swallows of the effect whatever it is (`Effect.unseen`), and how far it depends on what is called constant (`as_plain`).
     """
     effect = pick.effect
     plain = as_plain(scene, pick)
@@ -56,7 +60,8 @@ def strength_of(scene: Scene, pick: Pick, c: F1, cov: F2) -> tuple[float, float]
     own = float(np.sqrt(max(float(slope @ cov_plain @ slope), 0.0)))
     ratio, u_ratio = effect.unseen
     strength = ratio * seen
-    u = float(np.linalg.norm([ratio * own, true_to_form(effect.name, effect.family) * strength, u_ratio * seen]))
+    otherwise = seen - float(effect.strength(as_plain(scene, pick, offset=False) @ c, pick.values))
+    u = float(np.linalg.norm([ratio * own, true_to_form(effect.name, effect.family) * strength, u_ratio * seen, otherwise]))
     return strength / effect.per_unit, u / effect.per_unit
 
 
@@ -70,22 +75,24 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
     return out
 
 
-def as_plain(scene: Scene, pick: Pick) -> F2:
+def as_plain(scene: Scene, pick: Pick, *, offset: bool = True) -> F2:
     """Coefficients of the plain effect that comes nearest to the effect with its forms, per coefficient, shape (plain, all).
 
-    Only forms that carry part of the size itself count: an amplitude that changes along the axis, other courses of a warming up. What a
-    form adds beside (second harmonic, wind-up) is no part of the strength.
+    Only forms that carry part of the size itself count: an amplitude that changes along the axis, other courses of a warming up, what a
+    sensor followed. What a form adds beside (second harmonic, wind-up) is no part of the strength.
     """
     raw = pick.raw(scene)
     k = scene.raw(pick.effect.signal, pick.key, pick.values).shape[1]
     at = k
     for form in pick.forms:
         width = scene.raw(form.signal, pick.key, pick.values).shape[1]
-        if pick.effect.family != "thermal" and not form.name.startswith("modulated"):
+        if pick.effect.family != "thermal" and not form.name.startswith(CARRYING):
             raw[:, at : at + width] = 0.0
         at += width
     if not raw[:, k:].any():
         return np.eye(k, raw.shape[1])
-    scale = np.linalg.norm(raw[:, :k], axis=0)
+    beside = [scene.raw(f.signal, pick.key, pick.values)[:, :1] for f in pick.effect.forms if offset and f.name.startswith(OFFSET)]
+    basis = np.concatenate([raw[:, :k], *beside], axis=1)
+    scale = np.linalg.norm(basis, axis=0)
     scale[scale == 0.0] = 1.0
-    return np.asarray(np.linalg.lstsq(raw[:, :k] / scale, raw, rcond=1e-9)[0] / scale[:, None])
+    return np.asarray(np.linalg.lstsq(basis / scale, raw, rcond=1e-9)[0] / scale[:, None])[:k]

@@ -11,6 +11,9 @@ from models.discovery.generic import is_unnamed, where_of
 from models.discovery.selection import Found
 from models.discovery.variance import VarianceFinding
 
+TITLES = {"unnamed_burst": "short disturbance of the reading", "unnamed_place": "readings of the laser off near one place"}
+"""Of the structures of the scatter."""
+
 
 @dataclass(frozen=True)
 class Structure:
@@ -29,7 +32,7 @@ def structures(case: Case, found: Sequence[Found], loud: Sequence[VarianceFindin
         for f in found
         if f.pick.unnamed
     ]
-    out += [Structure(f.label, "short disturbance of the reading", f.evidence, f.where) for f in loud if is_unnamed(f.name)]
+    out += [Structure(f.label, TITLES[f.name], f.evidence, f.where) for f in loud if is_unnamed(f.name)]
     return tuple(sorted(out, key=lambda s: (-s.evidence, s.label)))
 
 

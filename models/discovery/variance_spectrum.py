@@ -15,6 +15,8 @@ HERTZ = (2.0, 75.0)
 PADDING = 4
 LOW_CYCLES, PER_TURN = 6.0, 2.0
 """Folded frequencies with fewer cycles per run, and per turn of the bar, belong to what is left of the mean."""
+LOBES_PER_TURN = 12.0
+"""Up to so many cycles per turn of the bar a line may be a form of the balls or of the machine instead: such runs do not prove a line."""
 REGULAR = 0.02
 """Sampling counts as regular when its steps differ by less than this share."""
 TOP = 24
@@ -22,7 +24,7 @@ TOP = 24
 
 @dataclass(frozen=True)
 class Line:
-    """Gain in log likelihood, how many frequencies were tried, frequency, amplitude with its uncertainty.
+    """Gain in log likelihood (of the runs that prove it), how many frequencies were tried, frequency, amplitude with its uncertainty.
 
     ``p_harmonics``: how often noise gives as much at twice to four times the frequency; a saw-tooth has them, a vibration has not.
     """
@@ -37,11 +39,15 @@ class Line:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Of one run: |sum r u_a e^-iwt| / sigma and (sum u_a^2) / sigma^2 by folded frequency 0 .. rate; zero where it does not count."""
+    """Of one run: |sum r u_a e^-iwt| / sigma and (sum u_a^2) / sigma^2 by folded frequency 0 .. rate; zero where it does not count.
+
+    ``proves``: where a line cannot be a form that the bar meets at every turn.
+    """
 
     rate_hz: float
     size: F1
     energy: F1
+    proves: np.ndarray[tuple[int], np.dtype[np.bool_]]
 
     def at(self, f: F1) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
         """Index of physical frequencies."""
@@ -71,7 +77,11 @@ def line_of_axis(
         gain, amplitude, u = _amplitude(spectra, f[i])
         if best is None or gain > best.gain:
             best = Line(gain, float((HERTZ[1] - HERTZ[0]) * longest), float(f[i]), amplitude, u)
-    return None if best is None else replace(best, p_harmonics=_harmonics(spectra, best.frequency_hz))
+    if best is None:
+        return None
+    proof = [s for s in spectra if s.proves[s.at(np.array([best.frequency_hz]))[0]]]
+    gain = min(best.gain, _amplitude(proof, best.frequency_hz)[0]) if proof else 0.0
+    return replace(best, gain=gain, p_harmonics=_harmonics(spectra, best.frequency_hz))
 
 
 def _harmonics(spectra: list[_Spectrum], f: float) -> float:
@@ -94,9 +104,10 @@ def _spectrum(axis: int, path: Path, rest: F1, sigma_mm: float, colour: Colour |
     size = np.abs(np.fft.fft(rest * look, PADDING * path.n))
     folded: F1 = np.fft.fftfreq(len(size)).astype(np.float64)
     through = np.ones(len(size)) if colour is None else 1.0 / _noise_power(folded, colour)
-    counts = np.abs(folded) * path.n >= _low_cycles(path) + 1.0
+    cycles = np.abs(folded) * path.n
+    counts = cycles >= _low_cycles(path) + 1.0
     energy = float(look @ look) * through
-    return _Spectrum(rate, size * np.sqrt(through) * counts, energy * counts)
+    return _Spectrum(rate, size * np.sqrt(through) * counts, energy * counts, cycles > LOBES_PER_TURN * _turns_of_bar(path))
 
 
 def fast(path: Path, rest: F1) -> F1:
@@ -110,8 +121,12 @@ def fast(path: Path, rest: F1) -> F1:
 
 def _low_cycles(path: Path) -> float:
     """Cycles per run up to which a frequency belongs to the mean: a few per turn of the bar."""
-    step = np.linalg.norm(np.diff(path.look, axis=0), axis=1)
-    return LOW_CYCLES + PER_TURN * float(step.sum()) / (2.0 * np.pi)
+    return LOW_CYCLES + PER_TURN * _turns_of_bar(path)
+
+
+def _turns_of_bar(path: Path) -> float:
+    """How far the bar turns along a run, turns."""
+    return float(np.linalg.norm(np.diff(path.look, axis=0), axis=1).sum()) / (2.0 * np.pi)
 
 
 def _noise_power(f: F1, colour: Colour) -> F1:

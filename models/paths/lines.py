@@ -101,3 +101,72 @@ def straight_line(start_mm: F1, end_mm: F1, n: int, *, back: bool = True) -> F2:
         raise ValueError(f"line: {n} positions, a line needs 2 or more")
     out = np.linspace(start_mm, end_mm, n)
     return np.concatenate([out, out[::-1]]) if back else out
+
+
+FACES: dict[str, tuple[str, str]] = {"XY": ("pp", "np"), "YZ": ("pp", "np"), "ZX": ("pp", "np")}
+"""The six face diagonals (ISO 230-6): two in each plane; ``np`` runs from large to small along the plane's first axis."""
+
+
+def face_ends(box_mm: F2, plane: str, diagonal: str, share: float) -> tuple[F1, F1]:
+    """Start and end of a face diagonal of a box, with the third axis standing at ``share`` of its length (0 its lower end).
+
+    Raises
+    ------
+    ValueError
+        Another plane or diagonal.
+    """
+    if plane not in FACES or diagonal not in FACES[plane]:
+        raise ValueError(f"face diagonal {plane} {diagonal}: must be XY, YZ or ZX and pp or np")
+    a, b = ("XYZ".index(c) for c in plane)
+    third = 3 - a - b
+    start, end = box_mm[:, 0].copy(), box_mm[:, 0].copy()
+    start[third] = end[third] = box_mm[third, 0] + share * (box_mm[third, 1] - box_mm[third, 0])
+    start[a], end[a] = box_mm[a] if diagonal == "pp" else box_mm[a, ::-1]
+    end[b] = box_mm[b, 1]
+    return start, end
+
+
+def target_shares(n: int, offset_share: float, seed: int) -> F1:
+    """Places of n targets between 0 and 1: equidistant, each moved by a pseudo-random part of the interval (ISO 230-2).
+
+    ``offset_share``: largest offset over the interval, below 0.5 so that the order stays; the first and last move inwards.
+    """
+    if n < 2 or not 0.0 <= offset_share < 0.5:
+        raise ValueError("targets: two or more, moved by less than half an interval")
+    step = 1.0 / (n - 1)
+    offset = np.random.default_rng(seed).uniform(-1.0, 1.0, n) * offset_share * step
+    offset[0], offset[-1] = abs(offset[0]), -abs(offset[-1])
+    return np.asarray(np.linspace(0.0, 1.0, n) + offset)
+
+
+def cycles_of(out_mm: F2, cycles: int, overrun_mm: float = 0.0) -> tuple[F2, F1]:
+    """Positions of a bidirectional test and the direction (+1 out, -1 back) of each: out and back, ``cycles`` times.
+
+    With an overrun the machine goes so far beyond both ends (along the first and last leg) before it turns, so that every target is
+    approached from the side that its direction names; these places are positions too. Without, the turning points stand there twice.
+
+    Parameters
+    ----------
+    out_mm : array, shape (n, 3)
+        The way out.
+
+    Returns
+    -------
+    positions, shape (m, 3), and directions, shape (m,).
+    """
+    if cycles < 1 or overrun_mm < 0.0:
+        raise ValueError("cycles: one or more, with an overrun of 0 or more")
+    way, there = np.asarray(out_mm, dtype=np.float64), np.ones(len(out_mm))
+    if overrun_mm == 0.0:
+        once, sign = np.concatenate([way, way[::-1]]), np.concatenate([there, -there])
+        return np.tile(once, (cycles, 1)), np.tile(sign, cycles)
+    first, last = way[0] - overrun_mm * _unit(way[1] - way[0]), way[-1] + overrun_mm * _unit(way[-1] - way[-2])
+    rows, signs = [first[None]], [np.ones(1)]
+    for _ in range(cycles):
+        rows += [way, last[None], way[::-1], first[None]]
+        signs += [there, np.ones(1), -there, -np.ones(1)]
+    return np.concatenate(rows), np.concatenate(signs)
+
+
+def _unit(v: F1) -> F1:
+    return np.asarray(v / np.linalg.norm(v))

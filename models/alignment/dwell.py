@@ -1,0 +1,250 @@
+"""Where a program that somebody else started stood still, and which of the planned readings each standstill is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from models.alignment.matching import LARGEST_MM, SURE, Match, match, places_reach
+from models.alignment.stands import CLEAR, LEAST_SAMPLES, Stand, noise_of, sides, stands
+from models.arrays import F1
+
+TOLERANCE = 0.3
+"""Where nothing moves, a reading that changes by less than this share of the smallest planned move is no move."""
+LONG, SHORT = 1.8, 0.4
+"""A standstill longer or shorter than planned by these factors is said."""
+JUMP_SAMPLES = 2
+MATCHED = 0.5
+"""Of the targets at least this share must be found: fewer, and the stream is of another program."""
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """One planned standstill: where (mm along what is read), for how long, and how many readings the plan takes there one after the
+    other."""
+
+    target: float
+    seconds: float
+    readings: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class DwellReading:
+    """One planned reading as found: mean, standard uncertainty, window, samples."""
+
+    value: float
+    u: float
+    start_s: float
+    end_s: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class Dwells:
+    """What was found of a plan. ``readings``: in the plan's order, None where the standstill is missing.
+
+    ``missing``: numbers (from 0) of planned standstills that nobody saw; ``extra``: standstills that nobody planned, each with the number
+    of the planned one before it (-1: before the first); ``odd``: planned standstills that were much longer or shorter than planned.
+    ``noise``: standard deviation of one sample, from the samples themselves.
+    """
+
+    readings: tuple[DwellReading | None, ...]
+    missing: tuple[int, ...]
+    extra: tuple[tuple[int, Stand], ...]
+    odd: tuple[int, ...]
+    noise: float
+
+
+def detect(t_s: F1, y: F1, planned: tuple[Planned, ...], *, settle_s: float, zero: float | None = None) -> Dwells:
+    """Match the standstills of a stream to the planned ones, in order; what has no partner is named, never shifted.
+
+    ``zero``: what the instrument shows at target 0, if it was zeroed there. If nobody knows, the offset between plan and stream is found
+    together with the match; where two offsets explain the stream about as well, nothing is guessed.
+
+    Parameters
+    ----------
+    t_s, y : array, shape (n,)
+        Sample times, and readings in the unit of the targets.
+    planned : tuple of Planned
+        In order; neighbours stand at different places.
+    settle_s : float
+        The first part of each standstill, in which the axes settle and nothing is read.
+
+    Raises
+    ------
+    ValueError
+        Too short a stream or plan; the reading jumped while nothing moved;
+        less than half of the plan was found: the stream is of another program; or two matches are as good.
+    """
+    if t_s.size < 10 or len(planned) < 2:
+        raise ValueError("dwells: a stream of ten samples and a plan of two standstills are the least")
+    targets = np.array([p.target for p in planned])
+    smallest = float(np.abs(np.diff(targets)).min())
+    if not smallest > 0.0:
+        raise ValueError("dwells: two planned standstills in a row are at one place; plan them as one with two readings")
+    found = stands(t_s, y, smallest_move=smallest, least_s=SHORT * settle_s)
+    tolerance = min(TOLERANCE * smallest, LARGEST_MM)
+    _check_jumps(found, tolerance)
+    noise = noise_of(y)
+    pairs = _matched(found, sides(t_s, y, found, smallest), targets, zero, noise)
+    if len(pairs) < MATCHED * len(planned):
+        raise ValueError(f"dwells: {len(pairs)} of {len(planned)} planned standstills were found: the stream is of another program")
+    _check_moves(found, pairs, targets)
+    lasted = {k: (found[s].end_s - found[s].start_s) / planned[k].seconds for k, s in pairs.items()}
+    pairs = {k: s for k, s in pairs.items() if lasted[k] > LONG or not _either_side(k, pairs, targets)}
+    readings: list[DwellReading | None] = []
+    for k, plan in enumerate(planned):
+        stand = found[pairs[k]] if k in pairs else None
+        if stand is not None and k == 0:  # the axes have long settled: its last seconds are those before the program moves
+            stand = replace(stand, start_s=max(stand.start_s, stand.end_s - plan.seconds))
+        elif stand is not None and (k == len(planned) - 1 or lasted[k] > LONG):  # later it may have been gone and come back
+            stand = replace(stand, end_s=min(stand.end_s, stand.start_s + plan.seconds))
+        readings += [None] * plan.readings if stand is None else _readings(t_s, y, stand, plan, (settle_s, noise))
+    ends = (0, len(planned) - 1)  # before the first and after the last the machine stands as long as it likes
+    odd = tuple(k for k in pairs if lasted[k] < SHORT or (lasted[k] > LONG and k not in ends))
+    missing = tuple(k for k in range(len(planned)) if k not in pairs)
+    return Dwells(tuple(readings), missing, _extra(found, pairs), odd, noise)
+
+
+def _check_jumps(found: tuple[Stand, ...], tolerance: float) -> None:
+    """Two standstills with nothing between them are one, in which the reading jumped: counts were lost, everything after is off."""
+    for before, after in pairwise(found):
+        by = after.level - before.level
+        if after.first - before.last <= JUMP_SAMPLES and abs(by) < tolerance:
+            at_s = after.start_s - found[0].start_s
+            raise ValueError(f"dwells: the reading jumped by {by:.4f} mm at {at_s:.1f} s, while nothing moved")
+
+
+def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
+    """Whether a place is planned twice, with a turn between, and of the three only one standstill was seen: a turn that short shows in no
+    sample, so nobody knows on which way the machine stood there."""
+    if k in (0, targets.size - 1):
+        return False
+    for far in (k - 2, k + 2):
+        if 0 <= far < targets.size and abs(targets[far] - targets[k]) < 1e-6 and far not in pairs and (k + far) // 2 not in pairs:
+            return True
+    return False
+
+
+def _check_moves(found: tuple[Stand, ...], pairs: dict[int, int], targets: F1) -> None:
+    """A step with nothing between two standstills is a short planned move, or lost counts."""
+    taken = {s: k for k, s in pairs.items()}
+    for s, (before, after) in enumerate(pairwise(found)):
+        by = after.level - before.level
+        if after.first - before.last > JUMP_SAMPLES or (s in taken and s + 1 in taken):
+            continue
+        near = [k for k in (taken.get(s), taken.get(s + 1)) if k is not None]
+        moves = [
+            targets[j] - targets[i]
+            for k in near
+            for i, j in ((k - 1, k), (k, k + 1), (k - 2, k), (k, k + 2))
+            if i >= 0 and j < targets.size
+        ]
+        if not any(abs(by - move) <= 0.5 * abs(move) for move in moves):
+            at_s = after.start_s - found[0].start_s
+            raise ValueError(f"dwells: the reading jumped by {by:.4f} mm at {at_s:.1f} s, which nobody planned")
+
+
+def _extra(found: tuple[Stand, ...], pairs: dict[int, int]) -> tuple[tuple[int, Stand], ...]:
+    """Standstills between (or before, or behind) those of the plan."""
+    used = {s: k for k, s in pairs.items()}
+    out, last = [], -1
+    for s, stand in enumerate(found):
+        last = used.get(s, last)
+        if s not in used:
+            out.append((last, stand))
+    return tuple(out)
+
+
+def _matched(found: tuple[Stand, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
+    """Planned number to number of the standstill; refuses where two explanations are as good.
+
+    Without a zero, offsets are tried from the first and last few of both.
+    """
+    levels = np.array([s.level for s in found])
+    if levels.size == 0:
+        return {}
+    u_level = noise / np.sqrt(LEAST_SAMPLES)
+    if zero is not None:
+        return _told(match(levels, side, targets, offset=zero, noise=u_level, zeroed=True), found)
+    few = min(6, levels.size), min(6, targets.size)
+    tries = [levels[i] - targets[k] for i in range(few[0]) for k in range(few[1])]
+    tries += [levels[-1 - i] - targets[-1 - k] for i in range(few[0]) for k in range(few[1])]
+    reach = 0.5 * float(places_reach(targets, np.zeros(targets.size)).min())
+    rising = np.sort(tries)
+    groups = np.split(rising, np.flatnonzero(np.diff(rising) > reach) + 1)
+    offsets = [float(np.median(group)) for group in groups]
+    matches = [match(levels, side, targets, offset=offset, noise=u_level, zeroed=False, rivals=False) for offset in offsets]
+    first = int(np.argmin([one.cost for one in matches]))
+    best = match(levels, side, targets, offset=offsets[first], noise=u_level, zeroed=False)
+    whole = len(best.pairs) >= MATCHED * targets.size
+    if whole and any(one.cost < best.cost + SURE and _shifted(one.pairs, best.pairs) for one in matches):
+        raise ValueError("dwells: the stream fits the plan in two ways; zero the instrument at the first target, then the place is known")
+    return _told(best, found) if whole else best.pairs
+
+
+def _told(best: Match, found: tuple[Stand, ...]) -> dict[int, int]:
+    """The pairs, if no other explanation is as good."""
+    if best.rival is None:
+        return best.pairs
+    stand, ours, other = best.rival
+    at_s = found[stand].start_s - found[0].start_s
+    which = f"planned standstill {ours + 1} or {other + 1}" if ours != other else f"planned standstill {ours + 1}, or another of them"
+    raise ValueError(f"dwells: the standstill at {at_s:.1f} s may be {which}; nothing is guessed")
+
+
+def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
+    """Whether most standstills that both matches know are taken for other targets."""
+    first, second = ({s: k for k, s in pairs.items()} for pairs in (one, other))
+    both = first.keys() & second.keys()
+    return 2 * sum(first[s] != second[s] for s in both) > len(both)
+
+
+def _readings(t_s: F1, y: F1, stand: Stand, plan: Planned, how: tuple[float, float]) -> list[DwellReading | None]:
+    """The standstill's readings: its time after settling, in as many equal parts as the plan reads there."""
+    settle_s, noise = how
+    at = np.arange(stand.first, stand.last + 1)
+    at = at[(t_s[at] >= stand.start_s) & (t_s[at] <= stand.end_s)]
+    settled = at[t_s[at] >= min(stand.start_s + settle_s, stand.end_s - 0.4 * (stand.end_s - stand.start_s))]
+    settled = settled[:-1] if settled.size > LEAST_SAMPLES else settled  # the last may have been taken as the axes began to move
+    out: list[DwellReading | None] = []
+    for part in np.array_split(settled, plan.readings):
+        out.append(_mean(t_s[part], y[part], noise) if part.size else None)
+    return out
+
+
+def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
+    """Mean without what sticks out, and its uncertainty from the scatter there, at least that of the whole stream's noise."""
+    keep = np.abs(y - np.median(y)) <= CLEAR * max(noise, 1.4826 * float(np.median(np.abs(y - np.median(y)))))
+    kept = y[keep]
+    scatter = max(noise, float(np.std(kept, ddof=1)) if kept.size > 1 else 0.0)
+    related = 1.0
+    if kept.size > 5:
+        rest = kept - kept.mean()
+        power = float(rest @ rest)
+        rho = float(rest[1:] @ rest[:-1]) / power if power > 0.0 else 0.0
+        related = (1.0 + max(rho, 0.0)) / (1.0 - min(max(rho, 0.0), 0.9))
+    return DwellReading(float(kept.mean()), scatter * float(np.sqrt(related / kept.size)), float(t_s[0]), float(t_s[-1]), int(kept.size))
+
+
+def named(found: Dwells, planned: tuple[Planned, ...]) -> tuple[str, ...]:
+    """What of the program was not as planned, one line each; standstills count from 1."""
+    lines = [f"standstill {k + 1} of {len(planned)} (at {planned[k].target:.3f} mm) is missing" for k in found.missing]
+    for after, stand in found.extra:
+        where = "before the first" if after < 0 else f"after standstill {after + 1}"
+        lines.append(f"an unplanned standstill at {stand.level:.3f} mm of the reading {where}, {stand.end_s - stand.start_s:.1f} s long")
+    lines += [f"standstill {k + 1} was not {planned[k].seconds:.1f} s long" for k in found.odd]
+    return tuple(lines)
+
+
+def merged(planned: list[Planned]) -> tuple[Planned, ...]:
+    """Neighbours at one place are one standstill with the readings and the time of both."""
+    out: list[Planned] = []
+    for one in planned:
+        if out and abs(out[-1].target - one.target) < 1e-6:
+            out[-1] = replace(out[-1], seconds=out[-1].seconds + one.seconds, readings=out[-1].readings + one.readings)
+        else:
+            out.append(one)
+    return tuple(out)

@@ -1,0 +1,117 @@
+"""How much later than the machine a signal is: the time by which what is expected has to be shifted to lie on what was read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from models.arrays import F1, F2
+
+COARSE = 201
+ROUNDS = 12
+SLACK = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """``lag_s`` > 0: the signal shows the machine where it was so long before. ``told``: whether the readings say anything about it."""
+
+    lag_s: float
+    u_s: float
+    told: bool
+
+
+def fit_lag(t_s: F1, signal: F1, expected_s: F1, expected: F1, *, columns: F2 | None = None, search_s: float = 0.5) -> Lag:
+    """Lag of a signal behind what is expected of it, by least squares: signal(t) = expected(t - lag) + columns @ unknowns.
+
+    A coarse search finds the minimum (the peak of the cross-correlation), Gauss-Newton makes it exact. The uncertainty counts neighbouring
+    residuals as related as they are (Newey-West), so that drift and vibration do not make it look small.
+
+    Parameters
+    ----------
+    t_s, signal : array, shape (n,)
+    expected_s, expected : array, shape (m,)
+        What the signal would be without a lag, straight in between.
+    columns : array, shape (n, k), optional
+        What else may be in the signal; default: a constant.
+    search_s : float
+        Largest lag either way.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 10 values, or arrays that do not fit each other.
+    """
+    if t_s.size < 10 or signal.shape != t_s.shape or expected.shape != expected_s.shape:
+        raise ValueError("lag: ten values or more, each with its time")
+    free = np.ones((t_s.size, 1)) if columns is None else columns
+    basis = np.linalg.qr(free)[0]
+
+    def without(v: F1) -> F1:
+        return np.asarray(v - basis @ (basis.T @ v))
+
+    def left(lag: float) -> F1:
+        return without(signal - np.interp(t_s - lag, expected_s, expected))
+
+    tries = np.linspace(-search_s, search_s, COARSE)
+    lag = float(tries[int(np.argmin([float(left(v) @ left(v)) for v in tries]))])
+    width = float(np.median(np.diff(expected_s)))
+    slope, power = np.zeros(t_s.size), 0.0
+    for _ in range(ROUNDS):
+        rise = np.interp(t_s - lag + width, expected_s, expected) - np.interp(t_s - lag - width, expected_s, expected)
+        slope, rest = without(rise / (2 * width)), left(lag)
+        power = float(slope @ slope)
+        if power <= SLACK * max(float(rest @ rest) / search_s**2, 1e-300):
+            return Lag(lag, np.inf, told=False)
+        change = -float(slope @ rest) / power
+        lag = float(np.clip(lag + change, -search_s, search_s))
+        if abs(change) < 1e-9:
+            break
+    u = _newey_west(slope * left(lag)) / power
+    return Lag(lag, u, told=bool(u < 0.5 * search_s and abs(lag) < search_s))
+
+
+def _newey_west(score: F1) -> float:
+    """Standard deviation of the sum of a score whose neighbours are related."""
+    n = score.size
+    reach = min(n // 4, int(4 * (n / 100.0) ** (2.0 / 9.0)) + 20)
+    total = float(score @ score)
+    for k in range(1, reach + 1):
+        total += 2.0 * (1.0 - k / (reach + 1)) * float(score[k:] @ score[:-k])
+    return float(np.sqrt(max(total, float(score @ score) * 0.1)))
+
+
+def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, search_s: float = 0.5, smooth_s: float = 2.0) -> Lag:
+    """Lag of a reading that was taken along one path both ways at one speed: the two patterns are shifted against each other by twice the
+    lag.
+
+    Parameters
+    ----------
+    t_s : array, shape (n,)
+        Time along the path at which the readings of the way out were taken, evenly spaced.
+    out, back : array, shape (n,)
+        Readings of the way out, and of the way back at the same places.
+    columns : array, shape (n, k), optional
+        What else makes the ways differ (lost motion: the bar's direction times the change of sign of each axis); a constant is always free.
+    smooth_s : float
+        Over so long the pattern is taken for a cubic when its slope is estimated: noise in the slope would hide the lag.
+    """
+    step = float(np.median(np.diff(t_s)))
+    width = max(2, round(smooth_s / step / 2)) * 2 + 1
+    if t_s.size < 3 * width:
+        raise ValueError("lag: the path is too short for this smoothing")
+    slope_all = np.asarray(savgol_filter(0.5 * (out + back), width, 3, deriv=1, delta=step))
+    inner = slice(width, t_s.size - width)  # the ends know only one side
+    slope = slope_all[inner]
+    free = np.ones((t_s.size, 1)) if columns is None else np.column_stack([np.ones(t_s.size), columns])
+    basis = np.linalg.qr(free[inner])[0]
+    half = 0.5 * (out - back)[inner]
+    slope, half = slope - basis @ (basis.T @ slope), half - basis @ (basis.T @ half)
+    power = float(slope @ slope)
+    if power <= 1e-30:
+        return Lag(0.0, np.inf, told=False)
+    lag = -float(slope @ half) / power
+    u = _newey_west(slope * (half + lag * slope)) / power
+    return Lag(lag, u, told=bool(u < 0.5 * search_s))

@@ -1,0 +1,64 @@
+"""ISO 230-6: displacement along body and face diagonals. Each diagonal is evaluated like an axis by ISO 230-2; the largest counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from models.evaluation.iso230_2 import Approaches, Positioning, ScaleBudget, Value, positioning
+
+BODY = frozenset({"ppp", "npp", "pnp", "ppn"})
+FACE = frozenset({"pp", "np"})
+
+
+@dataclass(frozen=True, slots=True)
+class Diagonals:
+    """The diagonals of a volume (four) or of one plane (two).
+
+    ``each``: by name. ``E_d``, ``B_d``, ``M_d``: largest bidirectional systematic deviation, reversal, and range of the bidirectional
+    means, each with the name of the diagonal that has it; ``R_d``: largest repeatability, None without repeats. ``missing``: what the
+    standard asks for and was not measured: then the figures are lower bounds.
+    """
+
+    each: Mapping[str, Positioning]
+    E_d: tuple[str, Value]
+    B_d: tuple[str, Value]
+    M_d: tuple[str, Value]
+    R_d: tuple[str, Value] | None
+    missing: tuple[str, ...]
+
+
+def diagonals(readings: Mapping[str, Approaches], wanted: Iterable[str] = BODY, budget: ScaleBudget | None = None) -> Diagonals:
+    """Evaluate the diagonals of a volume or a plane.
+
+    Parameters
+    ----------
+    readings : mapping of str to Approaches
+        By name (``ppp``: all axes grow); positions along the diagonal.
+    wanted : iterable of str
+        Names that the standard asks for: `BODY` or `FACE`.
+
+    Raises
+    ------
+    ValueError
+        No diagonal, or one that is not wanted.
+    """
+    names = set(wanted)
+    strange = sorted(set(readings) - names)
+    if strange or not readings:
+        raise ValueError(f"ISO 230-6: diagonal {strange[0]!r} is none of {sorted(names)}" if strange else "ISO 230-6: no diagonal")
+    each = {name: positioning(readings[name], budget) for name in sorted(readings)}
+    repeats = {name: p.R for name, p in each.items() if p.R is not None}
+    return Diagonals(
+        each,
+        _largest({n: p.E for n, p in each.items()}),
+        _largest({n: p.B for n, p in each.items()}),
+        _largest({n: p.M for n, p in each.items()}),
+        _largest(repeats) if repeats else None,
+        tuple(sorted(names - set(readings))),
+    )
+
+
+def _largest(values: Mapping[str, Value]) -> tuple[str, Value]:
+    name = max(sorted(values), key=lambda n: values[n].value_mm)
+    return name, values[name]

@@ -1,0 +1,278 @@
+"""Whether a series of figures drifts, since when, and when it reaches its limit, as far as the figures and their uncertainties can tell.
+
+The figures come at any times, each with its own standard uncertainty, of which only the proportions are believed: mean and scale are
+learned from the series itself. A figure is compared with the mean of all before it, and its deviation, a Student variable, is turned into
+a standard normal one (Hawkins' self-starting chart). While nothing changes these are exactly independent and standard normal whatever the
+uncertainties are, so that the false-alarm rates of the textbook's charts (ISO 7870-4 CUSUM, ISO 7870-6 EWMA) hold from the third figure
+on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from models.arrays import F1
+
+CUSUM_K = 0.5
+"""Half the smallest shift worth finding, in standard deviations of a check."""
+CUSUM_H = 5.0
+"""Decision limit. With `CUSUM_K` one false alarm in 465 checks on average (`average_run_length`)."""
+CUSUM_MOST = 2 * CUSUM_H
+"""The sums grow no further, so that a cured drift is over ten checks later."""
+EWMA_WEIGHT = 0.2
+EWMA_L = 2.962
+"""Width of the EWMA's limits: one false alarm in 500 checks on average (Lucas and Saccucci 1990)."""
+MIN_CHECKS = 8
+"""With fewer nothing is said about drift."""
+MIN_FIT = 6
+"""With fewer nothing is said about the limit."""
+SIGNIFICANCE = 0.01
+"""A slope that chance gives this often is not used to look ahead."""
+Z_MAX = 8.0
+MOST_CHECKS = 400
+"""Older checks say nothing about the days ahead."""
+MOST_KNOTS = 200
+FARTHEST = 20.0
+"""Nothing is said beyond so many times the length of the series."""
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Days from the last check until the limit is reached, with a 95 % interval; NaN and a reason where that is not known.
+
+    ``slope`` and ``slope_u``: change a day and its standard uncertainty, in the figure's unit.
+    """
+
+    days: float
+    low: float
+    high: float
+    reason: str
+    slope: float = np.nan
+    slope_u: float = np.nan
+
+
+@dataclass(frozen=True)
+class Trend:
+    """What a series shows. ``state``: ``in control``, ``drifting`` or ``too few checks``.
+
+    ``since``: index of the first check of the drift; ``found``: of the one at which it was certain. ``direction``: +1 up, -1 down, 0 none.
+    ``z``: standardised deviations (NaN for the first two checks); ``ewma`` and ``ewma_limit``: the chart of them and its two-sided limit;
+    ``high`` and ``low``: the CUSUM's two sums, limit `CUSUM_H`.
+    """
+
+    state: str
+    direction: int
+    since: int | None
+    found: int | None
+    z: F1
+    ewma: F1
+    ewma_limit: F1
+    high: F1
+    low: F1
+    forecast: Forecast
+
+
+def standardised(values: F1, u: F1) -> F1:
+    """Deviation of each figure from the mean of all before it, as standard normal variable; NaN for the first two.
+
+    Parameters
+    ----------
+    values, u : array (n,)
+        Figures and their standard uncertainties, in order of time. Only the proportions of ``u`` count.
+
+    Raises
+    ------
+    ValueError
+        An uncertainty is not positive, or shapes differ.
+    """
+    z = np.full(len(values), np.nan)
+    if values.shape != u.shape or not bool(np.all(u > 0)):
+        raise ValueError("each figure needs a positive uncertainty")
+    if len(values) < 3:
+        return z
+    weight = 1.0 / u**2
+    total = np.cumsum(weight)
+    mean = np.cumsum(weight * values) / total
+    r = (values[1:] - mean[:-1]) / np.sqrt(u[1:] ** 2 + 1.0 / total[:-1])
+    dof = np.arange(1, len(r))
+    scale = np.sqrt(np.cumsum(r**2)[:-1] / dof)
+    z[2:] = _normal(r[1:], scale, dof.astype(np.float64))
+    return z
+
+
+def _normal(r: F1, scale: F1, dof: F1) -> F1:
+    """The standard normal variable that is as improbable as a Student one."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.where(scale > 0, np.abs(r) / scale, np.where(r == 0, 0.0, np.inf))
+    found = np.minimum(stats.norm.isf(stats.t.sf(size, dof)), Z_MAX)
+    return np.asarray(np.copysign(found, r), dtype=np.float64)
+
+
+def ewma(z: F1, weight: float = EWMA_WEIGHT, width: float = EWMA_L) -> tuple[F1, F1]:
+    """Exponentially weighted mean of standard normal variables and its limit, exact from the first on; NaN counts as not measured."""
+    mean, limit = np.full(len(z), np.nan), np.full(len(z), np.nan)
+    last, variance = 0.0, 0.0
+    for k in np.flatnonzero(np.isfinite(z)):
+        last = weight * float(z[k]) + (1 - weight) * last
+        variance = weight**2 + (1 - weight) ** 2 * variance
+        mean[k], limit[k] = last, width * np.sqrt(variance)
+    return mean, limit
+
+
+def cusum(z: F1, k: float = CUSUM_K) -> tuple[F1, F1]:
+    """Upper and lower cumulative sum of standard normal variables; NaN counts as nothing."""
+    high, low = np.zeros(len(z)), np.zeros(len(z))
+    up = down = 0.0
+    for n, one in enumerate(np.where(np.isfinite(z), z, np.nan).tolist()):
+        if one == one:
+            up, down = min(max(0.0, up + one - k), CUSUM_MOST), min(max(0.0, down - one - k), CUSUM_MOST)
+        high[n], low[n] = up, down
+    return high, low
+
+
+def average_run_length(shift: float = 0.0, k: float = CUSUM_K, h: float = CUSUM_H, states: int = 400) -> float:
+    """Checks until a two-sided CUSUM alarms, on average, when the mean is off by ``shift`` standard deviations (Brook and Evans 1972)."""
+    one = [_one_sided(sign * shift, k, h, states) for sign in (1, -1)]
+    return 1.0 / sum(1.0 / length for length in one)
+
+
+def _one_sided(shift: float, k: float, h: float, states: int) -> float:
+    width = 2 * h / (2 * states - 1)
+    middle = np.arange(states) * width
+    step = middle[None, :] - middle[:, None] + k - shift
+    move = stats.norm.cdf(step + width / 2) - stats.norm.cdf(step - width / 2)
+    move[:, 0] = stats.norm.cdf(step[:, 0] + width / 2)
+    return float(np.linalg.solve(np.eye(states) - move, np.ones(states))[0])
+
+
+def trend(days: F1, values: F1, u: F1, limit: float | None = None) -> Trend:
+    """Judge a series.
+
+    Parameters
+    ----------
+    days : array (n,)
+        Times, d, rising.
+    values, u : array (n,)
+        Figures and standard uncertainties, one unit.
+    limit : float, optional
+        What the figure must not exceed, in its unit.
+
+    Raises
+    ------
+    ValueError
+        Shapes differ, times do not rise, an uncertainty is not positive.
+    """
+    if days.shape != values.shape or bool(np.any(np.diff(days) < 0)):
+        raise ValueError("times and figures have to be as many, in order of time")
+    z = standardised(values, u)
+    high, low = cusum(z)
+    enough = len(values) >= MIN_CHECKS
+    first = next(iter(np.flatnonzero(np.maximum(high, low) > CUSUM_H).tolist()), None)
+    if first is not None and (since := _since(high if high[first] > CUSUM_H else low, first)) >= MIN_CHECKS:
+        # Checks are compared with what was before the drift from here on: else the drift itself would become the habit.
+        z = _against_before(values, u, z, since, first)
+        high, low = cusum(z)
+    direction = 0 if not enough else 1 if high[-1] > CUSUM_H else -1 if low[-1] > CUSUM_H else 0
+    began = found = None
+    if direction:
+        side = high if direction > 0 else low
+        began = _since(side, len(side) - 1)
+        found = began + int(np.flatnonzero(side[began:] > CUSUM_H)[0])
+    state = "drifting" if direction else "in control" if enough else "too few checks"
+    mean, bound = ewma(z)
+    ahead = forecast(days[-MOST_CHECKS:], values[-MOST_CHECKS:], u[-MOST_CHECKS:], limit)
+    return Trend(state, direction, began, found, z, mean, bound, high, low, ahead)
+
+
+def _since(side: F1, found: int) -> int:
+    """The check after the last one at which the sum was nothing: where the change most probably began."""
+    zero = np.flatnonzero(side[: found + 1] == 0)
+    return int(zero[-1]) + 1 if len(zero) else 0
+
+
+def _against_before(values: F1, u: F1, z: F1, since: int, found: int) -> F1:
+    """What `standardised` gives, with the checks after ``found`` compared with those before ``since``."""
+    weight = 1.0 / u[:since] ** 2
+    mean = float(np.sum(weight * values[:since]) / np.sum(weight))
+    scale = np.sqrt(float(np.sum(weight * (values[:since] - mean) ** 2)) / (since - 1))
+    r = (values[found + 1 :] - mean) / np.sqrt(u[found + 1 :] ** 2 + 1.0 / np.sum(weight))
+    again = z.copy()
+    again[found + 1 :] = _normal(r, np.full(len(r), scale), np.full(len(r), since - 1.0))
+    return again
+
+
+def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.95) -> Forecast:
+    """When the figure reaches its limit if it goes on as it does: it stood still, and from some day on it rises evenly.
+
+    Weighted least squares over level, slope and the day of the onset (which may lie before the first check: a straight line); scale
+    from the residuals. The interval holds every day at which the limit may be reached without the fit becoming significantly worse
+    (likelihood ratio, F with 1 and n - 3 degrees of freedom). What no interval holds is that the machine goes on like this.
+    """
+    n = len(values)
+    if limit is None:
+        return Forecast(np.nan, np.nan, np.nan, "there is no limit")
+    if n < MIN_FIT:
+        return Forecast(np.nan, np.nan, np.nan, f"not known: {n} checks are too few")
+    if days[-1] <= days[0]:
+        return Forecast(np.nan, np.nan, np.nan, "not known: all checks are of one moment")
+    sums = _Sums.of(days - days[-1], values - limit, 1.0 / u**2)
+    left = sums.left()
+    best = int(np.argmin(left))
+    scale2 = max(float(left[best]), 1e-12 * sums.yy) / (n - 3)
+    slope = float(sums.slope()[best])
+    told = (slope, float(np.sqrt(scale2 * sums.w / (sums.w * sums.rr[best] - sums.r[best] ** 2))))
+    flat = sums.yy - sums.y**2 / sums.w
+    if (flat - left[best]) / (2 * scale2) <= stats.f.isf(SIGNIFICANCE, 2, n - 3):
+        return Forecast(np.nan, np.nan, np.nan, "not known: the slope is not significant", *told)
+    if slope < 0:
+        return Forecast(np.nan, np.nan, np.nan, "moves away from the limit", *told)
+    reached = max(float(sums.knots[best] - sums.level()[best] / slope), 0.0)
+    span = float(days[-1] - days[0])
+    ahead = np.concatenate([[0.0], span * np.geomspace(1e-3, FARTHEST, 600)])
+    inside = np.flatnonzero(sums.left_if(ahead) - left[best] <= scale2 * stats.f.isf(1 - level, 1, n - 3))
+    if reached == 0.0 and not len(inside):
+        return Forecast(0.0, 0.0, 0.0, "", *told)
+    if reached > ahead[-1] or not len(inside) or inside[-1] == len(ahead) - 1:
+        return Forecast(np.nan, np.nan, np.nan, "not known: it may be very long", *told)
+    return Forecast(reached, float(ahead[max(inside[0] - 1, 0)]), float(ahead[inside[-1] + 1]), "", *told)
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Weighted sums for a level with a ramp from each of several days on (``knots``); figures are counted from the limit."""
+
+    knots: F1
+    w: float
+    y: float
+    yy: float
+    r: F1
+    rr: F1
+    yr: F1
+
+    @staticmethod
+    def of(days: F1, y: F1, w: F1) -> _Sums:
+        last = days[-3]  # an onset after it would be two checks and a guess
+        candidates = np.concatenate([days[days <= last], (days[1:] + days[:-1])[days[1:] <= last] / 2])
+        knots = np.unique(np.concatenate([[days[0]], candidates]))
+        knots = knots[np.unique(np.linspace(0, len(knots) - 1, min(len(knots), MOST_KNOTS)).round().astype(int))]
+        ramp = np.maximum(days[None, :] - knots[:, None], 0.0)
+        return _Sums(knots, float(w.sum()), float(w @ y), float(w @ y**2), ramp @ w, ramp**2 @ w, ramp @ (w * y))
+
+    def slope(self) -> F1:
+        return np.asarray((self.w * self.yr - self.r * self.y) / (self.w * self.rr - self.r**2), dtype=np.float64)
+
+    def level(self) -> F1:
+        return np.asarray((self.y - self.slope() * self.r) / self.w, dtype=np.float64)
+
+    def left(self) -> F1:
+        """Weighted sum of squares that is left, for each knot."""
+        return np.asarray(self.yy - self.level() * self.y - self.slope() * self.yr, dtype=np.float64)
+
+    def left_if(self, reached: F1) -> F1:
+        """The least that is left if the limit is reached at each of these days, whatever the knot."""
+        s = 1.0 / (reached[:, None] - self.knots[None, :])
+        level2 = (self.y - s * self.yr) ** 2 / (self.w - 2 * s * self.r + s**2 * self.rr)
+        return np.asarray((self.yy - level2).min(axis=1), dtype=np.float64)
