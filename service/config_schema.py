@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from datetime import UTC, datetime
-from typing import Annotated, Self
-from zoneinfo import ZoneInfo
+from datetime import date
+from typing import Annotated, Literal, Self
 
-from cronsim import CronSim, CronSimError
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from drivers.errors import DriverError
 from drivers.links import urls
+from service.config_timetable import ScheduleEntry, Section, WindowEntry
 from service.errors import AbbeError
 from service.mqtt.broker import parse as parse_broker
 from service.runs.machine_object import Chain, Interval, Point
@@ -20,11 +19,7 @@ from service.storage.engine import parse_url as parse_database
 Positive = Annotated[float, Field(gt=0.0)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
-
-
-class AxisIntervals(_Section):
+class AxisIntervals(Section):
     """One interval of commanded coordinates for each axis, mm."""
 
     X: Interval
@@ -32,7 +27,7 @@ class AxisIntervals(_Section):
     Z: Interval
 
 
-class AxisPoints(_Section):
+class AxisPoints(Section):
     """One point for each carriage, mm."""
 
     X: Point = (0.0, 0.0, 0.0)
@@ -40,7 +35,7 @@ class AxisPoints(_Section):
     Z: Point = (0.0, 0.0, 0.0)
 
 
-class Devices(_Section):
+class Devices(Section):
     """Where the devices are; an absent one is not connected."""
 
     ballbar: str | None = Field(default=None, description="serial:///dev/ttyUSB0?baud=460800 or socket://host:port")
@@ -83,31 +78,78 @@ def _database(text: str) -> str:
     return text
 
 
-class StoreSection(_Section):
+class StoreSection(Section):
     """Where results are kept."""
 
     url: Annotated[str, AfterValidator(_database)] = Field(
         default="sqlite:///abbe.sqlite3", description="SQLite file (relative to the machine file's folder) or postgresql://user@host/name"
     )
+    capture: str = Field(
+        default="",
+        description="local folder in which samples are made safe before the database gets them; empty: beside the SQLite file; PostgreSQL "
+        "needs one",
+    )
+    capture_reserve_mib: Annotated[float, Field(ge=0.0625, le=1024.0)] = Field(
+        default=16.0, description="disk space held back so that a run can be closed when the disk is full"
+    )
+    keep_segments: bool = Field(default=False, description="keep the capture's files although the database has everything")
 
 
-class Limits(_Section):
+class Limits(Section):
     """What must never be exceeded. A table beyond a limit is refused, not clamped."""
 
-    table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(default=200.0, description="largest correction at any grid point")
+    table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(default=100.0, description="largest correction at any grid point")
     table_change_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
-        default=200.0,
-        description="largest change of a correction against the active table; 50 is enough once a machine is corrected, but the first push "
-        "on a raw machine replaces nothing by everything",
+        default=50.0,
+        description="largest change of a correction against the active table; the first push on a raw machine, which replaces nothing by "
+        "everything, may need more: look at the proposal first",
     )
     table_step_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(
         default=20.0, description="largest change between neighbouring grid points"
     )
+    measurement_age_h: Annotated[float, Field(gt=0.0, le=8760.0)] = Field(
+        default=72.0, description="a table is only written from runs that are not older"
+    )
+    two_people: bool = Field(
+        default=False,
+        description="a proposed table is only pushed when somebody else than its proposer has approved it (`abbe comp approve`)",
+    )
     feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
     temperature_c: Interval = Field(default=(18.0, 24.0), description="air temperature in which a measurement is allowed")
+    run_temperature_c: Interval | None = Field(
+        default=None, description="air temperature (of the laser) beyond which a running measurement stops; absent: it is not watched"
+    )
+    continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
+        default_factory=list,
+        description="conditions that only suspend a measurement, which goes on by itself when they have cleared; e-stop and alarm never "
+        "do. ballbar: its box was lost or switched on anew, and is back",
+    )
+    suspend_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = Field(default=1800.0, description="longest suspension, then the run ends")
+    settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(default=10.0, description="so long all is well before it goes on")
 
 
-class Verify(_Section):
+class Calibration(Section):
+    """Last days of the instruments' certificates. No table is written from an instrument without one, or after it."""
+
+    ballbar: date | None = Field(default=None, description="of the ball-bar, e.g. 2027-05-31")
+    laser: date | None = Field(default=None, description="of the laser")
+
+
+class Nc(Section):
+    """The controller for which NC programs are written (`abbe measure --nc`)."""
+
+    acceleration_mm_s2: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(
+        default=500.0, description="along the path; only how long a program runs is told from it"
+    )
+    heidenhain_tool: Annotated[int, Field(ge=1, le=32_767)] | None = Field(
+        default=None, description="row of the tool table for what is in the spindle (length 0, radius 0); absent: the operator writes it"
+    )
+    memory_kib: dict[Literal["siemens", "fanuc", "heidenhain", "linuxcnc", "iso"], Positive] = Field(
+        default_factory=dict, description="program memory by dialect; absent: 256 for fanuc and iso, no limit for the others"
+    )
+
+
+class Verify(Section):
     """Limits of the scheduled check: above one of them the machine does not pass."""
 
     body_diagonal_um: Positive = Field(default=20.0, description="range of the deviation along the worst body diagonal")
@@ -123,7 +165,7 @@ def _broker(text: str | None) -> str | None:
     return text
 
 
-class Mqtt(_Section):
+class Mqtt(Section):
     """Where results are published."""
 
     url: Annotated[str | None, AfterValidator(_broker)] = Field(
@@ -132,44 +174,43 @@ class Mqtt(_Section):
     topic_prefix: str = Field(default="abbe", pattern=r"^[^+#\s/][^+#\s]*$", description="first part of every topic")
 
 
-class Web(_Section):
+class Web(Section):
     """Where the web page is served."""
 
     host: str = Field(
-        default="127.0.0.1", min_length=1, description="only this computer (127.0.0.1, ::1 or localhost): the page has no users yet"
+        default="127.0.0.1",
+        min_length=1,
+        description="address to listen on; other than this computer's own (127.0.0.1, ::1, localhost) only with users and a certificate",
     )
     port: int = Field(default=8080, ge=0, le=65535, description="0: any free port")
+    names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9.:\[\]-]{1,253}$")]] = Field(
+        default_factory=list, description="names and addresses under which other computers ask for the page, e.g. abbe.plant.example"
+    )
+    certificate: str = Field(default="", description="TLS certificate, PEM file (relative to the machine file's folder); empty: plain HTTP")
+    key: str = Field(default="", description="private key of the certificate, PEM file")
+
+    @model_validator(mode="after")
+    def _both(self) -> Self:
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("certificate and key belong together, expected both or none")
+        return self
 
 
-class ScheduleEntry(_Section):
-    """One line of the timetable."""
-
-    name: str = Field(min_length=1, max_length=200)
-    cron: str = Field(description="minute hour day month weekday, e.g. 0 6 * * 1")
-    timezone: str = Field(default="UTC", description="IANA name, e.g. Europe/Berlin")
-    recipe: str = Field(default="quick-check", min_length=1, description="what to measure")
-    grace_s: float = Field(default=300.0, ge=0.0, le=86_400.0, description="a slot found later than this is recorded as missed and not run")
-
-    @field_validator("cron")
-    @classmethod
-    def _cron(cls, text: str) -> str:
-        try:
-            CronSim(text, datetime(2026, 1, 1, tzinfo=UTC))
-        except CronSimError as err:
-            raise ValueError(f"expected a cron expression (minute hour day month weekday), got {text!r}: {err}") from None
-        return text
-
-    @field_validator("timezone")
-    @classmethod
-    def _timezone(cls, text: str) -> str:
-        try:
-            ZoneInfo(text)
-        except (KeyError, ValueError, OSError):
-            raise ValueError(f"expected an IANA time zone such as Europe/Berlin or UTC, got {text!r}") from None
-        return text
+def _public_key(text: str) -> str:
+    if len(text) != 64 or not set(text) <= set("0123456789abcdef"):
+        raise ValueError(f"{text!r} is no public key, expected 64 hex digits as `abbe key new` prints them")
+    return text
 
 
-class MachineFile(_Section):
+class Signatures(Section):
+    """Whose signature makes a compensation file more than a candidate."""
+
+    trusted: list[Annotated[str, AfterValidator(_public_key)]] = Field(
+        default_factory=list, description="public keys of metrologists, 64 hex digits each, as `abbe key new` prints them"
+    )
+
+
+class MachineFile(Section):
     """One machine: its geometry, its devices, where results go, and the limits that protect it."""
 
     name: str = Field(min_length=1, max_length=200)
@@ -181,10 +222,15 @@ class MachineFile(_Section):
     devices: Devices = Devices()
     store: StoreSection = StoreSection()
     limits: Limits = Limits()
+    calibration: Calibration = Calibration()
+    nc: Nc = Nc()
     verify: Verify = Verify()
     mqtt: Mqtt = Mqtt()
     web: Web = Web()
+    signatures: Signatures = Signatures()
     schedule: list[ScheduleEntry] = Field(default_factory=list)
+    maintenance: list[WindowEntry] = Field(default_factory=list, description="windows in which no scheduled check starts")
+    staffed: list[WindowEntry] = Field(default_factory=list, description="when an operator is at the machine")
 
     @field_validator("schedule")
     @classmethod
@@ -193,6 +239,15 @@ class MachineFile(_Section):
         if twice:
             raise ValueError(f"two schedules are named {twice[0]!r}, expected different names")
         return entries
+
+    @model_validator(mode="after")
+    def _can_be_met(self) -> Self:
+        for entry in self.schedule:
+            if entry.needs.operator == "present" and not self.staffed:
+                raise ValueError(f"schedule {entry.name!r} needs an operator, expected [[staffed]] to say when one is there")
+            if entry.needs.air and self.devices.laser is None:
+                raise ValueError(f"schedule {entry.name!r} needs the air's temperature, expected a laser in [devices] to measure it")
+        return self
 
     def machine_doc(self) -> dict[str, object]:
         """Write the ``machine`` object of the exchange format."""

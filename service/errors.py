@@ -58,6 +58,126 @@ class MeasurementFault(AbbeError):
     code = "SEQ-003"
 
 
+class Interlock(UnsafeToMove):
+    """A condition that stops motion at once. Each has a code of its own; ``condition`` is its name in files and tables."""
+
+    code = "ILK-000"
+    condition = ""
+
+
+class EstopPressed(Interlock):
+    """The e-stop is pressed. Never goes on by itself."""
+
+    code = "ILK-001"
+    condition = "estop"
+
+
+class AlarmOn(Interlock):
+    """The controller has an alarm. Never goes on by itself."""
+
+    code = "ILK-002"
+    condition = "alarm"
+
+
+class DoorOpen(Interlock):
+    """The door is open."""
+
+    code = "ILK-003"
+    condition = "door"
+
+
+class RemoteLost(Interlock):
+    """The controller is not in remote mode any more."""
+
+    code = "ILK-004"
+    condition = "mode"
+
+
+class DrivesOff(Interlock):
+    """The drives are off, or the axes are not referenced."""
+
+    code = "ILK-005"
+    condition = "drives"
+
+
+class ProgramRuns(Interlock):
+    """An NC program runs: somebody else moves the machine."""
+
+    code = "ILK-006"
+    condition = "program"
+
+
+class BeamLost(Interlock):
+    """The laser has lost its beam or its signal is too low: its count is lost."""
+
+    code = "ILK-007"
+    condition = "beam"
+
+
+class BarOutOfRange(Interlock):
+    """The ball-bar is out of range or not mounted."""
+
+    code = "ILK-008"
+    condition = "bar"
+
+
+class TemperatureOutside(Interlock):
+    """The air is outside the window in which a measurement may run."""
+
+    code = "ILK-009"
+    condition = "temperature"
+
+
+class StatusUnknown(Interlock):
+    """The controller, or the instrument that is being read, has not said for too long how it is."""
+
+    code = "ILK-010"
+    condition = "status"
+
+
+class SpindleTurns(Interlock):
+    """The spindle turns: what is mounted on it, or in its cup, is torn off."""
+
+    code = "ILK-011"
+    condition = "spindle"
+
+
+class Stopped(AbbeError):
+    """A person asked to stop. What is complete stays; `abbe measure --resume` goes on."""
+
+    code = "SEQ-004"
+
+
+class Aborted(AbbeError):
+    """A person asked to stop at once: the axes were stopped where they were."""
+
+    code = "SEQ-005"
+
+
+class RunInterrupted(AbbeError):
+    """A run was broken off and is gone on with: what it has is kept as evidence and never averaged with what follows."""
+
+    code = "SEQ-006"
+
+
+class WorldChanged(AbbeError):
+    """A campaign cannot be gone on with: the controller, its table, the recipe or the machine is not what it was."""
+
+    code = "SEQ-007"
+
+
+class SetupDisturbed(AbbeError):
+    """What was mounted is not where it was: it has to be mounted anew."""
+
+    code = "SEQ-008"
+
+
+class StretchDiffers(SetupDisturbed):
+    """A path that was broken off reads otherwise, on the stretch that is read twice, than it did: what it has read is not gone on with."""
+
+    code = "SEQ-009"
+
+
 class NotObservable(AbbeError):
     """The data cannot carry the claim that was asked for."""
 
@@ -116,3 +236,81 @@ class StillActive(AbbeError):
     """An unverified table is still active: the controller could not be switched back. Every later command tries again first."""
 
     code = "CMP-003"
+
+
+class PushNotBegun(AbbeError):
+    """A table was not brought into force: something spoke against it on the way. The old table is in force."""
+
+    code = "CMP-004"
+
+
+class TakenBack(TableRefused):
+    """A table was in force for its probe, was refuted, and the old one is in force again."""
+
+    code = "CMP-005"
+
+
+class FormatRefused(AbbeError):
+    """Tables do not fit what a control's format can hold (points, spacing, size, zero at the reference, kind). Nothing was written."""
+
+    code = "TAB-001"
+
+
+class TableFileError(AbbeError):
+    """A control's table file is not what the control would read as a whole: file, line, what is wrong."""
+
+    code = "TAB-002"
+
+
+class TableContradicts(AbbeError):
+    """Tables are not those that were expected: wrong sign, wrong unit, exchanged directions. They must not be loaded."""
+
+    code = "TAB-003"
+
+
+class CaptureFault(AbbeError):
+    """Samples cannot be made safe: the disk reports an error, or there can be no segment. The run ends; what was acknowledged is kept."""
+
+    code = "CAP-001"
+
+
+class DiskFull(AbbeError):
+    """No disk space is left. The reserve was released so that the run could be closed; every acknowledged sample is kept."""
+
+    code = "CAP-002"
+
+
+class CaptureConflict(AbbeError):
+    """The database holds another chunk under the same number than the segment does. Nothing was overwritten."""
+
+    code = "CAP-003"
+
+
+class PasswordRefused(AbbeError):
+    """A new password is one that is guessed first."""
+
+    code = "USR-001"
+
+
+class UserRefused(AbbeError):
+    """No such user, role, scope or token, or what was asked would leave nobody who may manage users. Nothing was changed."""
+
+    code = "USR-002"
+
+
+class AuditBroken(AbbeError):
+    """The audit was changed after it was written, or its end is missing; or a record of it cannot be written."""
+
+    code = "AUD-001"
+
+
+class SignatureRefused(AbbeError):
+    """A signed compensation file is not what was signed, or not for this machine, base, limits or day. It was not taken in."""
+
+    code = "SIG-001"
+
+
+class KeyRefused(AbbeError):
+    """A key cannot be read, is no Ed25519 key, or would overwrite another."""
+
+    code = "SIG-002"

@@ -7,11 +7,23 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Where a measurement is: ``state`` (service.sequences.control), why it waits, the run in hand, its step of ``steps``, points read."""
+
+    state: str = "running"
+    why: str = ""
+    run: str = ""
+    step: int = 0
+    steps: int = 0
+    points: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Progress:
     """Where a job stands.
 
     ``done`` of ``total`` in the job's own unit (seconds of planned machine time, if not said otherwise); ``eta_s`` wall seconds left, None
-    while there is no basis for an estimate.
+    while there is no basis for an estimate; time in which the job waited is not counted. ``place``: of a measurement only.
     """
 
     stage: str
@@ -19,6 +31,7 @@ class Progress:
     total: float
     eta_s: float | None
     message: str
+    place: Place | None = None
 
 
 ProgressSink = Callable[[Progress], None]

@@ -16,10 +16,13 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import structlog
 
+from service.audit.book import AuditBook, this_account
+from service.audit.chain import Event
 from service.clock import Clock, SystemClock
 from service.errors import ConfigError
 from service.events import Progress
@@ -29,13 +32,18 @@ from service.mqtt.publisher import Publisher
 from service.mqtt.topics import Topics
 from service.scheduler.job import CheckJob
 from service.scheduler.keep import StoreLedger, StoreShelf
-from service.scheduler.loop import Scheduler
-from service.scheduler.ports import Check, Doc, JobWatcher
+from service.scheduler.loop import Scheduler, Terms
+from service.scheduler.ports import Check, Doc, JobWatcher, Readiness
+from service.scheduler.ready import AlwaysReady
 from service.scheduler.slots import Schedule
 from service.scheduler.store import ServiceStore
+from service.scheduler.windows import Window
+from service.storage.engine import parse_url
+from service.users.people import People
 from service.web.app import create_app
 from service.web.board import Board
-from service.web.server import bind, make_server
+from service.web.door import Door
+from service.web.server import bind, check_certificate, check_exposure, make_server
 from service.web.view import View
 
 log = structlog.get_logger("abbe.serve")
@@ -45,6 +53,8 @@ STOP_S = 4.5
 HOLD_S = 2.5
 GOODBYE_S = 1.2
 FLUSH_S = 5.0
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+EVERYWHERE = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - compared with, not listened on
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +81,14 @@ class Setup:
         Where the page is.
     check : callable
         Given the open store, returns ``check(recipe, progress)``.
+    maintenance : tuple of Window
+        Nothing starts by itself in these.
+    ready : callable
+        Given the clock, returns who knows the preconditions.
+    names : tuple of str
+        Under which other computers ask for the page.
+    certificate, key : str
+        PEM files of the page; empty: plain HTTP.
     """
 
     machine: str
@@ -83,6 +101,11 @@ class Setup:
     host: str
     port: int
     check: Callable[[ServiceStore], Check]
+    maintenance: tuple[Window, ...] = ()
+    ready: Callable[[Clock], Readiness] = lambda _: AlwaysReady()
+    names: tuple[str, ...] = ()
+    certificate: str = ""
+    key: str = ""
 
 
 class _StateTeller:
@@ -118,10 +141,17 @@ class Service:
         topics = (setup.topics.verification, setup.topics.alarm) if self._publisher is not None else None
         shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
         self._job = CheckJob(setup.machine, setup.check(store), shelf, watchers, clock)
-        self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._job, shelf, clock)
+        terms = Terms(setup.maintenance, setup.ready(clock))
+        self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._job, shelf, clock, terms)
         broker = "" if setup.broker is None else str(setup.broker)
         view = View(setup.machine, version("abbe"), self.board, store, self._scheduler.next_due, broker, clock)
-        self._server = make_server(create_app(view, version=version("abbe")))
+        book = AuditBook(store, setup.store_url)
+        book.write(Event(this_account(), "abbe serve", setup.machine, "begun", {"host": setup.host, "port": listening.getsockname()[1]}))
+        people = People(store, clock)
+        people.passwords.prepare()
+        hosts = (*LOCAL, *setup.names, *(() if setup.host in EVERYWHERE else (setup.host,)))
+        app = create_app(view, version=version("abbe"), hosts=hosts, door=Door(store, people, book))
+        self._server = make_server(app, setup.certificate, setup.key)
 
     def _make_publisher(self) -> Publisher | None:
         if self._setup.broker is None:
@@ -228,18 +258,30 @@ async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer
     for number in (signal.SIGTERM, signal.SIGINT):
         # signal.signal rather than add_signal_handler: it works on Windows too, and the loop is woken either way.
         signal.signal(number, from_any_thread)
+    await asyncio.to_thread(check_exposure, setup.host, lambda: _users(setup.store_url), tls=bool(setup.certificate))
+    check_certificate(setup.certificate, setup.key)
     listening = bind(setup.host, setup.port)
     try:
         store = await asyncio.to_thread(ServiceStore.open, setup.store_url)
         try:
             host, port = listening.getsockname()[:2]
-            log.info("serving", machine=setup.machine, page=f"http://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
+            scheme = "https" if setup.certificate else "http"
+            log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
             return await Service(setup, store, listening, clock).run(stop, once=once)
         finally:
             await asyncio.to_thread(store.close)
             log.info("stopped")
     finally:
         listening.close()
+
+
+def _users(url: str) -> int:
+    """How many may log in; a database that is not there yet has none, and is not made for the question."""
+    parsed = parse_url(url)
+    if parsed.drivername == "sqlite" and not Path(parsed.database or "").is_file():
+        return 0
+    with ServiceStore.open(url) as store:
+        return store.active_users()
 
 
 def _cut_off() -> None:

@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import date
 from typing import Any
 
 import numpy as np
 
 from models.machine import AXES, Machine
-from service.config_schema import MachineFile
+from service.capture.settings import MIB, CaptureSettings
+from service.config_schema import Limits, MachineFile
 from service.devices.session import DeviceUrls
-
-
-@dataclass(frozen=True, slots=True)
-class TableLimits:
-    """Largest absolute value, largest change against the active table, largest step between neighbours, mm (reliability.md 3.3)."""
-
-    value_mm: float = 0.2
-    change_mm: float = 0.2
-    step_mm: float = 0.02
+from service.push.limits import PushLimits
+from service.sequences.interlocks import Suspending, Watching
+from service.sequences.nc.settings import NcSettings
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Everything a workflow needs to know about a machine. ``doc`` is the machine object of run-format.md 1."""
+    """Everything a workflow needs to know about a machine. ``doc`` is the machine object of run-format.md 1.
+
+    ``calibrated_until``: last day of the certificates of ``ballbar`` and ``laser``; what is missing has none. ``two_people``: a proposed
+    table is only pushed when somebody else than its proposer has approved it.
+    """
 
     name: str
     machine: Machine
     doc: dict[str, Any]
     urls: DeviceUrls
-    limits: TableLimits = field(default_factory=TableLimits)
+    limits: PushLimits = field(default_factory=PushLimits)
     max_feed_mm_min: float = 6000.0
     temperature_c: tuple[float, float] = (18.0, 24.0)
+    capture: CaptureSettings = field(default_factory=CaptureSettings)
+    watching: Watching = field(default_factory=Watching)
+    nc: NcSettings = field(default_factory=NcSettings)
+    calibrated_until: dict[str, date] = field(default_factory=dict)
+    two_people: bool = False
 
 
 def machine_from_doc(doc: dict[str, Any]) -> Machine:
@@ -76,7 +81,23 @@ def site_of(config: MachineFile) -> Site:
         machine_from_doc(doc),
         doc,
         DeviceUrls(devices.cnc, devices.ballbar, devices.laser, devices.fixture),
-        TableLimits(limits.table_value_um * 1e-3, limits.table_change_um * 1e-3, limits.table_step_um * 1e-3),
+        push_limits(limits),
         limits.feed_mm_min,
         limits.temperature_c,
+        CaptureSettings(config.store.capture, int(config.store.capture_reserve_mib * MIB), config.store.keep_segments),
+        Watching(limits.run_temperature_c, Suspending(frozenset(limits.continue_after), limits.suspend_s, limits.settle_s)),
+        NcSettings(config.nc.acceleration_mm_s2, config.nc.heidenhain_tool, {str(name): kib for name, kib in config.nc.memory_kib.items()}),
+        {kind: day for kind, day in (("ballbar", config.calibration.ballbar), ("laser", config.calibration.laser)) if day is not None},
+        limits.two_people,
+    )
+
+
+def push_limits(limits: Limits) -> PushLimits:
+    """What the machine file limits tables to, in mm."""
+    return PushLimits(
+        value_mm=limits.table_value_um * 1e-3,
+        change_mm=limits.table_change_um * 1e-3,
+        step_mm=limits.table_step_um * 1e-3,
+        temperature_c=limits.temperature_c,
+        age_h=limits.measurement_age_h,
     )

@@ -60,7 +60,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except OSError as err:
         return _unwritten(err)
     except (AbbeError, DriverError) as err:
-        return complain(err.code, str(err))
+        return complain(err.code, "; ".join([str(err), *getattr(err, "__notes__", [])]))
     except typer.Abort:
         return INTERRUPTED
     except typer.TyperException as err:

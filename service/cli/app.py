@@ -4,22 +4,33 @@ from __future__ import annotations
 
 import typer
 
+from service.cli.audit import audit
+from service.cli.audited import record_all
+from service.cli.comp import comp
+from service.cli.comp_commission import commission
+from service.cli.comp_proposals import approve, diff, propose, show_proposals
+from service.cli.comp_push import push, rollback
 from service.cli.configuration import check_config, schema
 from service.cli.demo import demo
 from service.cli.discover import discover
 from service.cli.effects import effects
 from service.cli.errors import errors
 from service.cli.exchange import export_campaign, import_campaign
+from service.cli.key import key
+from service.cli.listen import listen
 from service.cli.measure import correct, measure
 from service.cli.model import model
 from service.cli.papers import papers
 from service.cli.plan import plan
+from service.cli.report import report
 from service.cli.serve import serve
 from service.cli.show import runs, show
 from service.cli.simulate import simulate
 from service.cli.solve import solve
 from service.cli.system import SIM_SETTINGS, sim, version
 from service.cli.table import accept_table
+from service.cli.trend import trend
+from service.cli.user import user
 from service.cli.vectors import vectors
 
 app = typer.Typer(
@@ -34,6 +45,7 @@ app = typer.Typer(
 app.command("demo")(demo)
 app.command("plan")(plan)
 app.command("measure")(measure)
+app.command("listen")(listen)
 app.command("solve")(solve)
 app.command("simulate")(simulate)
 app.command("discover")(discover)
@@ -41,7 +53,20 @@ app.add_typer(model, name="model")
 app.command("effects")(effects)
 app.command("errors")(errors)
 app.command("correct")(correct)
+comp.command("commission")(commission)
+comp.command("propose")(propose)
+comp.command("show")(show_proposals)
+comp.command("diff")(diff)
+comp.command("approve")(approve)
+comp.command("push")(push)
+comp.command("rollback")(rollback)
+app.add_typer(comp, name="comp")
+app.command("report")(report)
 app.command("serve")(serve)
+app.command("trend")(trend)
+app.add_typer(key, name="key")
+app.add_typer(user, name="user")
+app.add_typer(audit, name="audit")
 app.command("accept-table")(accept_table)
 app.command("check-config")(check_config)
 app.command("runs")(runs)
@@ -53,3 +78,5 @@ app.command("papers")(papers)
 app.command("schema")(schema)
 app.command("sim", context_settings=SIM_SETTINGS, add_help_option=False)(sim)
 app.command("version")(version)
+
+record_all(app)

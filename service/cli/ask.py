@@ -26,6 +26,12 @@ async def console_ask(text: str) -> None:
     termios.tcflush(line, termios.TCIFLUSH)
     sys.stderr.write(f"\n>> {text}\n   press Enter when done: ")
     sys.stderr.flush()
+    if await _entered(line) == b"":
+        raise ConfigError("standard input was closed", "start again from a terminal")
+
+
+async def _entered(line: int) -> bytes:
+    """What is typed up to Enter; nothing when the terminal has gone."""
     loop = asyncio.get_running_loop()
     entered: asyncio.Future[bytes] = loop.create_future()
 
@@ -39,7 +45,19 @@ async def console_ask(text: str) -> None:
 
     loop.add_reader(line, ready)
     try:
-        if await entered == b"":
-            raise ConfigError("standard input was closed", "start again from a terminal")
+        return await entered
     finally:
         loop.remove_reader(line)
+
+
+async def console_confirm(text: str) -> bool:
+    """Ask a question that only a yes answers; where nobody is at the console the answer is no."""
+    import termios
+
+    if not sys.stdin.isatty():
+        return False
+    line = sys.stdin.fileno()
+    termios.tcflush(line, termios.TCIFLUSH)
+    sys.stderr.write(f"\n>> {text}\n   type yes, or press Enter for no: ")
+    sys.stderr.flush()
+    return (await _entered(line)).strip().lower() in (b"y", b"yes")

@@ -13,6 +13,7 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from service.storage.records import CampaignRecord, RunRecord
     from service.storage.store import Store
 
 ENVIRONMENT = "ABBE_DB"
@@ -93,6 +94,25 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
     ):
         raise StoreError(f"there is no database {parsed.database}", f"give --db URL, --machine FILE or set {ENVIRONMENT}")
     return Store.open(url)
+
+
+def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
+    """What is called so; a run before a campaign.
+
+    Raises
+    ------
+    StoreError
+        Neither is in the database.
+    """
+    from service.errors import StoreError
+
+    try:
+        return store.run(name)
+    except StoreError:
+        found = next((one for one in store.campaigns() if one.name == name), None)
+        if found is None:
+            raise
+        return found
 
 
 def print_json(value: Any) -> None:

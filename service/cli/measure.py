@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
     from models.machine import Machine
     from service.devices.session import Session
-    from service.sequences.check import DryRun
+    from service.events import ProgressSink
+    from service.sequences.control import Control
     from service.sequences.steps import CampaignPlan
     from service.site import Site
     from service.storage.store import Store
@@ -23,63 +24,118 @@ MachineArgument = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="M
 RECIPES = "identification, verification, quick-check"
 
 
-def measure(
+def measure(  # noqa: PLR0913 - one argument for each option
     machine: MachineArgument,
-    recipe: Annotated[str, typer.Option(help=f"One of: {RECIPES}; or a recipe FILE.toml (`abbe plan` writes one).")] = "quick-check",
+    recipe: Annotated[
+        str, typer.Option(help=f"One of: {RECIPES}; or a recipe FILE.toml (`abbe plan` writes one). Default: quick-check.")
+    ] = "",
     helix: Annotated[str, typer.Option(help="Instead of a recipe: one ball-bar helix, X,Y,Z,RADIUS in mm.")] = "",
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
     rate_hz: Annotated[int, typer.Option(help="Ball-bar samples per second; must divide 1000.")] = 100,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would move and how long it takes; move nothing.")] = False,
     path: Annotated[bool, typer.Option("--path", help="With --dry-run: every commanded position, as CSV.")] = False,
+    picture: Annotated[Path | None, typer.Option(metavar="FILE.html", help="With --dry-run: a page with the paths in three views.")] = None,
+    nc: Annotated[str, typer.Option(help="Write an NC program: siemens, fanuc, heidenhain, linuxcnc or iso; with --out.")] = "",
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where --nc writes.")] = None,
+    resume: Annotated[str, typer.Option(help="Go on with this campaign, which was broken off; its recipe is known.")] = "",
+    untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: nobody has touched what is mounted.")] = False,
 ) -> None:
-    """Measure a campaign on the machine and store every sample."""
+    """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
+    from service.cli.rehearse import Rehearsal
     from service.cli.running import run_job
     from service.clock import SystemClock
     from service.config import load_machine
     from service.sequences.check import dry_run_campaign, paced
+    from service.sequences.control import Control
     from service.site import site_of
     from service.storage.store import Store
-    from service.workflows import measure as workflow
 
+    rehearsal = Rehearsal(dry_run, path, picture, nc, out)
+    instead = rehearsal.check((machine, Path(recipe)))
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
-    plan = _plan(site.machine, recipe, helix, rate_hz)
-    plan = replace(paced(plan, site.max_feed_mm_min), name=name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
+    source = _source(recipe, helix, rate_hz)
+    if resume:
+        with Store.open(loaded.database_url) as store:
+            store.campaign(resume)
+            source = source if recipe or helix else _begun(store, resume)
+    plan = _plan(site.machine, source)
+    title = resume or name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}"
+    plan = replace(paced(plan, site.max_feed_mm_min), name=title)
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
-    if dry_run:
-        print_path(plan) if path else print_dry_run(plan.name, runs)
+    if instead:
+        rehearsal.run(site, plan, runs)
         return
-
-    async def work(store: Store) -> None:
-        from service.cli.progress import display
-
-        with display() as sink:
-            async with ready_session(store, site) as session:
-                await workflow.measure(session, store, site, plan, progress=sink)
-
+    control = Control()
     with Store.open(loaded.database_url) as store:
-        run_job(work(store))
+        run_job(_measured(store, site, plan, control, source, resume=bool(resume), untouched=untouched), control)
     typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
+
+
+async def _measured(
+    store: Store, site: Site, plan: CampaignPlan, control: Control, source: dict[str, Any], *, resume: bool, untouched: bool
+) -> None:
+    """The measurement itself, from the beginning or from where it was broken off."""
+    from service.cli.ask import console_confirm
+    from service.cli.progress import display
+    from service.workflows.measure import Manner
+    from service.workflows.measure import measure as work
+    from service.workflows.resume import resume as find
+
+    async def yes(_: str) -> bool:
+        return True
+
+    async def ask(text: str) -> bool:
+        return await control.unless_stopped(console_confirm(text))  # the first Ctrl-C ends the question, too
+
+    confirm = yes if untouched else ask
+    async with ready_session(store, site) as session:
+        found = await find(session, store, site, plan, plan.name, confirm) if resume else None
+        for line in found.said if found is not None else ():
+            typer.echo(line, err=True)
+        with display() as sink:
+            await work(session, store, site, plan, progress=sink, manner=Manner(control, confirm, source, found))
+
+
+def _source(recipe: str, helix: str, rate_hz: int) -> dict[str, Any]:
+    """What a plan is made of; a recipe file's text with it, so that nobody needs the file to go on."""
+    from service.sequences.recipe_file import recipe_source
+
+    text = recipe_source(Path(recipe)) if recipe.endswith(".toml") else None
+    return {"recipe": recipe or "quick-check", "helix": helix, "rate_hz": rate_hz, "text": text}
+
+
+def _begun(store: Store, campaign: str) -> dict[str, Any]:
+    """What the plan of a campaign was made of that was broken off."""
+    from service.workflows.resume import begun_source
+
+    return begun_source(store, campaign)
 
 
 def correct(
     machine: MachineArgument,
     campaign: Annotated[str, typer.Argument(help="Identification campaign in the store.")],
     before: Annotated[str, typer.Option(help="Verification campaign measured with the present table; default: it is measured now.")] = "",
+    wait_s: Annotated[
+        float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
+    ] = 600.0,
 ) -> None:
     """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
     from service.cli.running import run_job
-    from service.clock import SystemClock
+    from service.cli.waiting import taken_back_when_safe
     from service.config import load_machine
-    from service.sequences.campaigns import verification
+    from service.errors import TakenBack
     from service.site import site_of
     from service.storage.store import Store
-    from service.workflows.correct import Correction, load_runs
+    from service.workflows.commission import check_commissioned
+    from service.workflows.correct import Correction
     from service.workflows.correct import correct as work_correct
-    from service.workflows.measure import measure as work_measure
+    from service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
+
+    said: list[str] = []
 
     async def work(store: Store) -> Correction:
         from service.cli.progress import display
@@ -87,42 +143,66 @@ def correct(
         store.campaign(campaign)
         with display() as sink:
             async with ready_session(store, site) as session:
-                if before:
-                    ids = [r.id for r in store.runs(before) if r.visible_status == "complete"]
-                else:
-                    plan = verification(site.machine, name=f"verify-before {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
-                    ids = await work_measure(session, store, site, plan, progress=sink)
-                return await work_correct(session, store, site, campaign, await load_runs(store, ids), progress=sink)
+                await check_commissioned(session.controller, store, site)
+                said.append(await check_level(session.controller, store, site))
+                runs = await verification_before(session, store, site, before, sink)
+                async with taken_back_when_safe(session, store, site, wait_s):
+                    return await work_correct(session, store, site, campaign, runs, progress=sink)
 
     with Store.open(loaded.database_url) as store:
-        found = run_job(work(store))
+        try:
+            found = run_job(work(store))
+        except TakenBack as error:  # the answer is no, not a fault
+            typer.echo("; ".join([f"rolled back: {error.detail}", *getattr(error, "__notes__", [])]))
+            raise typer.Exit(1) from None
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
     for line in found.not_for_tables:
         typer.echo(f"not in the tables: {line}")
+    for line in filter(None, said):
+        typer.echo(line)
     raise typer.Exit(0 if found.decision.keep else 1)
+
+
+async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[dict[str, Any]]:
+    """Runs of a verification with the present table: of a campaign in the store, or measured now where none is named."""
+    from service.clock import SystemClock
+    from service.sequences.campaigns import verification
+    from service.sequences.check import paced
+    from service.workflows.measure import measure as work_measure
+    from service.workflows.proposals import load_runs
+
+    if campaign:
+        ids = [r.id for r in store.runs(campaign) if r.visible_status == "complete"]
+    else:
+        plan = paced(verification(site.machine, name=f"verify-before {SystemClock().utc():%Y-%m-%d %H:%M:%S}"), site.max_feed_mm_min)
+        ids = await work_measure(session, store, site, plan, progress=sink)
+    return await load_runs(store, ids)
 
 
 @asynccontextmanager
 async def ready_session(store: Store, site: Site) -> AsyncIterator[Session]:
     """The machine's devices, after what an interrupted push may have left active was taken back: nothing is measured with it."""
     from service.cli.ask import console_ask
+    from service.devices.alone import alone
     from service.devices.session import open_session
     from service.workflows.recover import recover
 
-    async with open_session(site.urls, console_ask) as session:
-        said = await recover(session.controller, store, site)
-        if said is not None:
-            typer.echo(said, err=True)
-        yield session
+    with alone(site.urls.cnc):
+        async with open_session(site.urls, console_ask) as session:
+            said = await recover(session.controller, store, site)
+            if said is not None:
+                typer.echo(said, err=True)
+            yield session
 
 
-def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int) -> CampaignPlan:
+def _plan(machine: Machine, source: dict[str, Any]) -> CampaignPlan:
     """The campaign, named after its recipe."""
     from service.errors import ConfigError
     from service.sequences.campaigns import identification, quick_check, verification
     from service.sequences.recipes import Helix
     from service.sequences.steps import CampaignPlan
 
+    recipe, helix, rate_hz = str(source["recipe"]), str(source["helix"]), int(source["rate_hz"])
     if rate_hz < 1 or 1000 % rate_hz:
         raise ConfigError(f"rate {rate_hz} Hz does not divide 1000", "use 1000, 500, 250, 200, 125, 100, 50 ...")
     if helix:
@@ -133,34 +213,10 @@ def _plan(machine: Machine, recipe: str, helix: str, rate_hz: int) -> CampaignPl
         return CampaignPlan("helix", (Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz).plan(machine),))
     plans = {"identification": identification, "verification": verification, "quick-check": quick_check}
     if recipe.endswith(".toml"):
-        from service.sequences.recipe_file import read_recipe
+        from service.sequences.recipe_file import parse_recipe
 
-        name, recipes = read_recipe(Path(recipe))
+        name, recipes = parse_recipe(str(source["text"]), recipe)
         return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
     if recipe not in plans:
         raise ConfigError(f"there is no recipe {recipe!r}", f"use one of: {RECIPES}, or a FILE.toml")
     return plans[recipe](machine, rate_hz=rate_hz, name=recipe)
-
-
-def print_path(plan: CampaignPlan) -> None:
-    """Every commanded position of the plan, one CSV line each: test, X, Y, Z in mm."""
-    from service.sequences.check import positions
-
-    typer.echo("test,x_mm,y_mm,z_mm")
-    for test in plan.tests:
-        for x, y, z in positions(test.steps):
-            typer.echo(f"{test.label},{x:.5f},{y:.5f},{z:.5f}")
-
-
-def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
-    """One line a test: time, path, extent, readings."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"{name}: {sum(r.duration_s for r in runs) / 60:.1f} min of machine time, mounting not counted")
-    for column in ("test", "kind", "s", "path mm", "X", "Y", "Z", "readings"):
-        table.add_column(column, justify="left" if column in ("test", "kind") else "right")
-    for r in runs:
-        extent = [f"{r.lowest_mm[a]:.0f}..{r.highest_mm[a]:.0f}" for a in range(3)]
-        table.add_row(r.label, r.test, f"{r.duration_s:.0f}", f"{r.path_mm:.0f}", *extent, str(r.readings))
-    Console().print(table)

@@ -18,12 +18,16 @@ def display() -> Iterator[ProgressSink]:
 
     log = Console(stderr=True)
     if not log.is_terminal:
-        last = [""]
+        last = ["", ""]
 
         def plain(p: Progress) -> None:
+            waits = _waits(p)
             if p.stage != last[0]:
                 last[0] = p.stage
                 log.print(f"{p.stage}: {p.message}", highlight=False)
+            if waits and waits != last[1]:
+                log.print(f"{p.stage}: {waits}", highlight=False)
+            last[1] = waits
 
         yield plain
         return
@@ -43,6 +47,12 @@ def display() -> Iterator[ProgressSink]:
             if p.stage not in tasks:
                 tasks[p.stage] = bars.add_task(p.message, stage=p.stage, eta="", total=p.total)
             eta = "" if p.eta_s is None else f"{p.eta_s:.0f} s left"
-            bars.update(tasks[p.stage], completed=p.done, description=p.message, eta=eta)
+            bars.update(tasks[p.stage], completed=p.done, description=_waits(p) or p.message, eta=eta)
 
         yield live
+
+
+def _waits(p: Progress) -> str:
+    """What a measurement waits for; empty while it goes on."""
+    place = p.place
+    return f"{place.state}: {place.why}" if place is not None and place.state in ("paused", "suspended") else ""

@@ -11,17 +11,23 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, TypeVar
 
+from service.errors import Stopped
+from service.sequences.control import Control
+
+ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
 T = TypeVar("T")
 Handler = Callable[[int, FrameType | None], None]
 
 
-def run_job(job: Coroutine[Any, Any, T]) -> T:
+def run_job(job: Coroutine[Any, Any, T], control: Control | None = None) -> T:
     """Run a job to its end; Ctrl-C, SIGTERM and a closed terminal cancel it, and its clean-up runs before the process ends.
 
     Parameters
     ----------
     job : coroutine
         Motion guards and clean-up inside it do the stopping.
+    control : Control, optional
+        Of a measurement: then the first Ctrl-C only asks it to stop at a safe place, and SIGUSR1 pauses it or lets it go on.
 
     Returns
     -------
@@ -35,7 +41,13 @@ def run_job(job: Coroutine[Any, Any, T]) -> T:
     """
     received: list[int] = []
     try:
-        return asyncio.run(_cancelled_by_signal(job, received))
+        return asyncio.run(_cancelled_by_signal(job, received, control))
+    except Stopped as error:
+        if not received:
+            raise
+        with suppress(OSError):
+            sys.stderr.write(f"stopped: {error.remedy}\n")
+        raise SystemExit(128 + received[0]) from None
     except (asyncio.CancelledError, OSError) as error:
         # A closed terminal also ends the display's last words with EIO; what a device has to say (some are OSErrors) must not get lost.
         if not received or (isinstance(error, OSError) and error.errno != errno.EIO):
@@ -46,23 +58,31 @@ def run_job(job: Coroutine[Any, Any, T]) -> T:
         raise SystemExit(128 + received[0]) from None
 
 
-async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int]) -> T:
+async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int], control: Control | None) -> T:
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
     assert task is not None
 
     def stop(number: int, _frame: FrameType | None) -> None:
         # A second signal cancels once more: what must reach the machine is shielded from it (drivers.links.shielded).
         received.append(number)
-        loop.call_soon_threadsafe(task.cancel)
+        gently = control is not None and number == signal.SIGINT and len(received) == 1
+        if control is not None:  # whatever takes a cancellation for something else still sees what was asked for
+            loop.call_soon_threadsafe(control.stop if gently else control.abort)
+        if not gently:
+            loop.call_soon_threadsafe(task.cancel)
 
-    with _handled(stop):
+    def toggle(_number: int, _frame: FrameType | None) -> None:
+        if control is not None:
+            loop.call_soon_threadsafe(control.resume if control.pausing else control.pause)
+
+    with _handled(stop, ENDING), _handled(toggle, ("SIGUSR1",) if control is not None else ()):
         return await job
 
 
 @contextmanager
-def _handled(stop: Handler) -> Iterator[None]:
+def _handled(stop: Handler, names: tuple[str, ...]) -> Iterator[None]:
     before: dict[int, Any] = {}
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    for name in names:
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number is None or (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
             continue  # whoever started this with nohup wants it to survive the terminal

@@ -11,7 +11,6 @@ import typer
 
 if TYPE_CHECKING:
     from service.config import Loaded
-    from service.config_schema import MachineFile
     from service.events import ProgressSink
     from service.scheduler.ports import Check, CheckResult
     from service.scheduler.slots import Schedule
@@ -53,6 +52,8 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     """
     from service.mqtt.broker import parse
     from service.mqtt.topics import Topics
+    from service.scheduler.ready import Ready, look_at
+    from service.scheduler.timetable import schedules_of, windows_of
     from service.serve import Setup
     from service.site import site_of
     from service.workflows.check import run_check
@@ -70,22 +71,30 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         machine=config.name,
         doc=site.doc,
         devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
-        schedules=_timetable(config, site),
+        schedules=_measurable(schedules_of(config), site),
         store_url=loaded.database_url,
         broker=None if config.mqtt.url is None else parse(config.mqtt.url),
         topics=Topics(config.mqtt.topic_prefix, config.name),
         host=config.web.host,
         port=config.web.port if port is None else port,
         check=check_on,
+        maintenance=windows_of(config.maintenance),
+        ready=lambda clock: Ready(look_at(site.urls), schedules_of(config), site.temperature_c, windows_of(config.staffed), clock),
+        names=tuple(config.web.names),
+        certificate=_beside(loaded.path, config.web.certificate),
+        key=_beside(loaded.path, config.web.key),
     )
 
 
-def _timetable(config: MachineFile, site: Site) -> tuple[Schedule, ...]:
-    from service.scheduler.slots import Schedule, checked
+def _beside(machine_file: Path, name: str) -> str:
+    """A file of the machine file's folder, or an absolute one; empty stays empty."""
+    return str(machine_file.resolve().parent / name) if name else ""
+
+
+def _measurable(schedules: tuple[Schedule, ...], site: Site) -> tuple[Schedule, ...]:
     from service.sequences.check import dry_run_campaign
     from service.workflows.check import recipe_plan
 
-    schedules = tuple(checked(Schedule(entry.name, entry.cron, entry.timezone, entry.recipe, entry.grace_s)) for entry in config.schedule)
     for schedule in schedules:
         dry_run_campaign(site.machine, recipe_plan(schedule.recipe, site.machine), site.max_feed_mm_min)
     return schedules

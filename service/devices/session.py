@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from drivers import registry
 from drivers.api import BallBar, Controller, DisplacementMeter, Fixture
+from service.devices.clock_notes import noted
 from service.errors import ConfigError
 
 Ask = Callable[[str], Awaitable[None]]
@@ -70,7 +71,7 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console) -> AsyncIterator
     if urls.cnc is None:
         raise ConfigError("no controller configured", "add cnc = ... under [devices] of the machine file")
     async with AsyncExitStack() as stack:
-        controller = await registry.open_controller(urls.cnc)
+        controller = noted(await registry.open_controller(urls.cnc))
         stack.push_async_callback(controller.close)
         ballbar = laser = fixture = None
         if urls.ballbar is not None:

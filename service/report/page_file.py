@@ -9,8 +9,8 @@ from pathlib import Path
 from service.errors import FileFormatError
 
 
-def write_page(text: str, target: Path) -> None:
-    """Write a page beside its place and move it there: a reader sees the old file or the whole new one.
+def write_page(text: str | bytes, target: Path) -> None:
+    """Write a page (or the bytes of a PDF) beside its place and move it there: a reader sees the old file or the whole new one.
 
     Raises
     ------
@@ -23,8 +23,8 @@ def write_page(text: str, target: Path) -> None:
             raise IsADirectoryError(21, "it is a folder")
         handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
         aside = Path(name)
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(text.encode() if isinstance(text, str) else text)
             file.flush()
             os.fsync(file.fileno())
         aside.chmod(0o644)  # mkstemp makes private files, this one is for others

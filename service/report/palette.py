@@ -89,6 +89,14 @@ def style_rules() -> str:
     return f":root{{color-scheme:light dark;{_variables(LIGHT)}}}\n{dark}\n{_PLOT_RULES}{_role_rules()}"
 
 
+def paper_rules(font: str) -> str:
+    """CSS of a picture that stands alone on paper: every role with its light colour, for programs that know no variables."""
+    rules = (_PLOT_RULES + _role_rules()).replace("font-family:inherit", f"font-family:'{font}'")
+    for name, value in LIGHT.items():
+        rules = rules.replace(f"var(--{name})", value)
+    return rules
+
+
 def contrast(first: str, second: str) -> float:
     """Contrast ratio of two ``#rrggbb`` colours as WCAG 2 defines it, 1 to 21."""
     lighter, darker = sorted((_luminance(first), _luminance(second)), reverse=True)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from drivers.api import BarSample
 from service.errors import MeasurementFault
+from service.runs.clocks import Edges
 from service.storage.records import Doc
 
 Array = npt.NDArray[np.float64]
@@ -23,7 +24,24 @@ INVALID_BITS = 1 << 0 | 1 << 2 | 1 << 4
 DURATION_TOLERANCE = 0.01
 
 
-def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, complete: bool = True) -> Doc:
+def sync_edges(samples: Sequence[BarSample], start: Doc) -> Edges | None:
+    """What the sync line says of a run; None if no sample has it set."""
+    at = [k for k, sample in enumerate(samples) if sample.status & SYNC_BIT]
+    if not at:
+        return None
+    first, last = at[0], at[-1]
+    begins = first > 0 and samples[first - 1].seq + 1 == samples[first].seq
+    ends = last + 1 < len(samples) and samples[last].seq + 1 == samples[last + 1].seq
+    return Edges(samples[first].device_us, samples[last].device_us, 1.0 / float(start["rate_hz"]), begins and ends)
+
+
+def begins_seen(samples: Sequence[BarSample]) -> bool:
+    """Whether the sample before the first one on the path is there: only then the path's beginning is known to the period."""
+    first = next((k for k, sample in enumerate(samples) if sample.status & SYNC_BIT), 0)
+    return first > 0 and (samples[first - 1].seq + 1) % 2**32 == samples[first].seq
+
+
+def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, complete: bool = True, rate: float = 1.0) -> Doc:
     """Turn the samples of one path into columns.
 
     Parameters
@@ -36,6 +54,8 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
         End document; None for an interrupted run, which gives the columns it has.
     complete : bool
         Whether the path ran to its end, i.e. whether durations can be checked.
+    rate : float
+        Seconds of the controller per second of the box (`service.runs.clocks`).
 
     Returns
     -------
@@ -54,7 +74,9 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     device_us = np.array([sample.device_us for sample in on_path], dtype=np.int64)
     if complete and end is not None and "path_end_us" in end:
         _check_durations(device_us, end, _length_mm(points) / feed_mm_s, rate_hz)
-    along_s = _time_along_path(samples, on_path, device_us, end if complete else None, rate_hz)
+    along_s = _time_along_path(samples, on_path, device_us, end if complete else None, (rate_hz, rate))
+    counts = _counts(points, path.get("measured"), feed_mm_s * along_s)
+    on_path, device_us, along_s = [s for s, yes in zip(on_path, counts, strict=True) if yes], device_us[counts], along_s[counts]
     position = _position(points, feed_mm_s * along_s)
     times = {"t_s": (_start_s(start, end) + along_s).tolist()}
     places = {f"{axis}_mm": position[:, index].tolist() for index, axis in enumerate("xyz")}
@@ -78,12 +100,16 @@ def _start_s(start: Doc, end: Doc | None) -> float:
 
 
 def _time_along_path(
-    samples: Sequence[BarSample], on_path: Sequence[BarSample], device_us: npt.NDArray[np.int64], end: Doc | None, rate_hz: float
+    samples: Sequence[BarSample],
+    on_path: Sequence[BarSample],
+    device_us: npt.NDArray[np.int64],
+    end: Doc | None,
+    rates: tuple[float, float],
 ) -> Array:
     if not on_path:
         return np.zeros(0)
-    half_period_s = 0.5 / rate_hz
-    since_first_s = (device_us - device_us[0]) * 1e-6
+    half_period_s = 0.5 / rates[0]
+    since_first_s = (device_us - device_us[0]) * 1e-6 * rates[1]
     first = samples.index(on_path[0])
     start_was_lost = on_path[0].seq != (samples[first - 1].seq + 1) % 2**32 if first else on_path[0].seq != 0
     if start_was_lost and end is not None and end.get("path_end_us"):
@@ -113,6 +139,14 @@ def _check_durations(device_us: npt.NDArray[np.int64], end: Doc, planned_s: floa
 
 def _length_mm(points: Array) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _counts(points: Array, measured: Sequence[int] | None, arc_mm: Array) -> npt.NDArray[np.bool_]:
+    """Which readings lie between the first and the last point that count; feed-in and feed-out stay in the raw samples alone."""
+    if measured is None:
+        return np.ones(arc_mm.size, dtype=np.bool_)
+    arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    return np.asarray((arc_mm >= arc[measured[0]]) & (arc_mm <= arc[measured[1]]), dtype=np.bool_)
 
 
 def _position(points: Array, arc_mm: Array) -> Array:

@@ -4,7 +4,15 @@ Start document: ``setup`` and ``machine`` of the exchange format, ``ctrl0_us`` (
 ball-bar runs ``path`` {``feed_mm_min``, ``direction``, ``points_mm``} and ``rate_hz``. ``points_mm`` begins where the machine stands when
 the path starts. End document of a ball-bar run: ``path_start_us``, ``path_end_us`` (controller time). For a run without end document the
 path's start is taken from the start document: ``path_start_us``, else ``clock.ctrl_us``, else the setup's ``t_set_s``.
-``mounted_us`` of the end document is when cup or laser were mounted (controller time); the start document is written before.
+``path.measured``: first and last point of ``points_mm`` between which readings count; without it all do. A ball-bar run whose
+setup says how many ``samples`` make a reading was read at standstill, point by point: it has no ``path``, and its
+records stand where those of a laser run do.
+``path.pieces`` (run, to_mm) and ``path.offset_mm``: the path was broken off and went on (service.sequences.onward);
+``points_mm`` is its rest, and the readings of the broken runs belong to it up to those lengths. The end document of a broken run says how
+far it came at constant feed: ``path_start_us``, ``good_us``, ``box_boot_id``.
+``clock_pairs`` of the end document: controller time (us) and arrival (host s) of its statuses; they check the sync line
+(service.runs.clocks; ``timing`` of the result says what came of it).
+``mounted_us`` is when cup or laser were mounted (controller time); the start document is written before.
 """
 
 from __future__ import annotations
@@ -12,10 +20,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.errors import StoreError
-from service.runs.bar_columns import bar_columns
+from service.errors import MeasurementFault, StoreError, StretchDiffers
+from service.runs.bar_columns import bar_columns, begins_seen, sync_edges
+from service.runs.bar_point_columns import bar_point_columns
+from service.runs.clocks import RunClock, run_clock
 from service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
 from service.runs.laser_columns import laser_columns
+from service.runs.pieces import SoFar, joined, pieces_of, read_so_far, up_to
 from service.storage.records import ChunkRecord, Doc, RunRecord
 from service.storage.store import Store
 
@@ -47,8 +58,46 @@ def load_run(store: Store, id_or_label: int | str) -> Doc:
     MeasurementFault
         If its samples contradict its path.
     """
-    record = store.run(id_or_label)
-    return run_document(record, store.chunks(record.id))
+    return whole_document(store, store.run(id_or_label))
+
+
+def whole_document(store: Store, record: RunRecord) -> Doc:
+    """A run with the pieces that belong to it, as an ``abbe-run/1`` document; errors as of `load_run`."""
+    document = run_document(record, store.chunks(record.id))
+    pieces = pieces_of(record.start_doc)
+    if not pieces:
+        return document
+    broken = [(store.run(p.run), p.to_mm) for p in pieces]
+    pieces_doc = [run_document(run, store.chunks(run.id)) for run, _ in broken]
+    parts = [up_to(run, one["columns"], to_mm) for (run, to_mm), one in zip(broken, pieces_doc, strict=True)]
+    named = [{"run": run.label, "readings": len(part["t_s"])} for (run, _), part in zip(broken, parts, strict=True)]
+    timing = document.get("timing", {}) | {"pieces": named}
+    troubles = [f"in {run.label}: {text}" for (run, _), one in zip(broken, pieces_doc, strict=True) if (text := _trouble(one))]
+    if troubles and "trouble" not in timing:
+        timing["trouble"] = troubles[0]
+    return document | {"columns": joined([*parts, document["columns"]]), "timing": timing}
+
+
+def _trouble(document: Doc) -> str:
+    return str(document.get("timing", {}).get("trouble", ""))
+
+
+def path_so_far(store: Store, run: int) -> SoFar | None:
+    """How far a path was read by its last broken run and the pieces before it; None if it has to begin again."""
+    record = store.run(run)
+    if record.reason.startswith(StretchDiffers.code):
+        return None  # nobody knows which of the two was right
+    try:
+        chunks = store.chunks(run)
+        document = run_document(record, chunks)
+        samples = [sample for chunk in _of(chunks, BAR_CHANNEL, BAR_CODEC) for sample in decode_bar(chunk.payload)]
+        found = read_so_far(record, document["columns"]) if begins_seen(samples) and not _trouble(document) else None
+    except (StoreError, MeasurementFault):
+        found = None  # it cannot be read: it counts as nothing
+    if found is not None:
+        return found
+    earlier = pieces_of(record.start_doc)
+    return path_so_far(store, earlier[-1].run) if earlier else None
 
 
 def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
@@ -78,14 +127,15 @@ def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
         return dict(imported) | {"columns": unpack_columns(chunks)}  # the key stands in "imported" too, so its place is kept
     document: Doc = {"format": FORMAT, "campaign": record.campaign, "run_id": record.label, "test": record.test, "role": record.role}
     try:
-        columns = _measured(record, chunks)
+        columns, timing = _measured(record, chunks)
         document |= {"machine": record.start_doc["machine"], "setup": _setup(record.start_doc, record.end_doc), "columns": columns}
     except (KeyError, TypeError) as err:
         raise StoreError(
             f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
         ) from None
     # which compensation table was active: a solution is only meaningful together with it, so it travels with the run
-    return document | ({"table": record.start_doc["table"]} if "table" in record.start_doc else {})
+    document |= {"table": record.start_doc["table"]} if "table" in record.start_doc else {}
+    return document | ({"timing": timing} if timing else {})
 
 
 def _setup(start: Doc, end: Doc | None) -> Doc:
@@ -129,12 +179,17 @@ def unpack_columns(chunks: Sequence[ChunkRecord]) -> Doc:
     return {record["name"]: record["values"] for record in records}
 
 
-def _measured(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
-    if record.test.startswith("ballbar"):
-        samples = [sample for chunk in _of(chunks, BAR_CHANNEL, BAR_CODEC) for sample in decode_bar(chunk.payload)]
-        return bar_columns(samples, record.start_doc, record.end_doc, complete=record.status == "complete")
+def _measured(record: RunRecord, chunks: Sequence[ChunkRecord]) -> tuple[Doc, Doc]:
+    """The columns, and what is to be said of the clocks."""
+    if record.test.startswith("ballbar") and "samples" not in record.start_doc.get("setup", {}):
+        bar_chunks = _of(chunks, BAR_CHANNEL, BAR_CODEC)
+        samples = [sample for chunk in bar_chunks for sample in decode_bar(chunk.payload)]
+        edges, complete = sync_edges(samples, record.start_doc), record.status == "complete"
+        clock = RunClock(1.0, 0.0, {}) if edges is None else run_clock(bar_chunks, record.end_doc, edges)
+        return bar_columns(samples, record.start_doc, record.end_doc, complete=complete, rate=clock.rate), clock.doc
     records = [one for chunk in _of(chunks, LASER_CHANNEL, JSON_CODEC) for one in decode_json(chunk.payload)]
-    return laser_columns(records, record.start_doc)
+    make = bar_point_columns if record.test.startswith("ballbar") else laser_columns
+    return make(records, record.start_doc), {}
 
 
 def _of(chunks: Sequence[ChunkRecord], channel: str, codec: str) -> list[ChunkRecord]:

@@ -12,12 +12,15 @@ from pathlib import Path
 from service.errors import FileFormatError
 from service.runs.checks import check, check_run, read_json
 from service.runs.codec import JSON_CODEC, encode_json
-from service.runs.columns import pack_columns, run_document
+from service.runs.columns import pack_columns, run_document, whole_document
 from service.runs.formats import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
+from service.runs.pieces import pieces_of
 from service.storage.records import CampaignRecord, Doc, ImportedRun, RunRecord
 from service.storage.store import Store
 
 CAMPAIGN_FILE = "campaign.json"
+
+COMPLETE = "complete"
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,8 +163,11 @@ def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
 
 def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path) -> None:
     entries, setups = [], dict[str, Doc]()
+    joined = {piece.run for run in runs if run.status == COMPLETE for piece in pieces_of(run.start_doc)}
     for run in runs:
-        document = run_document(run, store.chunks(run.id))
+        if run.id in joined:
+            continue  # its readings are in the run that it belongs to: one measurement must not count twice
+        document = whole_document(store, run) if run.status == COMPLETE else run_document(run, store.chunks(run.id))
         entry = run.start_doc.get("entry") or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)
         setup = document["setup"]

@@ -20,7 +20,7 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
     ----------
     records : sequence of dict
         ``host_s``, ``ctrl_us``, ``target_mm`` [x, y, z], ``direction``, ``displacement_tenth_nm``, ``status``, ``signal_permille``,
-        ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order.
+        ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order. ``missing``: nobody saw that standstill.
     start : dict
         Start document (service.runs.columns).
 
@@ -28,7 +28,8 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
     -------
     dict
         Columns of ``abbe-run/1`` and ``status``, ``signal_permille``. The deviation is 0 at the first record, as there is no earlier one to
-        measure from.
+        measure from; if that one is missing, it counts from where the laser was zeroed. A missing reading is a row with the commanded
+        position, deviation 0 and ``valid`` 0: later rows keep their places.
     """
     first = records[0] if records else {}
     beam = start["setup"]["nominal_beam"]
@@ -40,12 +41,14 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
         "deviation_mm": [_deviation_mm(one, first, beam) for one in records],
         "temp_air_C": [float(one["air_temp_c"]) for one in records],
         "pressure_air_Pa": [float(one["air_pressure_pa"]) for one in records],
-        "valid": [0 if one["status"] & (BEAM_LOST | NO_REFLECTOR) else 1 for one in records],
+        "valid": [0 if one.get("missing") or one["status"] & (BEAM_LOST | NO_REFLECTOR) else 1 for one in records],
         "status": [int(one["status"]) for one in records],
         "signal_permille": [int(one["signal_permille"]) for one in records],
     }
 
 
 def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[float]) -> float:
+    if one.get("missing"):
+        return 0.0
     nominal_mm = sum(b * (now - then) for b, now, then in zip(beam, one["target_mm"], first["target_mm"], strict=True))
     return float((one["displacement_tenth_nm"] - first["displacement_tenth_nm"]) * MM_PER_COUNT - nominal_mm)

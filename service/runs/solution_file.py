@@ -21,12 +21,20 @@ class Versions(FileObject):
     revision: str | None = None
 
 
+class TableInForce(FileObject):
+    """A compensation table that runs were measured with: CRC-32 of its image; whether the controller said that it corrects anything."""
+
+    crc: int
+    acting: bool | None = None
+
+
 class Inputs(FileObject):
-    """SHA-256 of every run's data by its name, of the machine's geometry, and of all of them with the model."""
+    """SHA-256 of every run's data by its name, of the machine's geometry, and of all of them with the model; tables in force meanwhile."""
 
     digest: Digest
     machine: Digest = ""
     runs: dict[str, Digest]
+    tables: list[TableInForce] = Field(default_factory=list)
 
 
 class ParameterValue(FileObject):

@@ -12,8 +12,9 @@ import structlog
 from service.clock import Clock
 from service.errors import StoreError
 from service.scheduler import record
-from service.scheduler.ports import Doc
+from service.scheduler.ports import Doc, OpenSlot
 from service.scheduler.store import ServiceStore
+from service.storage.store_slots import RUNNING
 
 log = structlog.get_logger("abbe.store")
 
@@ -50,9 +51,22 @@ class StoreLedger(_Patient):
         """Return True to exactly one caller, ever, for each (schedule, slot)."""
         return await self._write(self._store.claim_slot, self._key(schedule), slot_utc)
 
-    async def finish(self, schedule: str, slot_utc: datetime, state: str) -> None:
-        """Write down what became of a claimed slot."""
-        await self._write(self._store.finish_slot, self._key(schedule), slot_utc, state[:30])
+    async def begin(self, schedule: str, slot_utc: datetime) -> None:
+        """Note that the check of a claimed slot starts: nobody may start it again."""
+        await self._write(self._store.begin_slot, self._key(schedule), slot_utc)
+
+    async def release(self, schedule: str, slot_utc: datetime) -> None:
+        """Give back a claimed slot that was not started."""
+        await self._write(self._store.release_slot, self._key(schedule), slot_utc)
+
+    async def adopt(self, schedule: str) -> list[OpenSlot]:
+        """Take over the open slots whose service is gone, in order of time. Each is given to exactly one caller."""
+        found = await self._write(self._store.adopt_slots, self._key(schedule))
+        return [OpenSlot(datetime.fromisoformat(one.slot_utc), one.state == RUNNING) for one in found]
+
+    async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
+        """Write down what became of a claimed slot: state (30 characters) and the sentence to it."""
+        await self._write(self._store.finish_slot, self._key(schedule), slot_utc, state[:30], reason)
 
     async def last_claimed(self, schedule: str) -> datetime | None:
         """Return the latest slot ever claimed for this schedule, or None if it is new."""

@@ -1,23 +1,26 @@
 """The timetable at work: each slot claimed once, one job at a time, nothing missed in silence.
 
-A slot ends in one of these states, written to the ledger (at most 30 characters; the sentence goes into the alarm):
-``done: <verdict>``, ``skipped: busy`` (another check was running), ``missed: <how> late`` (found too late: moving a machine hours
-after the planned time would surprise whoever stands there), ``interrupted`` (the service was stopped).
+A slot that is due waits until it may start: no other check runs, no maintenance window, the machine as the schedule needs it. How long it
+may wait is the schedule's grace; a slot found later than that is a missed one. What a slot ends as is in `service.scheduler.outcomes`.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from itertools import islice
 from typing import Protocol
 
 import structlog
 
 from service.clock import Clock
-from service.scheduler.ports import Doc, Ledger
-from service.scheduler.slots import Schedule, next_slot, slots_between
+from service.scheduler import outcomes
+from service.scheduler.ports import Doc, Ledger, Readiness
+from service.scheduler.ready import AlwaysReady
+from service.scheduler.slots import Schedule, next_slot, previous_slot, slots_after
+from service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
+from service.scheduler.windows import Window, covering
 
 log = structlog.get_logger("abbe.scheduler")
 
@@ -25,7 +28,10 @@ JUMP_S = 2.0
 """Wall clock and monotonic clock may differ by this much over one wait before we say that somebody set the clock."""
 
 MAX_BACKLOG = 1000
-"""More missed slots than this are reported as one span: a clock set to next year must not fill the disk."""
+"""More missed slots than this are written down as one span: a clock set to next year must not fill the disk."""
+
+ADOPT_S = 900.0
+"""How often slots are looked for that another service, which is gone, has left open."""
 
 Job = Callable[[Schedule, datetime], Awaitable[str]]
 
@@ -36,6 +42,28 @@ class Alarms(Protocol):
     async def alarm(self, doc: Doc) -> None:
         """Queue an alarm."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """On what terms slots start.
+
+    Parameters
+    ----------
+    maintenance : sequence of Window
+        Nothing starts in these.
+    ready : Readiness
+        Knows the preconditions.
+    poll_s : float
+        The longest wait: how soon a changed wall clock is noticed.
+    recheck_s : float
+        The longest wait while a slot waits for its preconditions.
+    """
+
+    maintenance: Sequence[Window] = ()
+    ready: Readiness = field(default_factory=AlwaysReady)
+    poll_s: float = 30.0
+    recheck_s: float = 30.0
 
 
 class Scheduler:
@@ -53,22 +81,26 @@ class Scheduler:
         Told of missed and skipped slots and of clock jumps.
     clock : Clock
         All waiting and all "now".
-    poll_s : float, optional
-        The longest wait: how soon a changed wall clock is noticed.
+    terms : Terms, optional
+        Maintenance windows, preconditions, pace.
     """
 
     def __init__(
-        self, schedules: Sequence[Schedule], ledger: Ledger, job: Job, alarms: Alarms, clock: Clock, *, poll_s: float = 30.0
+        self, schedules: Sequence[Schedule], ledger: Ledger, job: Job, alarms: Alarms, clock: Clock, terms: Terms | None = None
     ) -> None:
         self._schedules = tuple(schedules)
         self._ledger = ledger
         self._job = job
         self._alarms = alarms
         self._clock = clock
-        self._poll_s = poll_s
+        self._terms = terms or Terms()
         self._cursor: dict[str, datetime] = {}
+        self._ahead: dict[str, Iterator[datetime]] = {}
         self._upcoming: dict[str, datetime | None] = {}
         self._running: str | None = None
+        self._waiting: list[Waiting] = []
+        self._ended = asyncio.Event()
+        self._adopt_at_s = 0.0
 
     def next_due(self) -> list[tuple[Schedule, datetime]]:
         """Return what comes next of each schedule, soonest first."""
@@ -77,51 +109,128 @@ class Scheduler:
         return sorted(due, key=lambda pair: pair[1])
 
     async def run(self) -> None:
-        """Work for ever. Cancelling stops a running job through its own cancellation, and waits for it."""
+        """Work for ever. Cancelling stops a running job through its own cancellation, waits for it, and gives back what had to wait."""
         now = self._clock.utc()
         for schedule in self._schedules:
             # From the last slot we know of: what came due while the service was off is recorded, not forgotten.
             last = await self._ledger.last_claimed(schedule.name)
             self._move_cursor(schedule, now if last is None else min(last, now))
-        async with asyncio.TaskGroup() as tasks:
-            while True:
-                for schedule in self._schedules:
-                    await self._deal_with_due(schedule, tasks)
-                await self._wait()
+        self._adopt_at_s = self._clock.monotonic_s()
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._terms.ready.watch(), name="ready")
+                while True:
+                    await self._adopt()
+                    for schedule in self._schedules:
+                        await self._deal_with_due(schedule)
+                    await self._start_what_may(tasks)
+                    await self._wait()
+        finally:
+            for waiting in self._waiting:
+                await self._ledger.release(waiting.schedule.name, waiting.slot)
 
     def _move_cursor(self, schedule: Schedule, to: datetime) -> None:
         self._cursor[schedule.name] = to
-        self._upcoming[schedule.name] = next_slot(schedule, to)
+        self._ahead[schedule.name] = slots_after(schedule, to)
+        self._upcoming[schedule.name] = next(self._ahead[schedule.name], None)
 
-    async def _deal_with_due(self, schedule: Schedule, tasks: asyncio.TaskGroup) -> None:
+    async def _adopt(self) -> None:
+        """Decide on what a service that is gone has left open: what ran was broken off, what waited waits on."""
+        if self._clock.monotonic_s() < self._adopt_at_s:
+            return
+        self._adopt_at_s = self._clock.monotonic_s() + ADOPT_S
+        for schedule in self._schedules:
+            for slot, ran in await self._ledger.adopt(schedule.name):
+                if ran:
+                    await self._end(schedule, slot, outcomes.broken_off(schedule.name, slot))
+                else:
+                    await self._take(schedule, slot)
+
+    async def _deal_with_due(self, schedule: Schedule) -> None:
         now = self._clock.utc()
         upcoming = self._upcoming[schedule.name]
         if upcoming is None or upcoming > now:
             return
-        due = list(islice(slots_between(schedule, self._cursor[schedule.name], now), MAX_BACKLOG + 1))
+        due: list[datetime] = []
+        while upcoming is not None and upcoming <= now and len(due) <= MAX_BACKLOG:
+            due.append(upcoming)
+            upcoming = next(self._ahead[schedule.name], None)
+        self._cursor[schedule.name], self._upcoming[schedule.name] = due[-1], upcoming
         if len(due) > MAX_BACKLOG:
-            self._move_cursor(schedule, now)
-            await self._tell("SCH-004", f"{schedule.name}: more than {MAX_BACKLOG} slots missed between {due[0]:%F %R} and {now:%F %R} UTC")
-            return
-        self._move_cursor(schedule, due[-1])
+            due = await self._write_down_span(schedule, due[0], now)
+            self._move_cursor(schedule, due[-1])
+        if schedule.catch_up == "once":
+            await self._stand_for(schedule, due[:-1], due[-1])
+            due = due[-1:]
         for slot in due:
             if await self._ledger.claim(schedule.name, slot):
-                await self._decide(schedule, slot, tasks)
+                await self._take(schedule, slot)
 
-    async def _decide(self, schedule: Schedule, slot: datetime, tasks: asyncio.TaskGroup) -> None:
+    async def _write_down_span(self, schedule: Schedule, first: datetime, now: datetime) -> list[datetime]:
+        last = previous_slot(schedule, now) or first
+        if await self._ledger.claim(schedule.name, first):
+            await self._end(schedule, first, outcomes.whole_span(schedule.name, first, last))
+        return [last]
+
+    async def _stand_for(self, schedule: Schedule, older: Sequence[datetime], by: datetime) -> None:
+        """Write down the older of several due slots: the run of the last one is for all of them, whichever service starts it."""
+        ours = [slot for slot in older if await self._ledger.claim(schedule.name, slot)]
+        for slot in ours:
+            await self._end(schedule, slot, outcomes.stood_for(schedule.name, slot, by), tell=False)
+        if ours:
+            await self._tell(*outcomes.caught_up(schedule.name, ours, by))
+
+    async def _take(self, schedule: Schedule, slot: datetime) -> None:
+        """Decide on a slot that is ours: too late, or one that waits. Of one schedule no more than one waits."""
         late = self._clock.utc() - slot
-        if late > timedelta(seconds=schedule.grace_s):
-            await self._ledger.finish(schedule.name, slot, f"missed: {_span(late)} late")
-            allowed = _span(timedelta(seconds=schedule.grace_s))
-            await self._tell(
-                "SCH-001", f"{schedule.name}: slot {slot:%F %R} UTC was missed: found {_span(late)} late, allowed are {allowed}"
-            )
-        elif self._running is not None:
-            await self._ledger.finish(schedule.name, slot, "skipped: busy")
-            await self._tell("SCH-002", f"{schedule.name}: slot {slot:%F %R} UTC was skipped: {self._running!r} was still running")
-        else:
-            self._running = schedule.name
-            tasks.create_task(self._run_job(schedule, slot), name=f"check {schedule.name}")
+        if schedule.catch_up == "skip" and late > timedelta(seconds=schedule.grace_s):
+            await self._end(schedule, slot, outcomes.found_late(schedule, slot, late))
+            return
+        if schedule.catch_up == "skip" and self._running == schedule.name:
+            await self._end(schedule, slot, outcomes.overrun(schedule.name, slot))
+            return
+        new = Waiting(schedule, slot)
+        for other in [one for one in self._waiting if one.schedule.name == schedule.name]:
+            older, new = (other, new) if other.slot < slot else (new, other)
+            if schedule.catch_up == "skip":
+                await self._end(schedule, older.slot, outcomes.superseded(older, new.slot))
+            else:
+                await self._end(schedule, older.slot, outcomes.stood_for(schedule.name, older.slot, new.slot, older.hindrance))
+            self._waiting.remove(other)
+        self._waiting.append(new)
+
+    async def _start_what_may(self, tasks: asyncio.TaskGroup) -> None:
+        self._ended.clear()
+        for waiting in sorted(self._waiting, key=lambda one: one.slot):
+            now, until = self._clock.utc(), waiting.until
+            hindrance = await self._hindrance(waiting.schedule)
+            if until is not None and (now > until or (hindrance is not None and now >= until)):
+                hindrance = hindrance or waiting.hindrance
+                self._waiting.remove(waiting)
+                late = outcomes.found_late(waiting.schedule, waiting.slot, now - waiting.slot)
+                await self._end(
+                    waiting.schedule, waiting.slot, late if hindrance is None else outcomes.kept_from_starting(waiting, hindrance)
+                )
+            elif hindrance is not None:
+                waiting.hindrance = hindrance
+                if now > waiting.grace_ends and not waiting.told:
+                    waiting.told = True
+                    await self._tell(*outcomes.still_waits(waiting, hindrance))
+            else:
+                await self._ledger.begin(waiting.schedule.name, waiting.slot)
+                self._waiting.remove(waiting)
+                self._running = waiting.schedule.name
+                tasks.create_task(self._run_job(waiting.schedule, waiting.slot), name=f"check {waiting.schedule.name}")
+
+    async def _hindrance(self, schedule: Schedule) -> Hindrance | None:
+        """Return what keeps a schedule from starting now, the cheapest question first: devices are asked last."""
+        if self._running is not None:
+            return busy(self._running)
+        window = covering(self._terms.maintenance, self._clock.utc())
+        if window is not None:
+            return maintenance(window.name)
+        lack = await self._terms.ready.lack(schedule)
+        return not_ready(lack) if lack else None
 
     async def _run_job(self, schedule: Schedule, slot: datetime) -> None:
         state = "interrupted"
@@ -129,14 +238,19 @@ class Scheduler:
             state = await self._job(schedule, slot)
         finally:
             self._running = None
-            await self._ledger.finish(schedule.name, slot, state)
+            self._ended.set()
+            await self._ledger.finish(schedule.name, slot, state, "the service was stopped" if state == "interrupted" else "")
             log.info("slot done", schedule=schedule.name, slot=slot.isoformat(), state=state)
 
     async def _wait(self) -> None:
         """Sleep to the next slot, or to the next look at the clock, and notice if somebody set the clock meanwhile."""
         utc, monotonic_s = self._clock.utc(), self._clock.monotonic_s()
-        until_s = min(((slot - utc).total_seconds() for slot in self._upcoming.values() if slot is not None), default=self._poll_s)
-        await self._clock.sleep(min(max(until_s, 0.0), self._poll_s))
+        moments = [slot for slot in self._upcoming.values() if slot is not None]
+        # Once a slot's time is up it is given up, so no moment of those that wait lies in the past for longer than one turn.
+        moments += [waiting.until for waiting in self._waiting if waiting.until is not None]
+        longest_s = min(self._terms.poll_s, self._terms.recheck_s) if self._waiting else self._terms.poll_s
+        until_s = min(((moment - utc).total_seconds() for moment in moments), default=longest_s)
+        await self._nap(min(max(until_s, 0.0), longest_s))
         now = self._clock.utc()
         jump_s = (now - utc).total_seconds() - (self._clock.monotonic_s() - monotonic_s)
         if abs(jump_s) <= JUMP_S:
@@ -147,15 +261,23 @@ class Scheduler:
                 self._move_cursor(schedule, min(self._cursor[schedule.name], now))
         await self._tell("SCH-003", f"the computer's clock jumped by {jump_s:+.0f} s to {now:%F %T} UTC")
 
+    async def _nap(self, seconds: float) -> None:
+        """Sleep, or, while a slot waits for the machine, until the running check has ended."""
+        if not self._waiting or (self._running is None and not self._ended.is_set()):
+            await self._clock.sleep(seconds)
+            return
+        naps = [asyncio.ensure_future(self._clock.sleep(seconds)), asyncio.ensure_future(self._ended.wait())]
+        try:
+            await asyncio.wait(naps, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for nap in naps:
+                nap.cancel()
+
+    async def _end(self, schedule: Schedule, slot: datetime, outcome: outcomes.Outcome, *, tell: bool = True) -> None:
+        await self._ledger.finish(schedule.name, slot, outcome.state, outcome.text)
+        if tell:
+            await self._tell(outcome.code, outcome.text)
+
     async def _tell(self, code: str, what: str) -> None:
         log.warning(what, code=code)
         await self._alarms.alarm({"code": code, "what": what, "at_utc": self._clock.utc().isoformat()})
-
-
-def _span(length: timedelta) -> str:
-    seconds = length.total_seconds()
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    if seconds < 7200:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.0f} h" if seconds < 172800 else f"{seconds / 86400:.0f} days"

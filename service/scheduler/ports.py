@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from service.events import Progress, ProgressSink
 from service.scheduler.slots import Schedule
@@ -66,6 +66,13 @@ Check = Callable[[str, ProgressSink], Awaitable[CheckResult]]
 """``check(recipe, progress)``: opens the devices, measures, closes them. Cancelling it must leave the machine held."""
 
 
+class OpenSlot(NamedTuple):
+    """A slot that a service which is gone left open. ``ran``: the machine had begun to move for it."""
+
+    slot_utc: datetime
+    ran: bool
+
+
 class Ledger(Protocol):
     """Remembers which slots were dealt with, across restarts and across processes."""
 
@@ -73,12 +80,36 @@ class Ledger(Protocol):
         """Return True to exactly one caller, ever, for each (schedule, slot)."""
         ...
 
-    async def finish(self, schedule: str, slot_utc: datetime, state: str) -> None:
-        """Write down what became of a claimed slot."""
+    async def begin(self, schedule: str, slot_utc: datetime) -> None:
+        """Note that the check of a claimed slot starts: nobody may start it again."""
+        ...
+
+    async def release(self, schedule: str, slot_utc: datetime) -> None:
+        """Give back a claimed slot that was not started."""
+        ...
+
+    async def adopt(self, schedule: str) -> list[OpenSlot]:
+        """Take over the open slots whose service is gone, in order of time. Each is given to exactly one caller."""
+        ...
+
+    async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
+        """Write down what became of a claimed slot: state (30 characters) and the sentence to it."""
         ...
 
     async def last_claimed(self, schedule: str) -> datetime | None:
         """Return the latest slot ever claimed for this schedule, or None if it is new."""
+        ...
+
+
+class Readiness(Protocol):
+    """Knows whether the machine is as a schedule needs it."""
+
+    async def lack(self, schedule: Schedule) -> str:
+        """Return what is lacking as one sentence, or nothing."""
+        ...
+
+    async def watch(self) -> None:
+        """Work for ever on what has to be seen over time, or return at once."""
         ...
 
 

@@ -1,8 +1,9 @@
-"""Cron expression and time zone to UTC slots. Pure: no clock, no state.
+"""Cron expression and time zone, or an interval, to UTC slots. Pure: no clock, no state.
 
 A slot is a UTC instant at which a schedule is due. Daylight saving is settled here and nowhere else: a time that does not
 exist (spring) fires once, at the first instant after the gap; a time that exists twice (autumn) fires once, at its first
-occurrence; expressions that run every so many minutes run through both hours.
+occurrence; expressions that run every so many minutes run through both hours. Intervals are counted in UTC from a fixed
+instant, so that every process and every restart finds the same slots.
 """
 
 from __future__ import annotations
@@ -10,14 +11,38 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from typing import Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from cronsim import CronSim, CronSimError
 
 from service.errors import ConfigError
+from service.scheduler import wall
 
-# A fixed time is moved by at most the size of a clock change. No zone changes by more than this.
-_CLOCK_CHANGE = timedelta(hours=3)
+FIRST_UTC = datetime(2026, 1, 1, tzinfo=UTC)
+"""Intervals are counted from here unless the machine file names another instant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What has to be so before a check starts.
+
+    Parameters
+    ----------
+    idle : bool
+        Controller ready, nothing moves, no NC program, spindle off.
+    warm_min : float
+        So many of the last 60 minutes the spindle turned or an axis moved, min.
+    air : bool
+        Air temperature (of the laser) inside the machine file's window.
+    operator : str
+        ``present`` or ``absent`` by the staffed hours, or ``any``.
+    """
+
+    idle: bool = False
+    warm_min: float = 0.0
+    air: bool = False
+    operator: Literal["any", "present", "absent"] = "any"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,13 +54,21 @@ class Schedule:
     name : str
         Unique within the machine; part of the key that makes a slot run once.
     cron : str
-        Five fields (minute hour day month weekday, 1 = Monday), or six with seconds first.
+        Five fields (minute hour day month weekday, 1 = Monday), or six with seconds first. Empty where ``every_h`` is given.
     timezone : str
         IANA name, for example ``Europe/Berlin``.
     recipe : str
         What to run.
     grace_s : float
-        A slot found later than this is recorded as missed and not run.
+        A slot may start so late: found later, or kept from starting for longer, it is a missed one.
+    every_h : float
+        Interval, h; 0: by ``cron``.
+    first_utc : datetime
+        One slot of the interval; the others are whole intervals away from it.
+    catch_up : str
+        Missed slots: ``skip`` records each with its reason; ``once`` does so too, and runs once for all of them.
+    needs : Needs
+        Preconditions.
     """
 
     name: str
@@ -43,6 +76,10 @@ class Schedule:
     timezone: str
     recipe: str
     grace_s: float = 300.0
+    every_h: float = 0.0
+    first_utc: datetime = FIRST_UTC
+    catch_up: Literal["skip", "once"] = "skip"
+    needs: Needs = Needs()
 
 
 def checked(schedule: Schedule) -> Schedule:
@@ -60,6 +97,8 @@ def checked(schedule: Schedule) -> Schedule:
         raise ConfigError(
             f"{where}: there is no time zone {schedule.timezone!r}", "use an IANA name such as Europe/Berlin or UTC"
         ) from wrong
+    if schedule.every_h:
+        return schedule
     try:
         CronSim(schedule.cron, datetime(2026, 1, 1, tzinfo=zone))
     except CronSimError as wrong:
@@ -72,12 +111,22 @@ def checked(schedule: Schedule) -> Schedule:
 def slots_after(schedule: Schedule, after_utc: datetime) -> Iterator[datetime]:
     """Yield the UTC slots strictly later than ``after_utc``, in order, each once."""
     last = after_utc.astimezone(UTC)
-    for local in CronSim(schedule.cron, last.astimezone(ZoneInfo(schedule.timezone))):
-        slot = local.astimezone(UTC)
-        # Wall times lose their fold inside cronsim: two of them can be one instant, and one can lie before the start.
+    if schedule.every_h:
+        yield from _interval_after(schedule, last)
+        return
+    for slot in wall.due_after(schedule.cron, ZoneInfo(schedule.timezone), last):
+        # Two wall times can be one instant, and one can lie before the start.
         if slot > last:
             last = slot
             yield slot
+
+
+def _interval_after(schedule: Schedule, after: datetime) -> Iterator[datetime]:
+    step = timedelta(hours=schedule.every_h)
+    number = (after - schedule.first_utc) // step + 1
+    while True:
+        yield (schedule.first_utc + number * step).astimezone(UTC)
+        number += 1
 
 
 def next_slot(schedule: Schedule, after_utc: datetime) -> datetime | None:
@@ -88,11 +137,15 @@ def next_slot(schedule: Schedule, after_utc: datetime) -> datetime | None:
 def previous_slot(schedule: Schedule, until_utc: datetime) -> datetime | None:
     """Return the last slot not later than ``until_utc``, or None if there never was one."""
     until = until_utc.astimezone(UTC)
+    if schedule.every_h:
+        step = timedelta(hours=schedule.every_h)
+        return (schedule.first_utc + (until - schedule.first_utc) // step * step).astimezone(UTC)
     # Forward iteration defines the slots; walking backwards only finds a place to start from that is early enough.
     zone = ZoneInfo(schedule.timezone)
-    before = next(CronSim(schedule.cron, (until - _CLOCK_CHANGE).astimezone(zone), reverse=True), None)
+    early = (until - wall.CLOCK_CHANGE).astimezone(zone).replace(tzinfo=None)
+    before = next(CronSim(schedule.cron, early, reverse=True), None)
     found = None
-    start = until - _CLOCK_CHANGE if before is None else before.astimezone(UTC) - _CLOCK_CHANGE
+    start = until - wall.CLOCK_CHANGE if before is None else wall.instant(before, zone) - wall.CLOCK_CHANGE
     for slot in slots_after(schedule, start):
         if slot > until:
             break
@@ -110,4 +163,6 @@ def slots_between(schedule: Schedule, after_utc: datetime, until_utc: datetime) 
 
 def cron_in_words(schedule: Schedule) -> str:
     """Return the expression as a sentence, for people."""
+    if schedule.every_h:
+        return f"Every {schedule.every_h:g} hours, counted from {schedule.first_utc.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
     return CronSim(schedule.cron, datetime(2026, 1, 1, tzinfo=UTC)).explain()

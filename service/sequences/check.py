@@ -9,14 +9,17 @@ from itertools import pairwise
 
 from models.machine import AXES, Machine
 from service.errors import StrokeError
+from service.sequences.approach import LOW_SHARE, as_point, cup_of
 from service.sequences.steps import (
     MAX_PATH_POINTS,
     CampaignPlan,
     ChangeBar,
+    FollowPath,
     MountBar,
     MountLaser,
     MoveTo,
     Point,
+    ReadBar,
     ReadLaser,
     RecordPath,
     Step,
@@ -32,7 +35,7 @@ MOUNT_S = 0.0
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
-    """One test as it would run: machine seconds, path length, extent, number of readings."""
+    """One test as it would run: machine seconds, path length, extent, number of readings, largest speed."""
 
     label: str
     test: str
@@ -41,6 +44,7 @@ class DryRun:
     lowest_mm: Point
     highest_mm: Point
     readings: int
+    fastest_mm_min: float = 0.0
 
 
 def positions(steps: tuple[Step, ...]) -> Iterator[Point]:
@@ -48,7 +52,7 @@ def positions(steps: tuple[Step, ...]) -> Iterator[Point]:
     for step in steps:
         if isinstance(step, MoveTo):
             yield step.target_mm
-        elif isinstance(step, RecordPath):
+        elif isinstance(step, RecordPath | FollowPath):
             yield from step.points_mm
 
 
@@ -57,9 +61,11 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
     match step:
         case MoveTo(target, feed):
             return (0.0 if here is None else math.dist(here, target) / feed * 60.0), target
-        case RecordPath(points, feed, _, _):
+        case RecordPath(points, feed) | FollowPath(points, feed):
             length = sum(math.dist(a, b) for a, b in pairwise(points))
             return length / feed * 60.0, points[-1]
+        case ReadBar(_, settle, samples, rate_hz):
+            return settle + samples / rate_hz, here
         case ReadLaser(_, settle):
             return settle + 0.1, here
         case MountBar() | TakeBarOut() | ChangeBar() | MountLaser() | Unmount() | ZeroLaser():
@@ -75,7 +81,7 @@ def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
         Which test, which axis, by how much; or how many points.
     """
     for step in plan.steps:
-        if isinstance(step, RecordPath) and len(step.points_mm) > MAX_PATH_POINTS:
+        if isinstance(step, RecordPath | FollowPath) and len(step.points_mm) > MAX_PATH_POINTS:
             raise StrokeError(
                 f"test {plan.label}: the path has {len(step.points_mm)} points, the controller holds {MAX_PATH_POINTS}",
                 "use a longer chord, fewer turns or a smaller radius; nothing has moved",
@@ -101,7 +107,9 @@ def paced(plan: CampaignPlan, max_feed_mm_min: float) -> CampaignPlan:
     """
 
     def slowed(step: Step) -> Step:
-        return replace(step, feed_mm_min=min(step.feed_mm_min, max_feed_mm_min)) if isinstance(step, MoveTo) else step
+        if not isinstance(step, MoveTo | FollowPath):
+            return step
+        return replace(step, feed_mm_min=min(step.feed_mm_min, max_feed_mm_min))
 
     return replace(plan, tests=tuple(replace(t, steps=tuple(slowed(s) for s in t.steps)) for t in plan.tests))
 
@@ -112,20 +120,41 @@ def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> 
     Raises
     ------
     StrokeError
-        As `check_positions`.
+        As `check_positions`; or a ball-bar goes below its cup and the recipe does not say that there is room.
     """
     lowest, highest = check_positions(machine, plan)
+    _check_cup(plan)
     seconds, length, readings, here = 0.0, 0.0, 0, start_mm
     for step in plan.steps:
         dt, after = step_seconds(step, here)
-        if isinstance(step, RecordPath):
+        if isinstance(step, RecordPath | FollowPath):
             length += dt * step.feed_mm_min / 60.0
-            readings += int(dt * step.rate_hz)
+            readings += int(dt * step.rate_hz) if isinstance(step, RecordPath) else 0
         elif isinstance(step, MoveTo) and here is not None:
             length += math.dist(here, step.target_mm)
-        readings += isinstance(step, ReadLaser)
+        readings += isinstance(step, ReadLaser | ReadBar)
         seconds, here = seconds + dt, after
-    return DryRun(plan.label, plan.test, seconds, length, lowest, highest, readings)
+    return DryRun(plan.label, plan.test, seconds, length, lowest, highest, readings, fastest(plan))
+
+
+def _check_cup(plan: TestPlan) -> None:
+    setup = plan.setup
+    if not plan.test.startswith("ballbar") or setup.get("under_the_cup"):
+        return
+    own = next(
+        (k for k, s in enumerate(plan.steps) if isinstance(s, RecordPath | ReadBar)), len(plan.steps)
+    )  # before: another bar's sphere
+    lowest = cup_of(setup).lowest(list(positions(plan.steps[own:])) or [as_point(cup_of(setup).pole)])
+    if lowest < -LOW_SHARE:
+        raise StrokeError(
+            f"test {plan.label}: the path goes {-lowest * setup['radius_mm']:.0f} mm below the centre of the cup, which stands there",
+            f"use a partial arc ({LOW_SHARE:g} radii below the centre are allowed), or write under_the_cup = true if there is room",
+        )
+
+
+def fastest(plan: TestPlan) -> float:
+    """Largest feed of a test, mm/min."""
+    return max((s.feed_mm_min for s in plan.steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=0.0)
 
 
 def dry_run_campaign(machine: Machine, plan: CampaignPlan, max_feed_mm_min: float = math.inf) -> tuple[DryRun, ...]:
@@ -137,7 +166,7 @@ def dry_run_campaign(machine: Machine, plan: CampaignPlan, max_feed_mm_min: floa
         Which test, what it would do, what is allowed. Nothing has moved.
     """
     for test in plan.tests:
-        feed = max((s.feed_mm_min for s in test.steps if isinstance(s, MoveTo | RecordPath)), default=0.0)
+        feed = fastest(test)
         if feed > max_feed_mm_min:
             raise StrokeError(
                 f"test {test.label}: would move at {feed:g} mm/min, allowed are {max_feed_mm_min:g}",

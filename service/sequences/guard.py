@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
 from drivers.api import Controller
@@ -13,12 +13,18 @@ from service.errors import AbbeError
 
 STOP_S = 10.0
 """Outer bound only. The driver's own limits govern: seconds for each write, five until the axes stand still."""
+Spare = Callable[[], Awaitable[bool]]
 UNDELIVERED = "the stop could not be delivered: press e-stop"
 
 
 @asynccontextmanager
-async def motion_guard(controller: Controller) -> AsyncIterator[None]:
+async def motion_guard(controller: Controller, spare: Spare | None = None) -> AsyncIterator[None]:
     """Whatever ends this block early also stops the axes: abort is sent although the task is being cancelled.
+
+    Parameters
+    ----------
+    spare : callable, optional
+        Says that nothing of ours can move and somebody else works with the machine: then it is left alone.
 
     Raises
     ------
@@ -30,7 +36,7 @@ async def motion_guard(controller: Controller) -> AsyncIterator[None]:
     except BaseException as error:
         stopped = asyncio.Event()
         try:
-            await run_to_end(_stop(controller, stopped))
+            await run_to_end(_stop(controller, stopped, spare))
         except asyncio.CancelledError as cancelled:
             if stopped.is_set():
                 raise
@@ -43,10 +49,11 @@ async def motion_guard(controller: Controller) -> AsyncIterator[None]:
         raise told from error
 
 
-async def _stop(controller: Controller, stopped: asyncio.Event) -> None:
+async def _stop(controller: Controller, stopped: asyncio.Event, spare: Spare | None) -> None:
     try:
         async with asyncio.timeout(STOP_S):
-            await controller.abort()
+            if spare is None or not await spare():
+                await controller.abort()
     except Exception:  # noqa: BLE001 - why it failed is not what matters now: that the axes may run on is, and the caller says so
         return
     stopped.set()

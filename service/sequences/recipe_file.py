@@ -11,138 +11,33 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from models.machine import AXES
 from service.errors import ConfigError
 from service.explain import expected, nearest, where
-from service.sequences.recipes import RAPID_MM_MIN, Diagonal, Helix, Linear, Recipe
+from service.sequences import bar_tables, laser_tables
+from service.sequences.bar_tables import CircleTable, HelixPointsTable, HelixTable, bar_table
+from service.sequences.laser_tables import DiagonalTable, FaceTable, LineTable, laser_table
+from service.sequences.recipe_tables import Table, TestTable
+from service.sequences.recipes import BarRecipe, Recipe
 from service.sequences.setups import shared_setups
 
 FORMAT = "abbe-recipe/1"
-Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[^\s/\\](?:[^\n\r/\\]*[^\s/\\])?$")]
-Feed = Annotated[float, Field(gt=0.0, le=100_000.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Role = Literal["identify", "holdout"]
-Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
+AnyTest = Annotated[
+    HelixTable | HelixPointsTable | CircleTable | DiagonalTable | FaceTable | LineTable,
+    Field(discriminator="kind"),
+]
+KINDS: dict[str, type[TestTable]] = bar_tables.KINDS | laser_tables.KINDS
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
-
-
-class HelixTable(_Table):
-    """One ``[[test]]`` of kind helix."""
-
-    kind: Literal["helix"]
-    label: Name
-    setup: Name
-    role: Role = "identify"
-    centre_mm: tuple[float, float, float]
-    radius_mm: Annotated[float, Field(gt=0.0, le=2000.0)]
-    turns: Annotated[float, Field(ge=3.0, le=50.0)] = 5.0
-    law: Literal["area", "angle"] = "area"
-    axis: Literal["X", "Y", "Z"] = "Z"
-    opens: Literal[1, -1] = 1
-    direction: Literal[1, -1] = 1
-    feed_mm_min: Feed = 2000.0
-    rate_hz: Annotated[int, Field(ge=1, le=1000)] = 100
-    length_calibrated: bool = True
-    u_length_mm: Annotated[float, Field(ge=0.0, le=1.0)] = 0.002
-
-    @field_validator("rate_hz")
-    @classmethod
-    def _divides(cls, rate_hz: int) -> int:
-        if 1000 % rate_hz:
-            raise ValueError(f"expected a rate that divides 1000 Hz (1000, 500, 250, 200, 125, 100, 50 ...), got {rate_hz}")
-        return rate_hz
-
-    def recipe(self) -> Recipe:
-        """The recipe, mounting and clearing away by itself."""
-        return Helix(
-            self.label,
-            self.setup,
-            self.role,
-            self.centre_mm,
-            self.radius_mm,
-            turns=self.turns,
-            law=self.law,
-            axis=AXES.index(self.axis),
-            feed_mm_min=self.feed_mm_min,
-            direction=self.direction,
-            rate_hz=self.rate_hz,
-            opens=self.opens,
-            length_calibrated=self.length_calibrated,
-            u_length_mm=self.u_length_mm,
-        )
-
-
-class DiagonalTable(_Table):
-    """One ``[[test]]`` of kind diagonal; without ``order`` the diagonal is run straight."""
-
-    kind: Literal["diagonal"]
-    label: Name
-    setup: Name
-    role: Role = "identify"
-    diagonal: Literal["ppp", "npp", "pnp", "ppn"]
-    order: Order | None = None
-    steps: Annotated[int, Field(ge=1, le=500)] = 12
-    feed_mm_min: Feed = RAPID_MM_MIN
-    settle_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.3
-
-    def recipe(self) -> Recipe:
-        """The recipe, mounting and clearing away by itself."""
-        return Diagonal(
-            self.label,
-            self.setup,
-            self.role,
-            self.diagonal,
-            self.steps,
-            self.order or "",
-            feed_mm_min=self.feed_mm_min,
-            settle_s=self.settle_s,
-        )
-
-
-class LineTable(_Table):
-    """One ``[[test]]`` of kind line; ``at_share``: places of the two other axes in their strokes, 0 to 1, in the order X, Y, Z."""
-
-    kind: Literal["line"]
-    label: Name
-    setup: Name
-    role: Role = "identify"
-    axis: Literal["X", "Y", "Z"]
-    at_share: tuple[Share, Share]
-    positions: Annotated[int, Field(ge=5, le=1000)] = 25
-    feed_mm_min: Feed = RAPID_MM_MIN
-    settle_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.3
-
-    def recipe(self) -> Recipe:
-        """The recipe, mounting and clearing away by itself."""
-        return Linear(
-            self.label,
-            self.setup,
-            self.role,
-            AXES.index(self.axis),
-            n=self.positions,
-            at=self.at_share,
-            feed_mm_min=self.feed_mm_min,
-            settle_s=self.settle_s,
-        )
-
-
-TestTable = Annotated[HelixTable | DiagonalTable | LineTable, Field(discriminator="kind")]
-KINDS: dict[str, type[_Table]] = {"helix": HelixTable, "diagonal": DiagonalTable, "line": LineTable}
-
-
-class RecipeFile(_Table):
+class RecipeFile(Table):
     """A whole recipe file."""
 
     format: Literal["abbe-recipe/1"]
     name: Annotated[str, Field(min_length=1, max_length=120)]
     note: str = ""
-    test: Annotated[list[TestTable], Field(min_length=1)]
+    test: Annotated[list[AnyTest], Field(min_length=1)]
 
 
 def read_recipe(path: Path) -> tuple[str, tuple[Recipe, ...]]:
@@ -153,15 +48,25 @@ def read_recipe(path: Path) -> tuple[str, tuple[Recipe, ...]]:
     ConfigError
         File, key, what was expected; or which test cannot share its set-up with the one before.
     """
+    return parse_recipe(recipe_source(path), str(path))
+
+
+def recipe_source(path: Path) -> str:
+    """The text of a campaign recipe file.
+
+    Raises
+    ------
+    ConfigError
+        It is not there or cannot be read.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"recipe file {path} does not exist", "`abbe plan MACHINE.toml --out FILE.toml` writes one") from None
     except OSError as error:
         raise ConfigError(f"recipe file {path} cannot be read: {error.strerror}", "give a readable TOML file") from None
     except UnicodeDecodeError:
         raise ConfigError(f"recipe file {path} is not UTF-8 text", "save it as UTF-8") from None
-    return parse_recipe(text, str(path))
 
 
 def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
@@ -211,18 +116,8 @@ def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
 
 
 def _table(recipe: Recipe) -> dict[str, Any]:
-    common: dict[str, Any] = {"label": recipe.label, "setup": recipe.setup_id, "role": recipe.role}
-    if isinstance(recipe, Helix):
-        own = {"centre_mm": list(recipe.centre_mm), "radius_mm": recipe.radius_mm, "turns": recipe.turns, "law": recipe.law}
-        own |= {"axis": AXES[recipe.axis], "direction": recipe.direction, "feed_mm_min": recipe.feed_mm_min, "rate_hz": recipe.rate_hz}
-        own |= {"opens": recipe.opens, "length_calibrated": recipe.length_calibrated, "u_length_mm": recipe.u_length_mm}
-        return {"kind": "helix", **common, **own}
-    laser = {"feed_mm_min": recipe.feed_mm_min, "settle_s": recipe.settle_s}
-    if isinstance(recipe, Diagonal):
-        order = {"order": recipe.order} if recipe.order else {}
-        return {"kind": "diagonal", **common, "diagonal": recipe.diagonal, **order, "steps": recipe.steps, **laser}
-    at = [recipe.at] * 2 if isinstance(recipe.at, float) else list(recipe.at)
-    return {"kind": "line", **common, "axis": AXES[recipe.axis], "at_share": at, "positions": recipe.n, **laser}
+    own = bar_table(recipe) if isinstance(recipe, BarRecipe) else laser_table(recipe)
+    return {"kind": own["kind"], "label": recipe.label, "setup": recipe.setup_id, "role": recipe.role} | own
 
 
 def _toml(value: Any) -> str:

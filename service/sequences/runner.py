@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Awaitable, Callable
+from typing import Any
 
-from drivers.api import BarBatch, Controller, ControllerStatus, Point
+from drivers.api import ControllerStatus, Point
+from drivers.errors import Refused
 from service.devices.session import Session
-from service.errors import MeasurementFault, UnsafeToMove
+from service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
 from service.runs.recorder import Recorder
 from service.sequences.check import step_seconds
+from service.sequences.control import Control
 from service.sequences.guard import motion_guard
+from service.sequences.interlocks import AT_WORK, PAUSED, PROGRAM, REMOTE, Watching, check_interlocks, check_ours
+from service.sequences.journal import HAND, POINT, Journal, NoJournal
+from service.sequences.onward import Onward, Way
+from service.sequences.paths import follow_path, record_path
+from service.sequences.preconditions import Expected
+from service.sequences.rewind import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
+from service.sequences.standstill import read_bar
 from service.sequences.steps import (
     ChangeBar,
+    FollowPath,
     MountBar,
     MountLaser,
     MoveTo,
+    ReadBar,
     ReadLaser,
     RecordPath,
     Step,
@@ -25,190 +37,295 @@ from service.sequences.steps import (
     Unmount,
     ZeroLaser,
 )
+from service.sequences.waiting import paused
+from service.sequences.watch import NOTHING, Watch, watched
 
-ESTOP, DOOR, ALARM, REMOTE, REFERENCED, DRIVES, MOVING, HOLD, PATH, PROGRAM = 0, 1, 2, 3, 4, 5, 6, 8, 9, 11
-FORBIDDEN = (
-    (ESTOP, "e-stop is pressed"),
-    (DOOR, "the door is open"),
-    (ALARM, "the controller has an alarm"),
-    (PROGRAM, "an NC program runs"),
-)
-NEEDED = ((REMOTE, "the controller is not in remote mode"), (REFERENCED, "the axes are not referenced"), (DRIVES, "the drives are off"))
-POLL_S = 0.01
-STALL_S = 10.0
-BAD_IN_A_ROW = 25
-SYNC, BAD_BITS = 0b1000, 0b10101
 COMPENSATED = 3
+SAME_PLACE_MM = 1e-3
+MM_PER_COUNT = 1e-7
+BY_MOVES = 12
+"""A way back of so many points is driven in single moves, a longer one as a path."""
 
-BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
 Tick = Callable[[float, float], None]
 """Called after each step: planned machine seconds done so far in the test, and wall seconds that this step waited for a person."""
 
 
-def check_interlocks(status: ControllerStatus) -> None:
-    """Refuse to move (or to go on) unless the controller says that it is safe.
-
-    Raises
-    ------
-    UnsafeToMove
-        Which condition, and that nothing moves until it is cleared.
-    """
-    for bit, text in FORBIDDEN:
-        if status.bits >> bit & 1:
-            raise UnsafeToMove(text, "clear it at the machine, then start again; the run so far is kept as incomplete")
-    for bit, text in NEEDED:
-        if not status.bits >> bit & 1:
-            raise UnsafeToMove(text, "make the machine ready, then start again")
-
-
 class Runner:
-    """Runs tests on one session."""
+    """Runs tests on one session.
 
-    def __init__(self, session: Session) -> None:
+    Parameters
+    ----------
+    session : Session
+        Open devices.
+    control : Control, optional
+        How a person pauses, stops and aborts; default: nobody does.
+    watching : Watching, optional
+        What the watcher looks at.
+    journal : Journal, optional
+        Where checkpoints go.
+    expected : Expected, optional
+        What must not have changed when a pause ends.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        control: Control | None = None,
+        watching: Watching | None = None,
+        journal: Journal | None = None,
+        expected: Expected | None = None,
+    ) -> None:
         self._s = session
+        self._control = control or Control()
+        self._watching = watching or Watching()
+        self.journal = journal or NoJournal()
+        self._expected = expected
+        self._waited_s = 0.0
+        self._points = 0
+        self._still = self._stands = False
+        self.touched = False
+        """Somebody may have touched what is mounted, in the pause that ended the run."""
+        self.hand: int | None = None
+        """Last step by hand that was done; ``asked``: one that a person was asked for and that was not done."""
+        self.asked: int | None = None
+        self.mounted_us: int | None = None
+        self.gained = False
+        """A point was read that the attempts before had not; of paths only the store can say."""
+        self.way: Way | None = None
+        """How far the path that is recorded came."""
+        self._onward: Onward | None = None
+        self.records: list[dict[str, Any]] = []
+        """Laser records since the zero: what a continued run can begin with."""
 
-    async def run(self, plan: TestPlan, recorder: Recorder, tick: Tick) -> dict[str, int]:
-        """Execute a test; returns what the end document needs, in controller time.
+    async def run(self, plan: TestPlan, recorder: Recorder, tick: Tick, attempt: Attempt | None = None) -> dict[str, int]:
+        """Execute a test, or what is left of it; returns what the end document needs, in controller time.
 
         ``mounted_us``: when a cup or a laser was mounted, if this test mounts one; ``path_start_us``, ``path_end_us``: of a ball-bar run.
 
         Raises
         ------
-        UnsafeToMove, MeasurementFault, DriverError
+        Interlock, Stopped, Aborted, RunInterrupted, SetupDisturbed, MeasurementFault, DriverError
             The axes are stopped before the error leaves.
         """
+        attempt = attempt or Attempt()
+        self._onward = attempt.onward
         result: dict[str, int] = {}
-        here: Point | None = None
         done, clock = 0.0, asyncio.get_running_loop().time
-        async with motion_guard(self._s.controller):
+        # The guard stands outside: what it has to say of a stop that did not get through must not be lost with the watcher's own errors.
+        check_ours(await self._s.controller.status())  # before the guard: its stop would end somebody else's program
+        self._stands = not plan.mounts
+        async with motion_guard(self._s.controller, self._spared), watched(self._s, self._control, self._watching) as watch:
             check_interlocks(await self._s.controller.status())
-            for step in plan.steps:
+            here = await self._gone_back(attempt, recorder, watch)
+            for k, step in enumerate(plan.steps):
                 if isinstance(step, MoveTo) and here == step.target_mm:
                     continue
+                self._control.place(k + 1, len(plan.steps), self._points)
+                await self._safe_place(step, watch)
+                await self._nobody_inside(step, watch)
                 seconds, after = step_seconds(step, here)
                 began = clock()
-                result |= await self._step(step, here, recorder)
+                if isinstance(step, BY_HAND):
+                    result |= await self._by_hand(step, k, attempt, watch)
+                    self._waited_s += clock() - began
+                else:
+                    result |= await self._step(step, here, recorder)
+                await self._reached(step, k, attempt, recorder, watch)
                 done, here = done + seconds, after
-                tick(done, clock() - began if isinstance(step, BY_HAND) else 0.0)
+                waited, self._waited_s = self._waited_s, 0.0
+                tick(done, waited)
         return result
+
+    # ---- checkpoints ----------------------------------------------------------------------------------------------
+
+    async def _safe_place(self, step: Step, watch: Watch) -> None:
+        """Before a motion or a person's work: here it may wait or end. A point in hand is read first."""
+        if isinstance(step, ReadLaser | ReadBar | ZeroLaser):
+            return
+        self._control.check()
+        if self._control.pausing:
+            await self._paused(watch)
+
+    async def _paused(self, watch: Watch) -> None:
+        where = (await self._s.controller.status()).position_mm
+        watch.tolerated, self._still = PAUSED, True
+        touched = await paused(self._s, self._control, self._watching, self._expected, self.journal, beam=watch.beam)
+        watch.tolerated, self._still = NOTHING, False
+        if touched and self._stands:
+            self.touched = True
+            raise RunInterrupted("the door was open during the pause", "what is mounted is looked at again before the test goes on")
+        status = await self._s.controller.status()
+        if math.dist(status.position_mm, where) > SAME_PLACE_MM:
+            raise RunInterrupted("the axes were moved during the pause", "the test goes on from its last checkpoint")
+
+    async def _spared(self) -> bool:
+        """Whether nothing of ours can move, and somebody else works with the machine: a stop would end his program."""
+        if not self._still:
+            return False
+        status = await self._s.controller.status()
+        return bool(status.bits >> PROGRAM & 1 or not status.bits >> REMOTE & 1)
+
+    async def _nobody_inside(self, step: Step, watch: Watch) -> None:
+        """After somebody has worked inside, the first motion waits for nobody: the door is closed, or the test ends here."""
+        if watch.tolerated and not isinstance(step, BY_HAND):
+            check_interlocks(await self._s.controller.status())
+            watch.tolerated = NOTHING
+
+    async def _reached(self, step: Step, k: int, attempt: Attempt, recorder: Recorder, watch: Watch) -> None:
+        if isinstance(step, Unmount):
+            watch.beam = False
+        if isinstance(step, ReadLaser):
+            watch.beam = True
+        if isinstance(step, ReadLaser | ReadBar):
+            self._points, self.gained = self._points + 1, True
+            if attempt.run_id:
+                await self.journal.add(POINT, test=attempt.test, run=attempt.run_id, step=attempt.offset + k, points=self._points)
+
+    async def _by_hand(self, step: Step, k: int, attempt: Attempt, watch: Watch) -> dict[str, int]:
+        """Something that a person does: the door may be open meanwhile, and nothing moves until it is closed."""
+        line = {"test": attempt.test, "setup": attempt.setup, "mounting": attempt.mounting, "step": attempt.offset + k}
+        line |= {"what": type(step).__name__}
+        watch.beam = False
+        watch.tolerated = AT_WORK
+        self.asked, self.records = attempt.offset + k, []
+        await self.journal.add(HAND, phase="asked", **line)
+        self._still = True
+        await self._control.unless_stopped(self._done_by_hand(step))
+        self._still, self._stands = False, not isinstance(step, Unmount)
+        status = await self._s.controller.status()  # whoever mounts takes minutes: the clock is asked when it is done
+        await self.journal.add(HAND, phase="done", ctrl_us=status.ctrl_us, **line)
+        self.hand, self.asked = attempt.offset + k, None
+        if not isinstance(step, MountBar | MountLaser):
+            return {}
+        self.mounted_us = status.ctrl_us
+        return {"mounted_us": status.ctrl_us}
+
+    # ---- going on after a break ------------------------------------------------------------------------------------
+
+    async def _gone_back(self, attempt: Attempt, recorder: Recorder, watch: Watch) -> Point | None:
+        """Back to the last checkpoint, along the way that the test came; gives where the machine stands then, None if it did not move."""
+        rewind = attempt.rewind
+        if not rewind.trail:
+            return None
+        status = await self._s.controller.status()
+        watch.beam = bool(rewind.carried)
+        points = way_back(rewind, status.position_mm)
+        if len(points) <= BY_MOVES:
+            for point in points:
+                await self._safe_place(MoveTo(point, rewind.feed_mm_min), watch)
+                await self._move(point, rewind.feed_mm_min, None)
+        else:
+            await follow_path(self._s.controller, FollowPath(points, rewind.feed_mm_min), self._control)
+        for point in rewind.trail[rewind.to + 1 : rewind.upto + 1]:
+            await self._safe_place(MoveTo(point, rewind.feed_mm_min), watch)
+            await self._move(point, rewind.feed_mm_min, None)
+        if rewind.carried:
+            await self._same_as(rewind.carried[-1], recorder, rewind.carried)
+        return rewind.trail[rewind.upto]
+
+    async def _same_as(self, last: dict[str, Any], recorder: Recorder, carried: tuple[dict[str, Any], ...]) -> None:
+        """Read the last complete point again: only if it says the same, nothing was knocked and no count was lost."""
+        status = await self._settled(0.3)
+        record = await self._laser_record(status, tuple(last["target_mm"]), int(last["direction"]))
+        off_mm = abs(record["displacement_tenth_nm"] - last["displacement_tenth_nm"]) * MM_PER_COUNT
+        if off_mm > REFERENCE_MM:
+            raise SetupDisturbed(
+                f"the last point reads {1e3 * off_mm:.1f} um otherwise than before the break (allowed: {1e3 * REFERENCE_MM:.0f})",
+                "laser or mirror was knocked: it is mounted anew",
+            )
+        for one in carried:
+            await self._kept(one, recorder)
+        self._points = len(carried)
+
+    # ---- single steps -----------------------------------------------------------------------------------------------
+
+    def _done_by_hand(self, step: Step) -> Awaitable[None]:
+        fixture = self._s.need_fixture()
+        match step:
+            case MountBar(radius):
+                return fixture.mount_ballbar(radius)
+            case TakeBarOut():
+                return fixture.take_out_ballbar()
+            case ChangeBar(radius):
+                return fixture.change_ballbar(radius)
+            case MountLaser(beam):
+                return fixture.mount_laser(beam)
+        return fixture.unmount()
 
     async def _step(self, step: Step, here: Point | None, recorder: Recorder) -> dict[str, int]:
         match step:
             case MoveTo(target, feed):
                 await self._move(target, feed, here)
-            case MountBar(radius):
-                await self._s.need_fixture().mount_ballbar(radius)
-                return await self._mounted()
-            case TakeBarOut():
-                await self._s.need_fixture().take_out_ballbar()
-            case ChangeBar(radius):
-                await self._s.need_fixture().change_ballbar(radius)
-            case MountLaser(beam):
-                await self._s.need_fixture().mount_laser(beam)
-                return await self._mounted()
-            case Unmount():
-                await self._s.need_fixture().unmount()
             case ZeroLaser():
-                laser = self._s.need_laser()
-                await laser.clear_beam()
-                await laser.set_environment_compensation(True)  # without it every length is 270 ppm too long
-                await laser.zero()
+                self.records = []
+                await self._zeroed()
             case ReadLaser(direction, settle_s):
-                await self._read_laser(direction, settle_s, recorder, here)
+                status = await self._settled(settle_s)
+                await self._kept(await self._laser_record(status, here, direction), recorder)
+            case ReadBar():
+                settled = await self._settled(step.settle_s)
+                await recorder.add_record(await read_bar(self._s.need_ballbar(), step, settled, here))
+            case FollowPath():
+                await self._stands_at(step.points_mm[0])
+                await follow_path(self._s.controller, step, self._control)
             case RecordPath():
-                return await self._record_path(step, recorder)
+                return await self._recorded(step, recorder)
         return {}
 
-    async def _mounted(self) -> dict[str, int]:
-        """Whoever mounts takes minutes: the clock is asked when it is done, not when the test began."""
-        return {"mounted_us": (await self._s.controller.status()).ctrl_us}
+    async def _stands_at(self, start_mm: Point) -> None:
+        """A path is driven from where it begins: from elsewhere the way to its second point may lead through the sphere."""
+        off_mm = math.dist((await self._s.controller.status()).position_mm, start_mm)
+        if off_mm > OFF_PATH_MM:
+            raise MeasurementFault(
+                f"the machine stands {off_mm:.3f} mm beside where the path begins", "look at the machine, then begin again"
+            )
+
+    async def _recorded(self, step: RecordPath, recorder: Recorder) -> dict[str, int]:
+        await self._stands_at(step.points_mm[0])
+        self.way = Way(step)
+        return await record_path(self._s, step, recorder, self._control, self.way, self._onward)
+
+    async def _zeroed(self) -> None:
+        laser = self._s.need_laser()
+        try:
+            await laser.clear_beam()
+            await laser.set_environment_compensation(True)  # without it every length is 270 ppm too long
+            await laser.zero()
+        except Refused as error:
+            raise BeamLost(f"the laser takes no zero: {error.detail}", "free the beam; the test begins again") from error
+
+    async def _kept(self, record: dict[str, Any], recorder: Recorder) -> None:
+        await recorder.add_record(record)
+        self.records.append(record)
 
     async def _move(self, target: Point, feed_mm_min: float, here: Point | None) -> None:
         seconds = 60.0 if here is None else math.dist(here, target) / feed_mm_min * 60.0
         status = await self._s.controller.move(target, feed_mm_min=feed_mm_min, timeout_s=30.0 + 3.0 * seconds)
         check_interlocks(status)
 
-    async def _read_laser(self, direction: int, settle_s: float, recorder: Recorder, here: Point | None) -> None:
+    async def _settled(self, settle_s: float) -> ControllerStatus:
         status = await self._s.controller.status()
         while status.ctrl_us < status.in_position_us + settle_s * 1e6:
             await asyncio.sleep(0.001)
             status = await self._s.controller.status()
         check_interlocks(status)
+        return status
+
+    async def _laser_record(self, status: ControllerStatus, here: Point | None, direction: int) -> dict[str, Any]:
         laser = self._s.need_laser()
         before = await laser.read()
         reading = await laser.read(after_count=before.sample_count)  # a sample that began after the axes had settled
         if not reading.status >> COMPENSATED & 1:
             raise MeasurementFault("the laser's environmental compensation was switched off during the run", "start the test again")
-        await recorder.add_record(
-            {
-                "host_s": reading.host_s,
-                "ctrl_us": status.ctrl_us,
-                "target_mm": list(here if here is not None else status.position_mm),
-                "direction": direction,
-                "displacement_tenth_nm": reading.displacement_tenth_nm,
-                "status": reading.status,
-                "signal_permille": reading.signal_permille,
-                "air_temp_c": reading.air_temp_c,
-                "air_pressure_pa": reading.air_pressure_pa,
-                "feed_mm_min": 0.0,
-            }
-        )
-
-    async def _record_path(self, step: RecordPath, recorder: Recorder) -> dict[str, int]:
-        controller = self._s.controller
-        await controller.load_path(step.points_mm)
-        finished = asyncio.Event()
-        # The guard stands inside the stream: closing the stream of a mute box takes seconds, and the axes must not run on so long.
-        async with self._s.need_ballbar().stream(step.rate_hz) as batches, motion_guard(controller):
-            try:
-                async with asyncio.TaskGroup() as group:
-                    group.create_task(_pump(batches, recorder, finished))
-                    await controller.start_path(feed_mm_min=step.feed_mm_min)
-                    status = await _watch(controller)
-                    finished.set()
-            except BaseExceptionGroup as errors:
-                raise _first(errors) from None  # one cause for one person; the others follow from it
-        return {"path_start_us": status.path_start_us, "path_end_us": status.path_end_us}
-
-
-def _first(error: BaseException) -> BaseException:
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    return error
-
-
-async def _watch(controller: Controller) -> ControllerStatus:
-    """Poll until the path has ended; an interlock, a feed hold or a stall ends the run."""
-    loop = asyncio.get_running_loop()
-    points, since = -1, loop.time()
-    while True:
-        status = await controller.status()
-        check_interlocks(status)
-        if status.bits >> HOLD & 1:
-            raise MeasurementFault(
-                "feed hold was pressed while the ball-bar recorded", "start the test again: readings must be at constant feed"
-            )
-        if not status.bits >> PATH & 1 and status.path_end_us > status.path_start_us:
-            return status
-        if status.path_points_done != points:
-            points, since = status.path_points_done, loop.time()
-        elif loop.time() - since > STALL_S:
-            raise MeasurementFault(f"the path has not advanced for {STALL_S:g} s", "look at the machine: is the feed override at zero?")
-        await asyncio.sleep(POLL_S)
-
-
-async def _pump(batches: AsyncIterator[BarBatch], recorder: Recorder, finished: asyncio.Event) -> None:
-    """Record until the path has ended and one sample without the sync level has been seen."""
-    bad = 0
-    async for batch in batches:
-        await recorder.add_bar(batch)
-        for sample in batch.samples:
-            on_path = bool(sample.status & SYNC)
-            bad = bad + 1 if on_path and sample.status & BAD_BITS else 0
-            if bad >= BAD_IN_A_ROW:
-                raise MeasurementFault(
-                    f"the ball-bar is out of range or not mounted (status {sample.status:#06x})",
-                    "check centre, radius and that the bar sits in both cups, then start the test again",
-                )
-        if finished.is_set() and batch.samples and not batch.samples[-1].status & SYNC:
-            return
+        return {
+            "host_s": reading.host_s,
+            "ctrl_us": status.ctrl_us,
+            "target_mm": list(here if here is not None else status.position_mm),
+            "direction": direction,
+            "displacement_tenth_nm": reading.displacement_tenth_nm,
+            "status": reading.status,
+            "signal_permille": reading.signal_permille,
+            "air_temp_c": reading.air_temp_c,
+            "air_pressure_pa": reading.air_pressure_pa,
+            "feed_mm_min": 0.0,
+        }

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import groupby, pairwise
 
+import numpy as np
+
 from service.errors import ConfigError
-from service.sequences.recipes import Diagonal, Helix, Recipe
+from service.sequences.approach import LOW_SHARE, Cup, pole_of
+from service.sequences.recipes import BarRecipe, Diagonal, FaceDiagonal, Linear, Recipe
 
 
 def shared_setups(recipes: tuple[Recipe, ...], source: str) -> tuple[Recipe, ...]:
@@ -40,17 +43,17 @@ def shared_setups(recipes: tuple[Recipe, ...], source: str) -> tuple[Recipe, ...
 
 
 def _check_shared(before: Recipe, after: Recipe, source: str) -> None:
-    trouble = ""
-    if isinstance(before, Helix) and isinstance(after, Helix):
-        if before.centre_mm != after.centre_mm or (before.axis, before.opens) != (after.axis, after.opens):
-            trouble = "another centre or axis needs another cup"
-        elif before.radius_mm == after.radius_mm and before.direction == after.direction:
-            trouble = "with the same bar the second helix must run back (direction): the bar cannot follow a move through its sphere"
+    if isinstance(before, BarRecipe) and isinstance(after, BarRecipe):
+        trouble = _on_one_cup(before, after)
     elif isinstance(before, Diagonal) and isinstance(after, Diagonal):
-        if before.diagonal != after.diagonal:
-            trouble = "another diagonal needs another alignment"
+        trouble = "" if before.diagonal == after.diagonal else "another diagonal needs another alignment"
+    elif isinstance(before, FaceDiagonal) and isinstance(after, FaceDiagonal):
+        same = (before.plane, before.diagonal, before.at) == (after.plane, after.diagonal, after.at)
+        trouble = "" if same else "another diagonal needs another alignment"
+    elif isinstance(before, Linear) and isinstance(after, Linear):
+        trouble = "" if (before.axis, before.at) == (after.axis, after.at) else "another line needs another alignment"
     else:
-        trouble = "only helices about one cup and step orders on one diagonal share a set-up"
+        trouble = "only ball-bar tests about one cup and laser tests on one line share a set-up"
     if trouble:
         raise ConfigError(
             f"{source}: tests {before.label!r} and {after.label!r} cannot share set-up {after.setup_id!r}: {trouble}",
@@ -58,9 +61,21 @@ def _check_shared(before: Recipe, after: Recipe, source: str) -> None:
         )
 
 
+def _on_one_cup(before: BarRecipe, after: BarRecipe) -> str:
+    if before.centre_mm != after.centre_mm or (before.axis, before.opens) != (after.axis, after.opens):
+        return "another centre or axis needs another cup"
+    if before.radius_mm == after.radius_mm:
+        return ""
+    ends = ((before, before.path()[0][-1]), (after, after.path()[0][0]))
+    if min(Cup(np.array(r.centre_mm), r.radius_mm, pole_of(r)[1]).lowest([p]) for r, p in ends) < -LOW_SHARE:
+        return "the bar is changed below the cup: from there the machine would move through it"
+    return ""
+
+
 def _mounting(group: list[Recipe], k: int) -> Recipe:
     recipe, before = group[k], group[k - 1] if k else None
     shared = replace(recipe, mount=before is None, unmount=k == len(group) - 1)
-    if isinstance(shared, Helix) and isinstance(before, Helix):
-        return replace(shared, change_bar=shared.radius_mm != before.radius_mm)
+    if isinstance(shared, BarRecipe) and isinstance(before, BarRecipe):
+        other = shared.radius_mm != before.radius_mm
+        return replace(shared, change_bar=other, link_mm=before.path()[0][-1])
     return shared

@@ -64,15 +64,37 @@ class ReadLaser:
 
 @dataclass(frozen=True, slots=True)
 class RecordPath:
-    """Run a polyline at constant feed while the ball-bar streams. The machine stands at its first point."""
+    """Run a polyline at constant feed while the ball-bar streams. The machine stands at its first point.
+
+    ``measured``: first and last point of what counts; before and after it are feed-in and feed-out. None: all of it.
+    """
 
     points_mm: tuple[Point, ...]
     feed_mm_min: float
     rate_hz: int
     direction: int
+    measured: tuple[int, int] | None = None
 
 
-Step = MoveTo | MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath
+@dataclass(frozen=True, slots=True)
+class FollowPath:
+    """Run a polyline with the bar hung in and nothing recorded: on the sphere to where the next path begins."""
+
+    points_mm: tuple[Point, ...]
+    feed_mm_min: float
+
+
+@dataclass(frozen=True, slots=True)
+class ReadBar:
+    """Wait ``settle_s`` of controller time after the move, then record the mean of ``samples`` ball-bar samples taken at standstill."""
+
+    direction: int
+    settle_s: float = 0.3
+    samples: int = 20
+    rate_hz: int = 1000
+
+
+Step = MoveTo | MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath | FollowPath | ReadBar
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,9 @@ Doc = dict[str, Any]
 
 RUNNING = "running"
 INCOMPLETE = "incomplete"
-FINISHED = ("complete", "aborted", "failed")
+INTERRUPTED = "interrupted"
+DISK_FULL = "disk_full"
+FINISHED = ("complete", "stopped", "aborted", "failed", INTERRUPTED, DISK_FULL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,58 @@ class ChunkRecord:
     last_host_s: float
     first_device_us: int
     last_device_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointRecord:
+    """One line of a campaign's journal. Never changed after writing; ``seq`` counts from 0."""
+
+    id: int
+    campaign_id: int
+    seq: int
+    kind: str
+    doc: Doc
+    utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class PushEntryRecord:
+    """One transition of a push, chained by ``prev`` to the entry before it of the same machine. Never changed after writing."""
+
+    id: int
+    machine: str
+    push: int
+    seq: int
+    state: str
+    doc: Doc
+    utc: str
+    prev: str
+    digest: str
+
+
+@dataclass(frozen=True, slots=True)
+class ProposalRecord:
+    """Tables that somebody proposed, with everything they were made from. Never changed; ``digest``: SHA-256 of ``doc``."""
+
+    id: int
+    machine: str
+    solution_id: int
+    doc: Doc
+    digest: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class ApprovalRecord:
+    """Somebody's yes to a proposal until ``expiry`` (UTC). ``name``: as given; ``login``: of the account; ``digest``: what it binds."""
+
+    id: int
+    proposal_id: int
+    name: str
+    login: str
+    digest: str
+    expiry: str
+    utc: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +224,19 @@ class NewVersion:
     machine: str
     after: int | None
     doc: Doc
+
+
+@dataclass(frozen=True, slots=True)
+class SlotRecord:
+    """One slot of a schedule and what became of it. ``reason``: the sentence to ``state``; ``finished_utc``: None while it is open."""
+
+    id: int
+    schedule: str
+    slot_utc: str
+    state: str
+    reason: str
+    claimed_utc: str
+    finished_utc: str | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,23 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 
 from service.storage.records import Doc, ImportedRun
+from service.storage.store_audit import AuditStore
 from service.storage.store_campaigns import insert_campaign, machine_id_of
+from service.storage.store_checkpoints import CheckpointStore
 from service.storage.store_discoveries import DiscoveryStore
+from service.storage.store_people import PeopleStore
+from service.storage.store_proposals import ProposalStore
+from service.storage.store_push import PushStore
 from service.storage.store_queues import QueueStore
 from service.storage.store_results import ResultStore
 from service.storage.store_runs import RunStore, insert_imported
+from service.storage.store_slots import SlotStore
+from service.storage.tables import identity
 
 
-class Store(RunStore, ResultStore, DiscoveryStore, QueueStore):
+class Store(
+    RunStore, CheckpointStore, ResultStore, DiscoveryStore, ProposalStore, PushStore, QueueStore, SlotStore, PeopleStore, AuditStore
+):
     """A database of machines, campaigns, runs, results, model books and queues.
 
     Any thread may call; writes happen one after the other in one thread.
 
     Open it with ``Store.open(url)``; in coroutines use ``await store.write(store.method, ...)``.
     """
+
+    def database_id(self) -> str:
+        """What the database calls itself since its tables were made, whatever address it is reached by; 32 hex digits."""
+        return str(self._read(lambda connection: connection.execute(select(identity.c.uid)).scalar_one()))
 
     def import_campaign(self, machine: tuple[str, Doc], campaign: tuple[str, Doc], imported: Sequence[ImportedRun]) -> int:
         """Store a campaign that was measured elsewhere: everything, or after an error nothing.

@@ -1,70 +1,17 @@
-"""Store methods for what must happen exactly once or at last: schedule slots and the outbox."""
+"""Store methods for what must happen at last: the outbox."""
 
 from __future__ import annotations
 
-from datetime import datetime
+from sqlalchemy import insert, select, update
 
-from sqlalchemy import Connection, insert, select, update
-from sqlalchemy.dialects.postgresql import insert as pg_insert
-from sqlalchemy.dialects.sqlite import insert as sqlite_insert
-
-from service.errors import StoreError
-from service.storage.base import StoreBase, utc_text
+from service.storage.base import StoreBase
 from service.storage.records import OutboxRecord
 from service.storage.store_campaigns import new_id
-from service.storage.tables import outbox, slots
-
-CLAIMED = "claimed"
+from service.storage.tables import outbox
 
 
 class QueueStore(StoreBase):
-    """Slots of schedules (each is run by one process only) and messages for the broker (none is forgotten)."""
-
-    def claim_slot(self, schedule: str, slot_utc: datetime | str) -> bool:
-        """Take a slot of a schedule.
-
-        Parameters
-        ----------
-        schedule : str
-            Its name.
-        slot_utc : datetime or str
-            When it is due; text is ISO 8601 with time zone.
-
-        Returns
-        -------
-        bool
-            False if somebody has it.
-        """
-        values = {"schedule": schedule, "slot_utc": _slot(slot_utc), "state": CLAIMED, "claimed_utc": self._now()}
-
-        def work(connection: Connection) -> bool:
-            fresh = pg_insert(slots) if connection.dialect.name == "postgresql" else sqlite_insert(slots)
-            return connection.execute(fresh.values(values).on_conflict_do_nothing().returning(slots.c.id)).first() is not None
-
-        return self._write(work)
-
-    def finish_slot(self, schedule: str, slot_utc: datetime | str, state: str) -> None:
-        """Write how a claimed slot ended.
-
-        Parameters
-        ----------
-        schedule : str
-            Its name.
-        slot_utc : datetime or str
-            As it was claimed.
-        state : str
-            E.g. ``"done"``.
-
-        Raises
-        ------
-        StoreError
-            If nobody claimed it.
-        """
-        key = _slot(slot_utc)
-        statement = update(slots).where(slots.c.schedule == schedule, slots.c.slot_utc == key)
-        done = self._write(lambda connection: connection.execute(statement.values(state=state, finished_utc=self._now())).rowcount)
-        if done != 1:
-            raise StoreError(f"slot {key} of schedule {schedule!r} was not claimed")
+    """Messages for the broker: none is forgotten."""
 
     def outbox_add(self, topic: str, payload: bytes | str) -> int:
         """Put a message into the outbox; it stays until it is sent.
@@ -111,12 +58,3 @@ class QueueStore(StoreBase):
         """
         statement = update(outbox).where(outbox.c.id == message_id, outbox.c.sent_utc.is_(None)).values(sent_utc=self._now())
         self._write(lambda connection: connection.execute(statement).rowcount)
-
-
-def _slot(moment: datetime | str) -> str:
-    if isinstance(moment, datetime):
-        return utc_text(moment)
-    try:
-        return utc_text(datetime.fromisoformat(moment))
-    except ValueError:
-        raise StoreError(f"slot time {moment!r} is not ISO 8601", "write e.g. 2026-11-21T03:00:00Z") from None

@@ -10,11 +10,12 @@ from sqlalchemy.exc import IntegrityError
 from service.errors import StoreError
 from service.storage.owner import Owner, this_process
 from service.storage.records import FINISHED, RUNNING, ChunkRecord, Doc, ImportedRun, RunRecord
-from service.storage.store_campaigns import CampaignStore, new_id
+from service.storage.store_campaigns import new_id
+from service.storage.store_chunks import ChunkStore
 from service.storage.tables import campaigns, chunks, runs
 
 
-class RunStore(CampaignStore):
+class RunStore(ChunkStore):
     """Runs and their samples."""
 
     def start_run(self, campaign_id: int, label: str, test: str, role: str, doc: Doc) -> int:
@@ -52,7 +53,7 @@ class RunStore(CampaignStore):
         run_id : int
             Run.
         status : str
-            ``"complete"``, ``"aborted"`` or ``"failed"``.
+            One of ``service.storage.records.FINISHED``.
         reason : str
             Why, in words; empty for a complete run.
         doc : dict or None

@@ -158,6 +158,65 @@ machine_models = Table(
     UniqueConstraint("machine", "version"),
 )
 
+checkpoints = Table(
+    "checkpoints",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("campaign_id", ForeignKey("campaigns.id"), nullable=False),
+    Column("seq", Integer, nullable=False),
+    Column("kind", String(30), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("utc", String(32), nullable=False),
+    UniqueConstraint("campaign_id", "seq"),
+)
+
+identity = Table(
+    "identity",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("uid", String(32), nullable=False),
+)
+
+push_entries = Table(
+    "push_entries",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine", String(200), nullable=False),
+    Column("push", Integer, nullable=False),
+    Column("seq", Integer, nullable=False),
+    Column("state", String(30), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("utc", String(32), nullable=False),
+    Column("prev", String(64), nullable=False),
+    Column("digest", String(64), nullable=False),
+    UniqueConstraint("machine", "prev"),
+)
+
+proposals = Table(
+    "proposals",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine", String(200), nullable=False),
+    Column("solution_id", ForeignKey("solutions.id"), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("digest", String(64), nullable=False),
+    Column("created_utc", String(32), nullable=False),
+    Index(None, "machine"),
+)
+
+approvals = Table(
+    "approvals",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("proposal_id", ForeignKey("proposals.id"), nullable=False),
+    Column("name", String(200), nullable=False),
+    Column("login", String(200), nullable=False),
+    Column("digest", String(64), nullable=False),
+    Column("expiry", String(40), nullable=False),
+    Column("utc", String(32), nullable=False),
+    Index(None, "proposal_id"),
+)
+
 slots = Table(
     "slots",
     metadata,
@@ -167,6 +226,10 @@ slots = Table(
     Column("state", String(30), nullable=False),
     Column("claimed_utc", String(32), nullable=False),
     Column("finished_utc", String(32)),
+    Column("reason", Text),
+    Column("owner_host", String(255)),
+    Column("owner_pid", Integer),
+    Column("owner_start", String(80)),
     UniqueConstraint("schedule", "slot_utc"),
 )
 

@@ -1,1 +1,1 @@
-"""The status page and its JSON. It shows; it starts nothing, moves nothing and changes nothing."""
+"""The status page, its JSON and the way in. It shows; it moves nothing, and what changes something is guarded and recorded."""

@@ -11,6 +11,7 @@ from typing import Any
 from models.machine import Machine
 from service.clock import Clock, SystemClock
 from service.config_schema import MachineFile
+from service.devices.alone import alone
 from service.devices.session import open_session
 from service.errors import ConfigError
 from service.events import ProgressSink
@@ -68,9 +69,10 @@ async def run_check(config: MachineFile, store: Store, recipe: str, progress: Pr
     site = site_of(config)
     plan = recipe_plan(recipe, site.machine)
     plan = CampaignPlan(f"{plan.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
-    async with open_session(site.urls) as session:
-        await recover(session.controller, store, site)
-        run_ids = await measure(session, store, site, plan, progress=progress, clock=clock)
+    with alone(site.urls.cnc):
+        async with open_session(site.urls) as session:
+            await recover(session.controller, store, site)
+            run_ids = await measure(session, store, site, plan, progress=progress, clock=clock)
     runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
     rows = figure_rows(figures(runs))
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}

@@ -1,34 +1,55 @@
-"""From an identification campaign to a verified table: solve, push, measure again, keep or go back.
+"""From an identification campaign, or a stored proposal, to a verified table: push, prove the sign, measure again, keep or go back.
 
-A machine that is measured while a table is active shows what that table has left. So the table that was active is read from the controller,
-must be the one all runs were measured with, and the new table is the old one plus what the runs still show.
+`correct` is `proposals.make` and `push` in one go; both take the same way through the push machine, with the same questions.
 """
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from drivers.links.shielded import run_to_end
-from models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
+import numpy as np
+
+from models.compensation.sign_probe import expected_changes, probe
+from models.compensation.tables import NineTables, Predicted
+from service.clock import Clock, SystemClock
 from service.devices.session import Session
-from service.errors import TableMismatch, TableRefused
+from service.errors import TableRefused, TakenBack
 from service.events import Progress, ProgressSink
-from service.runs.columns import load_run
+from service.push.operations import Verdict
 from service.sequences.campaigns import verification
+from service.sequences.check import paced
+from service.sequences.interlocks import Suspending
 from service.site import Site
 from service.storage.store import Store
-from service.workflows.compensate import Base, Pushed, Pusher, read_base
+from service.workflows.bar_places import BarPlaces, Readings
+from service.workflows.commission import check_commissioned
 from service.workflows.measure import measure
+from service.workflows.proposal_checks import Held, hold
+from service.workflows.proposal_doc import load
+from service.workflows.proposals import (
+    Made,
+    by_whom,
+    check_before_runs,
+    check_same_table,
+    check_temperature,
+    gather,
+    load_runs,
+    make,
+    solved_again,
+)
+from service.workflows.proved_levels import check_level
+from service.workflows.pushing import Pushed, Pushing, Questions, Wanted
 from service.workflows.recover import recover
-from service.workflows.solve import Solved, helix_misfit, solve_runs
-from service.workflows.solve_report import solution_doc
-from service.workflows.tables import added
-from service.workflows.taken_out import stored_without
-from service.workflows.verify import Decision, Figures, decide, figure_rows, figures
+from service.workflows.solve import Solved, helix_misfit
+from service.workflows.tables import check_limits
+from service.workflows.verify import Decision, Figures, check_before, decide, figure_rows, figures
 
-GRID = (25, 21, 19)
+UNSEEN = "DRIFT: no ball-bar run that the solution has not seen shows whether the machine still is what was measured"
+VERIFY, SIGN = "verify-after-push-", "sign-check"
+PLACES = 12
+"""Of the ball-bar, before and after a new table comes into force."""
 MIN_GAIN = 0.1
 """A table is pushed only if the identified model promises at least this relative improvement (reliability.md 3.3)."""
 
@@ -37,7 +58,8 @@ MIN_GAIN = 0.1
 class Correction:
     """What was solved, pushed and found. ``bank`` and ``image`` are what the controller holds active at the end.
 
-    ``not_for_tables``: effects that the machine's model knows and that no table takes out, each with its remedy.
+    ``not_for_tables``: effects that the machine's model knows and that no table takes out, each with its remedy. ``proposal``: its number
+    in the store.
     """
 
     solved: Solved
@@ -52,6 +74,7 @@ class Correction:
     bank: int
     image: bytes
     not_for_tables: tuple[str, ...] = ()
+    proposal: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +86,7 @@ class _Bench:
     site: Site
     rate_hz: int
     progress: ProgressSink
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """Tables that a campaign proposes, absolute and quantised, and what they promise."""
-
-    solved: Solved
-    tables: NineTables
-    predicted: Predicted
+    clock: Clock
 
 
 async def correct(
@@ -103,74 +118,76 @@ async def correct(
         An unverified table could not be taken back yet.
     """
     await recover(session.controller, store, site)
-    record = await asyncio.to_thread(store.campaign, campaign)
-    run_ids = [r.id for r in await asyncio.to_thread(store.runs, record.id) if r.visible_status == "complete"]
-    runs = await load_runs(store, run_ids)
-    base = await read_base(session.controller)
-    check_same_table(base, [*(r for r in runs if r["role"] == "identify"), *before])
-    check_temperature(site, runs)
-    old = figures(before)  # before anything is written: runs that are no verification are refused now
-    lsb_nm = (await session.controller.table_format()).lsb_nm
-    progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
-    known = await asyncio.to_thread(stored_without, store, record.name)
-    proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, lsb_nm)
-    doc = solution_doc(proposal.solved) | known.doc
-    solution_id = await store.write(store.add_solution, record.id, "joint", run_ids, doc)
-    bench = _Bench(session, store, site, rate_hz, progress)
-    pushed, after, decision = await _push_and_verify(bench, proposal, base, solution_id, old)
-    bank = pushed.bank if decision.keep else pushed.previous_bank
-    helix = next((r for r in before if r["test"] == "ballbar_helix"), None)
-    misfit = helix_misfit(proposal.solved, helix) * 1e3 if helix is not None else None
-    image = await session.controller.read_bank(bank)
-    return Correction(
-        proposal.solved, proposal.tables, lsb_nm, proposal.predicted, misfit, old, after, pushed, decision, bank, image, known.lines
-    )
+    await check_level(session.controller, store, site)
+    await check_commissioned(session.controller, store, site)
+    gathered = await gather(session.controller, store, site, campaign)
+    check_same_table(gathered.base, before)
+    check_temperature(site, gathered.runs)
+    figures(before)  # before anything is written: runs that are no verification are refused now
+    made = await make(store, site, gathered, progress=progress)
+    check_promise(made.proposed.predicted)
+    check_limits(made.proposed.tables, gathered.base.tables, site.limits)  # says where, and which key of the machine file to look at
+    return await _push(_Bench(session, store, site, rate_hz, progress, SystemClock()), made, before)
 
 
-def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
-    """Every run must have been measured with the table that is active now.
+async def push(  # noqa: PLR0913 - one argument for each thing it needs
+    session: Session,
+    store: Store,
+    site: Site,
+    number: int,
+    before: list[dict[str, Any]],
+    *,
+    rate_hz: int = 100,
+    progress: ProgressSink,
+    clock: Clock | None = None,
+) -> Correction:
+    """Push a stored proposal: everything that was checked when it was made is checked again, then as `correct`.
 
-    Raises
-    ------
-    TableMismatch
-        Which run was not, or does not say so.
-    """
-    for run in runs:
-        seen = run.get("table", {}).get("crc")
-        if seen != base.crc:
-            with_what = "does not say with which table it was measured" if seen is None else f"was measured with table {seen:08X}"
-            raise TableMismatch(f"run {run['run_id']} {with_what}; active is {base.crc:08X}", "measure again with the present table")
-
-
-def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:
-    """Tables hold at the temperature they were measured at: outside of the allowed window none is pushed.
+    Parameters
+    ----------
+    number : int
+        Of the proposal.
+    before : list of dict
+        Verification runs measured with the present table, as ``abbe-run/1``.
 
     Raises
     ------
-    TableRefused
-        Which run, which temperature.
+    StoreError
+        There is no such proposal, or its row was changed.
+    TableRefused, TableMismatch, StillActive
+        As of `correct`.
     """
-    low, high = site.temperature_c
-    for run in runs:
-        for t in run["columns"].get("temp_air_C", []):
-            if not low <= t <= high:
-                raise TableRefused(
-                    f"run {run['run_id']} was measured at {t:.1f} °C air, allowed are {low:g} to {high:g} °C",
-                    "measure again when the shop has settled, or change temperature_c under [limits]; nothing was written",
-                )
+    await recover(session.controller, store, site)
+    clock = clock or SystemClock()
+    proposed = await asyncio.to_thread(load, store, number)
+    against = (await hold(session.controller, store, site, number, proposed, clock)).reasons()
+    if against:
+        raise TableRefused("; ".join(against), "nothing was written")
+    progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
+    made = Made(number, proposed, await solved_again(store, site, proposed.campaign))
+    return await _push(_Bench(session, store, site, rate_hz, progress, clock), made, before)
 
 
-def propose(site: Site, runs: list[dict[str, Any]], base: Base, lsb_nm: int) -> Proposal:
-    """Absolute tables from runs that were measured while ``base`` was active.
+async def reasons_now(session: Session, store: Store, site: Site, number: int, clock: Clock | None = None) -> list[str]:
+    """What speaks against pushing a proposal now, before anything is measured for it. Nothing is written.
+
+    Raises
+    ------
+    StoreError
+        There is no such proposal, or its row was changed.
+    """
+    proposed = await asyncio.to_thread(load, store, number)
+    return (await hold(session.controller, store, site, number, proposed, clock or SystemClock())).reasons()
+
+
+def check_promise(predicted: Predicted) -> None:
+    """Refuse what is not worth writing.
 
     Raises
     ------
     TableRefused
         The model promises less than `MIN_GAIN`, or less than twice its own uncertainty.
     """
-    solved = solve_runs(site, runs)
-    change = nine_tables(solved.joint, GRID)
-    predicted = predict_residual(solved.joint, change)
     gain = predicted.before_mm - predicted.after_mm
     if gain < MIN_GAIN * predicted.before_mm or gain < 2.0 * predicted.u_model_mm:
         raise TableRefused(
@@ -178,44 +195,112 @@ def propose(site: Site, runs: list[dict[str, Any]], base: Base, lsb_nm: int) -> 
             f"(model uncertainty {predicted.u_model_mm * 1e3:.1f} µm): not enough to write",
             "the present table is as good as these runs can tell; nothing was written",
         )
-    return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), predicted)
 
 
-async def _push_and_verify(
-    bench: _Bench, proposal: Proposal, base: Base, solution_id: int, before: Figures
-) -> tuple[Pushed, Figures, Decision]:
-    """Push, measure again, keep or go back. Whatever stops the verification takes the old table back."""
-    site, store = bench.site, bench.store
-    bench.progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
-    pusher = Pusher(bench.session.controller, store, site)
-    p = proposal.predicted
-    doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3}
-    pushed = await pusher.push(proposal.tables, base=base, solution_id=solution_id, doc=doc)
-    name = f"verify-after-push-{pushed.push_id}"
-    try:
-        plan = verification(site.machine, rate_hz=bench.rate_hz, name=name)
-        ids = await measure(bench.session, store, site, plan, progress=bench.progress)
-        after = figures(await load_runs(store, ids))
-        decision = decide(before, after)
-        if decision.keep:
-            await run_to_end(pusher.keep())
-    except BaseException as error:
-        await pusher.back_out(error)  # not verified is not kept
-        raise
-    if not decision.keep:
-        await pusher.go_back(decision.text)
-    await _store_verification(store, site, name, pushed, after, decision)
-    return pushed, after, decision
+async def _push(bench: _Bench, made: Made, before: list[dict[str, Any]]) -> Correction:
+    """Hold the proposal against now, push it, verify it. Any interlock ends it: nothing waits while an unverified table is in force."""
+    session, store, proposed = bench.session, bench.store, made.proposed
+    site = replace(bench.site, watching=replace(bench.site.watching, suspending=Suspending()))
+    bench = replace(bench, site=site)
+    await check_level(session.controller, store, site)
+    held = await hold(session.controller, store, site, made.number, proposed, bench.clock)
+    against = held.reasons()
+    if against:
+        raise TableRefused("; ".join(against), "nothing was written")
+    check_same_table(held.base, before)
+    evidence = proposed.candidate.evidence
+    newest_s = evidence.ended_s if evidence.last_s is None else evidence.last_s
+    check_before_runs(site, held.base, before, newest_s, bench.clock.utc().timestamp())
+    old = figures(before)
+    check_before(old)
+    helix = next((r for r in before if r["test"] == "ballbar_helix"), None)
+    misfit_mm = helix_misfit(made.solved, helix) if helix is not None else None
+    bar = None
+    if session.ballbar is not None and session.fixture is not None:
+        number = sum(c.name.startswith(SIGN) for c in await asyncio.to_thread(store.campaigns)) + 1
+        bar = BarPlaces(session, store, site, bench.progress, f"{SIGN} {number}", PLACES)
+    p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
+    doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
+    work = _Correcting(bench, held, misfit_mm, bar, old)
+    wanted = Wanted(proposed.tables, held.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
+    pushed, after, decision = await _push_and_verify(work, wanted)
+    bank = pushed.bank if decision.keep else pushed.previous_bank
+    image = await session.controller.read_bank(bank)
+    misfit_um = None if misfit_mm is None else misfit_mm * 1e3
+    return Correction(
+        made.solved, proposed.tables, lsb_nm, p, misfit_um, old, after, pushed, decision, bank, image, proposed.not_for_tables, made.number
+    )
 
 
-async def _store_verification(store: Store, site: Site, name: str, pushed: Pushed, after: Figures, decision: Decision) -> None:
+@dataclass
+class _Correcting:
+    """Answers the push machine's questions about one proposal: are there reasons against it, goes the tool where it says, is it better?"""
+
+    bench: _Bench
+    held: Held
+    drift_mm: float | None
+    bar: BarPlaces | None
+    before: Figures
+    read_before: Readings | None = None
+    after: Figures | None = None
+    decision: Decision | None = None
+    verified_as: str = ""
+    pushing: Pushing | None = None
+
+    def reasons(self) -> list[str]:
+        """Everything against it; asked again by the machine of the push, with what the controller says of itself by then."""
+        drift = [] if self.drift_mm is not None else [UNSEEN]
+        return [*self.held.reasons(self.drift_mm), *drift]
+
+    async def probe(self) -> Verdict:
+        """Sign, axis and unit of this table, physically; the bar is taken out afterwards, for the verification mounts its own."""
+        if self.bar is None or self.read_before is None:
+            return Verdict(True, "no ball-bar is configured: the sign rests on the commissioning")
+        after = await self.bar.read("after")
+        await self.bar.clear_away()
+        each = expected_changes(after.places_mm, np.array(self.bar.centre_mm), self.held.base.tables, self.held.proposed.tables)
+        found = probe(each, self.read_before.deviation_mm, after.deviation_mm)
+        return Verdict(found.agrees, found.text + ("" if all(found.seen) else "; that rests on the commissioning"))
+
+    async def verify(self) -> Verdict:
+        bench = self.bench
+        number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(bench.store.campaigns)) + 1
+        name = f"{VERIFY}{number}"
+        plan = paced(verification(bench.site.machine, rate_hz=bench.rate_hz, name=name), bench.site.max_feed_mm_min)
+        ids = await measure(bench.session, bench.store, bench.site, plan, progress=bench.progress)
+        self.after = figures(await load_runs(bench.store, ids))
+        self.decision = decide(self.before, self.after, self.pushing.crc if self.pushing is not None else None)
+        self.verified_as = name
+        return Verdict(self.decision.keep, self.decision.text)
+
+
+async def _push_and_verify(work: _Correcting, wanted: Wanted) -> tuple[Pushed, Figures, Decision]:
+    """Push, prove the sign, measure again, keep or go back. Whatever stops it takes the old table back."""
+    bench = work.bench
+    against = work.reasons()
+    if against:
+        raise TableRefused("; ".join(against), "nothing was written")
+    await check_commissioned(bench.session.controller, bench.store, bench.site)
+    questions = Questions(work.reasons, by_whom(), work.probe, work.verify, work.held.approval(bench.clock))
+    work.pushing = pushing = Pushing(bench.session.controller, bench.store, bench.site)
+    if work.bar is None:
+        pushed = await pushing.bring(wanted, questions)
+    else:
+        async with work.bar.cleared_away():
+            work.read_before = await work.bar.read("before")
+            bench.progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
+            pushed = await pushing.bring(wanted, questions)
+    if work.after is None or work.decision is None:
+        raise TakenBack(f"the table was taken back: {pushed.why}", "look at the control's convention: abbe comp commission")
+    decision = work.decision if pushed.kept == work.decision.keep else Decision(pushed.kept, pushed.why)
+    await _store_verification(bench, work.verified_as, pushed, work.after, decision)
+    return pushed, work.after, decision
+
+
+async def _store_verification(bench: _Bench, name: str, pushed: Pushed, after: Figures, decision: Decision) -> None:
+    store, site = bench.store, bench.site
     rows = {k: {"value": v, "u": u} for k, (v, u) in figure_rows(after).items()}
     machine_id = await store.write(store.add_machine, site.name, site.doc)
     doc = {"text": decision.text, "push": pushed.push_id, "figures": rows}
     campaign = await asyncio.to_thread(store.campaign, name)
     await store.write(store.add_verification, machine_id, campaign.id, "pass" if decision.keep else "fail", doc)
-
-
-async def load_runs(store: Store, run_ids: list[int]) -> list[dict[str, Any]]:
-    """Runs of the store as ``abbe-run/1`` objects, read off the event loop."""
-    return await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])

@@ -1,28 +1,38 @@
 """The demonstration: the whole job on a simulated machine over real wires.
 
-identify -> measure (before) -> solve -> push -> measure (after) -> keep or roll back; then the simulator's sealed truth says how well it
-went.
+identify -> measure (before) -> commission -> solve -> push -> measure (after) -> keep or roll back; then the simulator's sealed truth says
+how well it went.
 """
 
 from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass, field
+from datetime import date
 from pathlib import Path
 from typing import Any
 
 from service.clock import Clock, SystemClock
 from service.devices.session import DeviceUrls, Session, open_session
 from service.events import Progress, ProgressSink
+from service.push.limits import PushLimits
 from service.sequences.campaigns import identification, verification
 from service.site import Site, machine_doc, machine_from_doc
 from service.storage.store import Store
-from service.workflows.correct import Correction, correct, load_runs
+from service.workflows.commission import commission
+from service.workflows.commission_levels import commission_levels
+from service.workflows.correct import Correction, correct
 from service.workflows.measure import measure
+from service.workflows.proposals import load_runs
 from service.workflows.world import running_world, sealed_truth
 
 MAX_SAMPLES_PER_S = 6000
 """Ball-bar samples per wall second that the demonstration asks for at most, so that a small PC follows at high speed."""
+
+CERTIFICATES = {"ballbar": date(2099, 12, 31), "laser": date(2099, 12, 31)}
+"""Simulated instruments are as good as their simulator says, for ever."""
+RAW = PushLimits(value_mm=0.2, change_mm=0.2)
+"""Nobody has ever corrected these machines: their first tables replace nothing by everything, as a person would allow after a look."""
 
 
 @dataclass
@@ -49,7 +59,7 @@ def demo_site(ready: dict[str, Any]) -> Site:
     """The machine file's content for a simulated machine: its nominal geometry and where its devices listen."""
     machine = machine_from_doc(ready["machine"])
     urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
-    return Site("demo-machine", machine, machine_doc("demo-machine", machine), urls)
+    return Site("demo-machine", machine, machine_doc("demo-machine", machine), urls, limits=RAW, calibrated_until=CERTIFICATES)
 
 
 def write_machine_file(site: Site, folder: Path) -> Path:
@@ -63,6 +73,8 @@ def write_machine_file(site: Site, folder: Path) -> Path:
     lines += [f"{a} = {row(m.stroke_mm[k])}" for k, a in enumerate("XYZ")]
     lines += ["", "[pivots_mm]"] + [f"{a} = {row(m.pivots_mm[k])}" for k, a in enumerate("XYZ")]
     lines += ["", "[devices]"] + [f'{k} = "{getattr(site.urls, k)}"' for k in ("cnc", "ballbar", "laser", "fixture")]
+    lines += ["", "[calibration]"] + [f"{kind} = {day.isoformat()}" for kind, day in sorted(site.calibrated_until.items())]
+    lines += ["", "[limits]", f"table_value_um = {site.limits.value_mm * 1e3:g}", f"table_change_um = {site.limits.change_mm * 1e3:g}"]
     lines += ["", "[store]", 'url = "sqlite:///abbe.sqlite3"', ""]
     path = folder / "machine.toml"
     path.write_text("\n".join(lines), encoding="utf-8")
@@ -104,5 +116,7 @@ async def _job(session: Session, store: Store, result: DemoResult, progress: Pro
     await measure(session, store, site, identification(site.machine, rate_hz=rate), progress=progress)
     before_ids = await measure(session, store, site, verification(site.machine, rate_hz=rate, name="verify-before"), progress=progress)
     before = await load_runs(store, before_ids)
+    await commission_levels(session.controller, store, site)
+    await commission(session, store, site, progress=progress)
     result.correction = await correct(session, store, site, "identify", before, rate_hz=rate, progress=progress)
     (result.folder / "active_bank.bin").write_bytes(result.correction.image)

@@ -19,7 +19,8 @@ from service.sequences.discovery_campaign import BACK, discovery_campaign, new_m
 from service.site import Site
 from service.storage.store import Store
 from service.workflows.campaign_folder import from_store
-from service.workflows.correct import Correction, correct, load_runs
+from service.workflows.commission import commission
+from service.workflows.correct import Correction, correct
 from service.workflows.demo import bar_rate_hz, demo_site, write_machine_file
 from service.workflows.discover import Job, Journal, discover, prepare
 from service.workflows.discovery_engine import catalogue, search
@@ -27,6 +28,7 @@ from service.workflows.discovery_store import journal_of
 from service.workflows.measure import measure
 from service.workflows.model_book import current
 from service.workflows.new_measurement import NewMeasurement, judged_anew
+from service.workflows.proposals import load_runs
 from service.workflows.thinned import picked
 from service.workflows.world import running_world, sealed_truth
 
@@ -114,6 +116,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
     if not tables or model is None:
         return
     try:
+        await commission(session, store, site, progress=progress)
         before = [run for run in await load_runs(store, ids) if run["run_id"] != BACK]  # the verification, as tables are judged
         result.correction = await correct(session, store, site, CAMPAIGN, before, rate_hz=rate, progress=progress)
     except (TableRefused, NotObservable) as error:

@@ -14,7 +14,7 @@ from typing import Any
 from service.devices.session import Session
 from service.errors import CampaignRefused, UnsafeToMove
 from service.events import ProgressSink
-from service.sequences.runner import MOVING
+from service.sequences.interlocks import MOVING
 from service.sequences.steps import CampaignPlan, TestPlan, Unmount
 from service.site import Site
 from service.storage.records import RUNNING, CampaignRecord

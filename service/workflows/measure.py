@@ -2,51 +2,53 @@
 
 from __future__ import annotations
 
+import asyncio
 import platform
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
 from drivers.errors import DriverError
 from drivers.links.shielded import run_to_end
+from service.capture.recorder import CaptureRecorder, close_run, recording
 from service.clock import Clock, SystemClock
+from service.devices.clock_notes import notes_since
 from service.devices.session import Session
-from service.errors import AbbeError
-from service.events import Progress, ProgressSink, ignore_progress
-from service.runs.recorder import recording
-from service.sequences.check import dry_run_campaign
+from service.errors import AbbeError, Aborted, ConfigError, DiskFull, RunInterrupted, Stopped, StoreError
+from service.events import ProgressSink, ignore_progress
+from service.sequences.check import dry_run_campaign, step_seconds
+from service.sequences.control import Control, State
 from service.sequences.guard import warnings_of
+from service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
+from service.sequences.interlocks import COMPENSATION_ON
+from service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
+from service.sequences.preconditions import Expected
+from service.sequences.rewind import Attempt
 from service.sequences.runner import Runner, Tick
-from service.sequences.steps import CampaignPlan, RecordPath, TestPlan
+from service.sequences.steps import CampaignPlan, MoveTo, RecordPath, TestPlan
 from service.site import Site
+from service.storage.owner import this_process
+from service.storage.records import DISK_FULL
 from service.storage.store import Store
+from service.workflows.bar_link import BarBreaks, bar_ready
+from service.workflows.campaign_run import Conduct, Confirm, Resumed, in_mounting, items, nobody, plan_hash, read_path
+from service.workflows.meter import Meter
+
+RUN_STATUS: dict[type[Exception], str] = {Stopped: "stopped", Aborted: "aborted", RunInterrupted: "aborted"}
+"""How a run is closed that a person has ended, or that is gone on with; everything else has failed."""
 
 
-@dataclass
-class Meter:
-    """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA.
+LAST_LINE_S = 10.0
 
-    The time in which the job waited for a person (``waited_s``) says nothing about the machine and does not count.
-    """
 
-    stage: str
-    total_s: float
-    sink: ProgressSink
-    clock: Clock
-    done_s: float = 0.0
-    start_s: float = field(default=0.0)
-    waited_s: float = 0.0
+@dataclass(frozen=True, slots=True)
+class How:
+    """By whom a test is run, which part of it, and where its checkpoints go."""
 
-    def __post_init__(self) -> None:
-        """Start the stopwatch."""
-        self.start_s = self.clock.monotonic_s()
-
-    def at(self, done_s: float, message: str, waited_s: float = 0.0) -> None:
-        """Report how far the job is, and how long the last step waited for a person."""
-        self.waited_s += waited_s
-        elapsed = self.clock.monotonic_s() - self.start_s - self.waited_s
-        eta = elapsed / done_s * (self.total_s - done_s) if done_s > 0.02 * self.total_s else None
-        self.sink(Progress(self.stage, done_s, self.total_s, eta, message))
+    runner: Runner
+    attempt: Attempt
+    journal: Journal
 
 
 @dataclass
@@ -75,7 +77,20 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
     return await store.write(store.add_campaign, machine_id, name, doc), status.ctrl_us
 
 
-async def measure(
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """Who may interrupt a measurement, who can say whether a set-up was touched, what it was made of, and where it goes on.
+
+    ``source``: what the plan can be made from again, for `abbe measure --resume`.
+    """
+
+    control: Control | None = None
+    confirm: Confirm = nobody
+    source: dict[str, Any] = field(default_factory=dict)
+    resumed: Resumed | None = None
+
+
+async def measure(  # noqa: PLR0913 - what on what, and for whom
     session: Session,
     store: Store,
     site: Site,
@@ -84,39 +99,154 @@ async def measure(
     progress: ProgressSink = ignore_progress,
     clock: Clock | None = None,
     campaign: tuple[int, int] | None = None,
+    manner: Manner | None = None,
 ) -> list[int]:
-    """Run all tests of a plan; returns the run numbers in the store.
+    """Run all tests of a plan; returns the numbers of their complete runs in the store.
 
     Parameters
     ----------
     campaign : tuple of int, optional
         A campaign that was begun, as `start_campaign` gives it; default: a new one of the plan's name.
+    manner : Manner, optional
+        Control from outside, and from where to go on; default: nobody interrupts, from the beginning.
 
     Raises
     ------
     StrokeError
         Before anything moves.
-    UnsafeToMove, MeasurementFault, DriverError
+    Interlock, MeasurementFault, DriverError
         The run in hand is closed as failed, with the reason; earlier runs stay.
+    Stopped, Aborted
+        A person asked for it; the run in hand is closed as stopped or aborted.
     """
-    clock = clock or SystemClock()
+    clock, manner = clock or SystemClock(), manner or Manner()
+    control, resumed = manner.control or Control(), manner.resumed
     dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
+    if site.watching.air_c is not None and session.laser is None:
+        raise ConfigError(
+            "run_temperature_c is set, but no laser is configured whose sensor could read the air",
+            "add laser = ... under [devices], or take run_temperature_c out of [limits]",
+        )
+    if resumed is not None:
+        campaign = resumed.campaign
     campaign = campaign or await start_campaign(session, store, site, plan.name)
-    meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock)
-    run_ids, under_way = [], OpenCampaign(*campaign)
-    for test, expected in zip(plan.tests, dry, strict=True):
-        base = meter.done_s
-
-        def tick(seconds: float, waited_s: float, base: float = base, label: str = test.label) -> None:
-            meter.at(base + seconds, label, waited_s)
-
-        run_ids.append(await measure_test(session, store, site, under_way, test, tick, clock))
-        meter.done_s = base + expected.duration_s
-        meter.at(meter.done_s, test.label)
+    under_way = OpenCampaign(*campaign, dict(resumed.mounted_us) if resumed is not None else {})
+    journal = StoreJournal(store, under_way.id)
+    conduct = await _conduct(session, store, site, plan, journal, manner, control)
+    meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
+    control.now(State.RUNNING)
+    notes, told = IncidentNotes(journal, clock), asyncio.create_task(meter.tell())
+    once = _once(session, store, site, under_way, meter, control)
+    try:
+        async with incidents_noted(session, notes):
+            run_ids = await _all_tests(plan, [d.duration_s for d in dry], conduct, meter, resumed, once)
+    except BaseException as error:
+        await _ended(journal, notes, "stopped" if isinstance(error, Stopped) else "failed", error)
+        raise
+    else:
+        await _ended(journal, notes, "complete", None)
+    finally:
+        control.now(State.ENDED)
+        told.cancel()
     return run_ids
 
 
-async def measure_test(
+async def _ended(journal: StoreJournal, notes: IncidentNotes, how: str, error: BaseException | None) -> None:
+    """The journal's last line. A database that does not take it must not hide why the measurement has ended."""
+    journal.longest_s = min(journal.longest_s, LAST_LINE_S)
+    try:
+        left_out = {"incidents_not_written": notes.not_written} if notes.not_written else {}
+        await run_to_end(journal.add(ENDED, how=how, **left_out))
+    except StoreError as lost:
+        if error is None:
+            raise
+        error.add_note(f"and the journal's last line could not be written: {lost}")
+
+
+async def _conduct(
+    session: Session, store: Store, site: Site, plan: CampaignPlan, journal: StoreJournal, manner: Manner, control: Control
+) -> Conduct:
+    """The journal's first line, and what the campaign is carried through with."""
+    comp = await session.controller.comp_status()
+    expected = Expected(comp.boot_id, comp.bank_crc[comp.active_bank])
+    if manner.resumed is not None and manner.resumed.expected is not None:
+        expected = manner.resumed.expected  # the table may have been changed since it was looked at: while a question stood
+    begun = {"plan": plan_hash(plan), "source": manner.source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
+    begun["owner"] = asdict(this_process())
+    await journal.add(BEGUN, **begun)
+    conduct = Conduct(session, control, site.watching, journal, expected, manner.confirm)
+    conduct.read_path = lambda test, mounting: read_path(session, store, journal.campaign, test, mounting)
+    if manner.resumed is not None:
+        conduct.mountings = dict(manner.resumed.mountings)
+        conduct.used = set(manner.resumed.used)
+        conduct.labels = {run.label for run in await asyncio.to_thread(store.runs, journal.campaign)}
+    return conduct
+
+
+def planned_seconds(test: TestPlan) -> float:
+    """How long a test's steps take."""
+    seconds, here = 0.0, None
+    for step in test.steps:
+        if not (isinstance(step, MoveTo) and here == step.target_mm):
+            one, here = step_seconds(step, here)
+            seconds += one
+    return seconds
+
+
+Once = Callable[[TestPlan, Attempt, Runner], Awaitable[int]]
+
+
+async def _all_tests(
+    plan: CampaignPlan,
+    seconds: list[float],
+    conduct: Conduct,
+    meter: Meter,
+    resumed: Resumed | None,
+    once: Callable[[TestPlan, float], Once],
+) -> list[int]:
+    """Every test that has no complete run yet, in the plan's order."""
+    run_ids: list[int] = []
+    done, start = (resumed.done, resumed.start) if resumed is not None else ({}, {})
+    for item, duration_s in zip(items(plan), seconds, strict=True):
+        label, base_s = item.test.label, meter.done_s
+        if label in done:
+            run_ids.append(done[label])
+            meter.skip(duration_s)
+        else:
+            item = start.get(label) or in_mounting(item, conduct.mountings.get(item.setup, 1))
+            run_ids.append(await conduct.complete(item, once(item.test, base_s)))
+            meter.done_s = base_s + duration_s
+        meter.at(meter.done_s, label)
+    return run_ids
+
+
+def _once(
+    session: Session, store: Store, site: Site, under_way: OpenCampaign, meter: Meter, control: Control
+) -> Callable[[TestPlan, float], Once]:
+    """How one attempt at a test becomes one run."""
+
+    def of(test: TestPlan, base_s: float) -> Once:
+        breaks = BarBreaks(session, control, site.watching.suspending)
+
+        async def once(left: TestPlan, attempt: Attempt, runner: Runner) -> int:
+            before_s = max(planned_seconds(test) - planned_seconds(left), 0.0)  # what an earlier attempt has done stays done
+
+            def tick(seconds: float, waited_s: float) -> None:
+                meter.at(base_s + before_s + seconds, test.label, waited_s)
+
+            how = How(runner, attempt, runner.journal)
+            try:
+                return await measure_test(session, store, site, under_way, left, tick, meter.clock, how)
+            except DriverError as error:
+                await breaks.wait(error, runner, runner.journal)
+                raise
+
+        return once
+
+    return of
+
+
+async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it goes, and how
     session: Session,
     store: Store,
     site: Site,
@@ -124,21 +254,29 @@ async def measure_test(
     test: TestPlan,
     tick: Tick,
     clock: Clock,
+    how: How | None = None,
 ) -> int:
     """One test as one run; whatever ends it early is written into the run before it is raised again."""
-    doc = await _start_doc(session, site, campaign, test, clock)
+    runner, attempt, journal = (how.runner, how.attempt, how.journal) if how is not None else (Runner(session), Attempt(), NoJournal())
+    doc = await start_document(session, site, campaign, test, clock)
+    if attempt.onward is not None:
+        doc["path"] |= attempt.onward.doc()
     run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, doc)
     status, reason, end = "aborted", "stopped", dict[str, Any]()
-    gaps: list[dict[str, int]] = []
+    recorder: CaptureRecorder | None = None
+    about = {"label": test.label, "test": test.test, "machine": site.name}
     try:
-        async with recording(store, run_id) as recorder:
-            gaps = recorder.gaps
-            end = dict(await Runner(session).run(test, recorder, tick))
-        if "mounted_us" in end:
-            campaign.mounted_us[test.setup["setup_id"]] = end["mounted_us"]
+        async with recording(store, run_id, site.capture, clock, about) as recorder:
+            await journal.add(RUN, test=attempt.test, run=run_id, label=test.label, setup=attempt.setup, mounting=attempt.mounting)
+            with run_named(session, f"run {run_id} {test.label}"):
+                await bar_ready(session, test)
+                end = dict(await runner.run(test, recorder, tick, replace(attempt, run_id=run_id)))
         status, reason = "complete", ""
+    except DiskFull as error:
+        status, reason = DISK_FULL, f"{error.code}: {error}"
+        raise
     except (AbbeError, DriverError) as error:
-        status, reason = "failed", f"{error.code}: {error}"
+        status, reason = RUN_STATUS.get(type(error), "failed"), f"{error.code}: {error}"
         raise
     except Exception as error:
         status, reason = "failed", repr(error)  # a defect: what it was must not get lost behind "stopped"
@@ -147,28 +285,41 @@ async def measure_test(
         reason = "; ".join(["stopped", *warnings_of(error)])
         raise
     finally:
-        end |= {"gaps": gaps, "ended_utc": clock.utc().isoformat()}
-        await run_to_end(store.write(store.finish_run, run_id, status, reason, end))
+        mounted_us = end.get("mounted_us", runner.mounted_us)
+        if mounted_us is not None:
+            campaign.mounted_us[test.setup["setup_id"]] = end["mounted_us"] = mounted_us
+        end |= {"ended_utc": clock.utc().isoformat(), "clock_pairs": notes_since(session.controller, doc["clock"]["ctrl_us"])}
+        end |= {} if recorder is None else recorder.doc()
+        end |= {} if runner.way is None or status == "complete" else runner.way.doc()
+        await run_to_end(close_run(store, run_id, recorder, status, reason, end))
     return run_id
 
 
-async def _start_doc(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:
+async def start_document(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:
     """What is known before the first step. A test that mounts is taken to mount now; the end document knows better (`mounted_us`)."""
     status = await session.controller.status()
     comp = await session.controller.comp_status()
     ctrl0_us, set_us = campaign.ctrl0_us, status.ctrl_us
     if not test.mounts:
         set_us = campaign.mounted_us.get(test.setup["setup_id"], set_us)
+    acting = bool(status.bits >> COMPENSATION_ON & 1)
     doc: dict[str, Any] = {
         "setup": test.setup | {"t_set_s": (set_us - ctrl0_us) * 1e-6},
         "machine": site.doc,
         "ctrl0_us": ctrl0_us,
-        "table": {"bank": comp.active_bank, "crc": comp.bank_crc[comp.active_bank], "gen": comp.gen},
+        "table": {
+            "bank": comp.active_bank,
+            "crc": comp.bank_crc[comp.active_bank],
+            "gen": comp.gen,
+            "boot_id": comp.boot_id,
+            "acting": acting,
+        },
         "clock": {"utc": clock.utc().isoformat(), "host_s": clock.monotonic_s(), "ctrl_us": status.ctrl_us},
         "versions": {"abbe": version("abbe"), "python": platform.python_version()},
     }
     for step in test.steps:
         if isinstance(step, RecordPath):
             doc["path"] = {"feed_mm_min": step.feed_mm_min, "direction": step.direction, "points_mm": [list(p) for p in step.points_mm]}
+            doc["path"] |= {} if step.measured is None else {"measured": list(step.measured)}
             doc["rate_hz"] = step.rate_hz
     return doc

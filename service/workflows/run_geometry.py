@@ -115,10 +115,11 @@ def _direction(test: str, setup: Doc, span: F1) -> Misplaced | None:
         moved = "XYZ"[int(np.argmax(np.abs(unit)))]
         return Misplaced(f"axis is {setup['axis']}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")
     letters = setup.get("diagonal") if test == "laser_diagonal" else None
-    if letters and any((s > 0) != (c == "p") for s, c in zip(span, letters, strict=True)):
+    if letters and any((s > 0) != (c == "p") for s, c in zip(span, letters, strict=True) if s):  # a face diagonal leaves one axis alone
         return Misplaced(f"diagonal is {letters}, but start_mm and end_mm run otherwise", "correct diagonal, start_mm or end_mm")
     step, count = setup.get("increment_mm"), setup.get("steps")
-    if isinstance(step, list | tuple) and count and float(np.abs(np.asarray(step) * count - span).max()) > TOLERANCE_MM:
+    allowed = TOLERANCE_MM + 2.0 * float(setup.get("overrun_mm") or 0.0)  # the ends are the turning points
+    if isinstance(step, list | tuple) and count and float(np.abs(np.asarray(step) * count - span).max()) > allowed:
         return Misplaced(f"{count} steps of increment_mm do not lead from start_mm to end_mm", "correct increment_mm, steps or the ends")
     return None
 

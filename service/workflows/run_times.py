@@ -21,9 +21,15 @@ UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
 
 def times(runs: Sequence[Doc]) -> list[Finding]:
     """Flags of runs whose t_s does not fit their feed, and of runs that were measured while others were."""
-    out = [f for run in runs for f in _against_feed(run)]
+    out = [f for run in runs for f in (*_clocks(run), *_against_feed(run))]
     known = {f.run for f in out}
     return out + _overlaps([r for r in runs if r["run_id"] not in known])
+
+
+def _clocks(run: Doc) -> list[Finding]:
+    """What the clocks of a run that was measured here contradict each other in (service.runs.clocks)."""
+    trouble = (run.get("timing") or {}).get("trouble")
+    return [Finding(run["run_id"], str(trouble), "look at the sync cable and the links, then measure it again", False)] if trouble else []
 
 
 def _against_feed(run: Doc) -> list[Finding]:
@@ -37,7 +43,8 @@ def _against_feed(run: Doc) -> list[Finding]:
     wanted = float((np.linalg.norm(np.diff(points, axis=0), axis=1) * 60.0 / feed[1:]).sum())
     if wanted <= 0.0:
         return []
-    ratio, slowest = float(t[-1] - t[0]) / wanted, SLOWEST["laser" if run["test"].startswith("laser") else "ballbar"]
+    waited = np.sort(np.diff(t))[::-1][: len((run.get("timing") or {}).get("pieces", []))].sum()  # between the pieces of a path
+    ratio, slowest = float(t[-1] - t[0] - waited) / wanted, SLOWEST["laser" if run["test"].startswith("laser") else "ballbar"]
     if FASTEST <= ratio <= slowest:
         return []
     unit = next((word for factor, word in UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is not what it says")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.paths.lines import DIAGONALS, step_diagonal
 from models.solvers.helix import HelixSolution, fit_run
 from models.solvers.joint import JointSolution, Model, implausible, solve_joint
 from models.solvers.observations import RunData, nominal_reading
@@ -47,6 +48,8 @@ STEP_NOTE = (
     "the mirrors and angular errors of the axes bias them and are not in it; the joint solution knows both and is the one to use."
 )
 Say = Callable[[str], None]
+STEP_PLACE_MM = 0.1
+"""A row farther from where its step leads belongs to another step."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Solved:
     """Joint solution plus the papers' own solutions of the same runs, for comparison.
 
     ``flags``: what is odd about single runs without being wrong for certain. ``digests``: a hash of every run's data, by its name.
+    ``tables``: the compensation table that each run was measured with, where it says so.
     ``rows``: for every value of a run the first and the last row of its file (from 1) that went into it, shape (values, 2).
     """
 
@@ -64,6 +68,7 @@ class Solved:
     flags: tuple[Finding, ...] = ()
     digests: dict[str, str] = field(default_factory=dict)
     rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    tables: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid21", say: Say | None = None) -> Solved:
@@ -91,9 +96,8 @@ def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid2
     flags += check_instruments(joint, data)
     spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not tell ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
-    return Solved(
-        joint, helices, step_diagonals(used), noise, tuple(flags), {r["run_id"]: run_digest(r) for r in used}, value_rows(used, data)
-    )
+    digests, tables = {r["run_id"]: run_digest(r) for r in used}, {r["run_id"]: r["table"] for r in used if "crc" in r.get("table", {})}
+    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables)
 
 
 def value_rows(runs: list[dict[str, Any]], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
@@ -203,10 +207,22 @@ def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     out = {}
     for order in ("XYZ", "ZYX"):
         found = {r["setup"]["diagonal"]: r for r in runs if r["test"] == "laser_diagonal" and r["setup"].get("order", "") == order}
-        if set(found) != set(ORDER):
+        if set(found) != set(ORDER) or not all(_whole_way_out(r, order) for r in found.values()):
             continue
         out[order] = _step_figures(found, order)
     return out
+
+
+def _whole_way_out(run: dict[str, Any], order: str) -> bool:
+    """Whether the first 3 n + 1 rows are valid and stand where the steps of this order lead: else later rows are another's."""
+    setup, columns = run["setup"], run["columns"]
+    n = int(setup["steps"])
+    points = np.column_stack([np.asarray(columns[f"{a}_mm"], dtype=np.float64)[: 3 * n + 1] for a in "xyz"])
+    if len(points) < 3 * n + 1 or not np.all(np.asarray(columns.get("valid", np.ones(len(points))))[: 3 * n + 1]):
+        return False
+    span = n * np.abs(np.asarray(setup["increment_mm"], dtype=np.float64)) * DIAGONALS[setup["diagonal"]]
+    nominal = step_diagonal(points[0], points[0] + span, n, order, back=False)
+    return float(np.abs(points - nominal).max()) < STEP_PLACE_MM
 
 
 def _step_figures(found: dict[str, dict[str, Any]], order: str) -> dict[str, float]:

@@ -18,6 +18,7 @@ from models.uncertainty.mask import CompensableMask, compensable_mask
 from models.uncertainty.prediction import Prediction, predict_deviation
 from models.uncertainty.sources import ErrorSources, error_sources
 from models.volumetric import volume_grid
+from service.workflows.measured_with import distinct
 from service.workflows.provenance import campaign_digest, machine_digest, versions
 from service.workflows.solve import HELIX_NOTE, STEP_NOTE, Solved
 from service.workflows.solve_verdict import Verdict, layout_line, verdict
@@ -126,6 +127,7 @@ def _inputs(found: Account, model: str) -> dict[str, Any]:
         "digest": campaign_digest(found.solved.digests, model, machine),
         "machine": machine,
         "runs": found.solved.digests,
+        "tables": distinct(found.solved.tables.values()),
     }
 
 

@@ -9,7 +9,7 @@ from drivers.cnc.tables import TableImage
 from models.compensation.tables import NineTables
 from models.machine import AXES
 from service.errors import TableMismatch, TableRefused
-from service.site import TableLimits
+from service.push.limits import PushLimits
 
 KIND_NINE = 1
 
@@ -43,7 +43,7 @@ def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
     return TableImage(KIND_NINE, table_id, lsb_nm, (sx, sy, sz), (px, py, pz), (nx, ny, nz), tuple(values))
 
 
-def check_limits(tables: NineTables, active: NineTables | None, limits: TableLimits) -> None:
+def check_limits(tables: NineTables, active: NineTables | None, limits: PushLimits) -> None:
     """Refuse, never clamp: value, change against the active table, step between neighbours, zero at the reference (reliability.md 3.3).
 
     Raises
@@ -108,43 +108,6 @@ def tables_from_image(image: bytes) -> NineTables | None:
     return NineTables(
         (positions[0], positions[1], positions[2]), (corrections[0], corrections[1], corrections[2]), (none[0], none[1], none[2])
     )
-
-
-def compare_bytes(sent: bytes, held: bytes) -> None:
-    """First read-back: every byte.
-
-    Raises
-    ------
-    TableMismatch
-        The first register that differs.
-    """
-    if sent != held:
-        at = next((k for k in range(min(len(sent), len(held))) if sent[k] != held[k]), min(len(sent), len(held)))
-        raise TableMismatch(
-            f"read-back differs from what was sent at register {at // 2}", "the table was not activated; check the link, push again"
-        )
-
-
-def compare_meaning(wanted: NineTables, held: NineTables | None, lsb_nm: int) -> None:
-    """Second read-back: what an independent decoder makes of the bytes must be the wanted correction, axis by axis, within half a unit.
-
-    Raises
-    ------
-    TableMismatch
-        Which table differs: this catches a wrong sign, a swapped axis, or a wrong unit in the encoder.
-    """
-    for a in range(3):
-        for i in range(3):
-            name = f"{AXES[i]} over {AXES[a]}"
-            if held is None or held.correction_mm[a].shape != wanted.correction_mm[a].shape:
-                raise TableMismatch(f"table {name} is not in the controller's bank", "it was not activated")
-            off_grid = np.abs(held.position_mm[a] - wanted.position_mm[a]).max()
-            off_value = np.abs(held.correction_mm[a][:, i] - wanted.correction_mm[a][:, i]).max()
-            if off_grid > 1e-5 or off_value > 0.51e-6 * lsb_nm:
-                raise TableMismatch(
-                    f"table {name} means something else to an independent decoder (off by {off_value * 1e3:.2f} µm)",
-                    "it was not activated; the encoder is wrong",
-                )
 
 
 def added(active: NineTables | None, change: NineTables) -> NineTables:

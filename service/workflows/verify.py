@@ -9,12 +9,16 @@ from typing import Any, Literal
 import numpy as np
 
 from models.verification import Figure, diagonal_figure, helix_figure
-from service.errors import MeasurementFault
+from service.errors import MeasurementFault, TableRefused
 from service.runs.observations import run_data
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
 """Any figure may get worse by its expanded uncertainty plus this share: of the worst diagonal before (diagonals), of itself (helix)."""
+
+SAME_AIR_C = 1.0
+"""All readings of before and after must have been taken in air within so much: steel and iron grow by 11 to 12 um per metre and kelvin,
+which is what a correction is about. An assumption of this service; there are no body sensors here, so what the castings do is not seen."""
 
 DIAGONALS = frozenset({"ppp", "npp", "pnp", "ppn"})
 
@@ -23,10 +27,22 @@ Verdict = Literal["pass", "fail", "cannot tell"]
 
 @dataclass(frozen=True)
 class Figures:
-    """What one verification measured: body diagonals by name, and the helix."""
+    """What one verification measured: body diagonals by name, and the helix.
+
+    ``air_c``: lowest and highest temperature of the air, None where no reading says any. ``tables``: CRC of every table that was active
+    while its runs were measured; None stands for a run that does not say so.
+    """
 
     diagonals: Mapping[str, Figure]
     helix: Figure | None
+    air_c: tuple[float, float] | None = None
+    tables: frozenset[int | None] = frozenset()
+
+    @property
+    def finite(self) -> bool:
+        """Whether every figure and every uncertainty is a number."""
+        every = [*self.diagonals.values(), *([self.helix] if self.helix is not None else [])]
+        return all(np.isfinite(f.value_mm) and np.isfinite(f.u_mm) for f in every)
 
     @property
     def worst(self) -> Figure:
@@ -44,7 +60,7 @@ def figures(runs: list[dict[str, Any]]) -> Figures:
     """
     diagonals, helix = {}, None
     for run in runs:
-        if run["test"] == "laser_diagonal" and not run["setup"].get("order"):
+        if run["test"] == "laser_diagonal" and not run["setup"].get("order") and not run["setup"].get("face"):
             try:
                 diagonals[str(run["setup"]["diagonal"])] = diagonal_figure(run_data(run))
             except ValueError as error:
@@ -56,7 +72,26 @@ def figures(runs: list[dict[str, Any]]) -> Figures:
         raise MeasurementFault(
             f"these runs are no verification: body diagonal {lost} is missing", "measure the verification campaign again"
         )
-    return Figures(diagonals, helix)
+    return Figures(diagonals, helix, _air_c(runs), frozenset(run.get("table", {}).get("crc") for run in runs))
+
+
+def _air_c(runs: list[dict[str, Any]]) -> tuple[float, float] | None:
+    air = [float(t) for run in runs for t in run["columns"].get("temp_air_C", []) if t is not None and np.isfinite(t)]
+    return (min(air), max(air)) if air else None
+
+
+def check_before(before: Figures) -> None:
+    """Refuse a verification that nothing can be compared with, before anything is written.
+
+    Raises
+    ------
+    TableRefused
+        A figure is no number, or no reading says how warm the air was.
+    """
+    what = "" if before.finite else "a figure of it is no number"
+    what = what or ("" if before.air_c is not None else "no reading of it says how warm the air was")
+    if what:
+        raise TableRefused(f"nothing can be compared with the verification before: {what}", "measure it again; nothing was written")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +106,39 @@ def _expanded(a: Figure, b: Figure) -> float:
     return COVERAGE * float(np.hypot(a.u_mm, b.u_mm))
 
 
-def decide(before: Figures, after: Figures) -> Decision:
+def incomparable(before: Figures, after: Figures, pushed_crc: int | None = None) -> str:
+    """Why before and after say nothing about a new table; empty if they can be compared.
+
+    Parameters
+    ----------
+    pushed_crc : int, optional
+        CRC of the new table: every run of the verification after must have been measured with it, and with no other.
+    """
+    if not (before.finite and after.finite):
+        return "a figure is no number"
+    if pushed_crc is not None and after.tables != {pushed_crc}:
+        seen = (
+            ", ".join(sorted("one that nobody named" if crc is None else f"{crc:08X}" for crc in after.tables)) or "one that nobody named"
+        )
+        return f"it was measured with table {seen}, brought into force was {pushed_crc:08X}"
+    if before.air_c is None or after.air_c is None:
+        return "how warm the air was is not known"
+    low, high = min(before.air_c[0], after.air_c[0]), max(before.air_c[1], after.air_c[1])
+    if high - low > SAME_AIR_C:
+        return f"the air had {low:.1f} to {high:.1f} °C over before and after, more than {SAME_AIR_C:g} K apart"
+    return ""
+
+
+def decide(before: Figures, after: Figures, pushed_crc: int | None = None) -> Decision:
     """Keep only if the worst diagonal improved by more than its expanded uncertainty and no other figure got worse (reliability.md H11).
 
     "Worse" is more than the expanded uncertainty of the difference plus `WORSE_SHARE`: a diagonal that happened to be good because errors
-    cancelled may come closer to the others, but only by a small part of what the worst one was.
+    cancelled may come closer to the others, but only by a small part of what the worst one was. Where that cannot be told, because the two
+    do not compare (`incomparable`) or a figure is less certain than what was gained, the old table comes back as well.
     """
+    why = incomparable(before, after, pushed_crc)
+    if why:
+        return Decision(False, f"cannot tell whether it is better: {why}")
     worst = before.worst.value_mm
     gain, needed = worst - after.worst.value_mm, _expanded(before.worst, after.worst)
     change = f"worst body diagonal {worst * 1e3:.1f} → {after.worst.value_mm * 1e3:.1f} µm"
@@ -88,6 +150,9 @@ def decide(before: Figures, after: Figures) -> Decision:
     if before.helix is not None and after.helix is not None:
         pairs.append(("helix", before.helix, after.helix, before.helix.value_mm))
     for name, old, new, scale in pairs:
+        if _expanded(old, new) > gain:
+            blind = f"the {name} is uncertain by {_expanded(old, new) * 1e3:.1f} µm, more than the {gain * 1e3:.1f} µm that were gained"
+            return Decision(False, f"{change}, but cannot tell whether nothing got worse: {blind}")
         worse = new.value_mm - old.value_mm
         if worse > _expanded(old, new) + WORSE_SHARE * scale:
             return Decision(False, f"{name} got worse by {worse * 1e3:.1f} µm, although the worst diagonal improved")

@@ -46,6 +46,7 @@ function connected(yes) {
 async function refresh() {
   try {
     const answer = await fetch("/api/v1/status", { signal: AbortSignal.timeout(PATIENCE_MS) });
+    if (answer.status === 401) location.assign("/login");
     if (!answer.ok) throw new Error(`status ${answer.status}`);
     const status = await answer.json();
     if (status.revision !== revision) await replaceContent(status.revision);

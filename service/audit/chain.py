@@ -1,0 +1,126 @@
+"""Records of the audit and the proof that they are all there and as written. Pure."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from service.push.entries import GENESIS, Doc, canonical
+from service.storage.store_audit import AuditRecord
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What is to be recorded.
+
+    Parameters
+    ----------
+    who : str
+        ``os:NAME@HOST`` at the command line, ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous`` on the network.
+    action : str
+        ``abbe measure``, ``POST /login``.
+    target : str
+        Machine file, user, file, address.
+    outcome : str
+        ``done``, ``no``, ``refused 403``, a code of an error.
+    doc : dict
+        More of it: options, reasons. No secrets.
+    """
+
+    who: str
+    action: str
+    target: str
+    outcome: str
+    doc: Doc
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """What was kept of the audit's end outside of the database."""
+
+    id: int
+    digest: str
+    mac: str
+
+
+def key_name(key: bytes) -> str:
+    """What a record calls the key of its seal: says nothing about the key."""
+    return hashlib.sha256(b"abbe audit key " + key).hexdigest()[:16]
+
+
+def mac_of(key: bytes, digest: str) -> str:
+    """Seal of a record: without the key nobody makes a chain anew."""
+    return hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
+
+
+def digest_of(number: int, utc: str, event: Event, prev: str, name: str) -> str:
+    """SHA-256 of a record's content and of the digest before it."""
+    return hashlib.sha256(canonical([number, utc, event.who, event.action, event.target, event.outcome, event.doc, prev, name])).hexdigest()
+
+
+def follow(last: AuditRecord | None, utc: str, event: Event, key: bytes) -> AuditRecord:
+    """Make the record that follows ``last``."""
+    number, prev, name = (1, GENESIS, key_name(key)) if last is None else (last.id + 1, last.digest, key_name(key))
+    digest = digest_of(number, utc, event, prev, name)
+    return AuditRecord(
+        number, utc, event.who, event.action, event.target, event.outcome, event.doc, prev, digest, name, mac_of(key, digest)
+    )
+
+
+def faults(records: Sequence[AuditRecord], anchors: Sequence[Anchor], key: bytes) -> list[str]:
+    """Everything that is wrong with an audit; an empty list: it is all there and as written.
+
+    Parameters
+    ----------
+    records : sequence of AuditRecord
+        All of them, in the order of their numbers.
+    anchors : sequence of Anchor
+        What was kept outside.
+    key : bytes
+        Of the seals.
+    """
+    found, head, mine = [], GENESIS, key_name(key)
+    for number, record in enumerate(records, 1):
+        event = Event(record.who, record.action, record.target, record.outcome, record.doc)
+        if record.id != number:
+            found.append(f"record {number} is missing")
+            break
+        if record.prev != head:
+            found.append(f"record {number} does not follow the one before it")
+        if record.digest != _digest_or_none(record, event):
+            found.append(f"record {number} was changed after it was written")
+        if record.key != mine:
+            found.append(f"record {number} is sealed with a key that is not here ({record.key})")
+        elif not hmac.compare_digest(record.mac, mac_of(key, record.digest)):
+            found.append(f"record {number} was not sealed by this service")
+        head = record.digest
+    return found + _against(records, anchors, key)
+
+
+def _digest_or_none(record: AuditRecord, event: Event) -> str | None:
+    try:
+        return digest_of(record.id, record.utc, event, record.prev, record.key)
+    except (TypeError, ValueError):  # no JSON any more
+        return None
+
+
+def _against(records: Sequence[AuditRecord], anchors: Sequence[Anchor], key: bytes) -> list[str]:
+    """What the kept heads say: the database must hold each of them."""
+    found, held = [], {record.id: record.digest for record in records}
+    for anchor in anchors:
+        if not hmac.compare_digest(anchor.mac, mac_of(key, f"{anchor.id} {anchor.digest}")):
+            found.append(f"the head kept for record {anchor.id} was not sealed by this service")
+        elif anchor.id not in held:
+            found.append(f"the audit ended with record {anchor.id} at least, and holds {len(records)}")
+        elif held[anchor.id] != anchor.digest:
+            found.append(f"record {anchor.id} is not the one whose head was kept")
+    if records and not anchors:
+        found.append("no head was kept outside of the database: nobody knows how long the audit was")
+    return found
+
+
+def anchor_of(record: AuditRecord, key: bytes) -> Anchor:
+    """The head to keep of a record."""
+    return Anchor(record.id, record.digest, mac_of(key, f"{record.id} {record.digest}"))

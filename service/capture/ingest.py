@@ -1,0 +1,138 @@
+"""From a segment into the database, in a thread of its own: a locked or missing database delays it and nothing else."""
+
+from __future__ import annotations
+
+import os
+import threading
+import zlib
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError, TimeoutError
+
+from service.capture.records import CHUNK, GAP, Record, decode_at
+from service.errors import AbbeError, CaptureFault, StoreError
+from service.storage.records import ChunkRecord
+from service.storage.store import Store
+
+RETRY_S = 0.1
+END_S = 10.0
+"""So long is waited for a write that the database has begun and does not end."""
+BATCH = 200
+
+
+def chunk_of(record: Record) -> ChunkRecord:
+    """The row of the database that a record of a segment becomes."""
+    r = record
+    crc = zlib.crc32(r.payload)
+    count = r.count if r.kind == CHUNK else 1
+    return ChunkRecord(r.run, r.channel, r.chunk_no, count, r.codec, crc, r.payload, r.first_host_s, r.last_host_s, r.first_us, r.last_us)
+
+
+def may_pass(error: BaseException) -> bool:
+    """Tell whether the database may take the same chunks later: locked, full, restarting, gone for a while."""
+    cause = error.__cause__
+    return isinstance(cause, DBAPIError | TimeoutError) and not isinstance(cause, IntegrityError | DataError | ProgrammingError)
+
+
+def is_full(error: BaseException) -> bool:
+    """Tell whether the database says that its disk is full, in SQLite's words or with PostgreSQL's code (53100, disk_full)."""
+    said = getattr(error.__cause__, "orig", None)
+    if not isinstance(error, StoreError) or said is None:
+        return False
+    return getattr(said, "sqlstate", None) == "53100" or any(words in str(said).lower() for words in ("is full", "no space left"))
+
+
+class Ingest:
+    """Reads records back from the segment, checks them, and gives them to the database until it takes them.
+
+    Parameters
+    ----------
+    store : Store
+        Where they go.
+    path : Path
+        The segment.
+    disk_full : callable
+        Called when the database finds no disk space.
+    """
+
+    def __init__(self, store: Store, path: Path, disk_full: Callable[[], None]) -> None:
+        self.error: AbbeError | None = None
+        self.ingested = 0
+        self._store, self._disk_full = store, disk_full
+        self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._places: deque[tuple[int, int]] = deque()
+        self._stop = False
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="abbe-ingest", daemon=True)
+        self._thread.start()
+
+    def add(self, places: list[tuple[int, int]]) -> None:
+        """Records that are durable now: offset and length in the segment."""
+        with self._news:
+            self._places.extend(places)
+            self._news.notify()
+
+    @property
+    def waiting(self) -> int:
+        """Records that the database does not have yet."""
+        return len(self._places)
+
+    def finish(self, timeout_s: float) -> bool:
+        """Wait until the database has everything; False when it did not take all in time (the segment keeps it)."""
+        with self._news:
+            done = self._news.wait_for(lambda: not self._places or self.error is not None, timeout_s)
+            self._stop = True
+            self._news.notify_all()
+        self._thread.join(END_S)
+        if self._thread.is_alive():  # the file stays open: the thread is in the middle of it
+            return False
+        os.close(self._file)
+        return done and self.error is None
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._places or self._stop)
+                batch = [self._places[k] for k in range(min(BATCH, len(self._places)))]
+                if self._stop or not batch:
+                    return
+            try:
+                self._give([self._read(*place) for place in batch])
+            except AbbeError as error:
+                if not may_pass(error):
+                    self._fail(error)
+                    return
+                with self._news:
+                    self._news.wait_for(lambda: self._stop, RETRY_S)
+                if is_full(error):
+                    self._disk_full()
+                continue
+            except Exception as error:  # noqa: BLE001 - a thread that dies in silence would look like a slow database
+                self._fail(CaptureFault(f"the way to the database broke: {error!r}", "report this"))
+                return
+            with self._news:
+                for _ in batch:
+                    self._places.popleft()
+                self.ingested += len(batch)
+                self._news.notify_all()
+
+    def _fail(self, error: AbbeError) -> None:
+        with self._news:
+            self.error = error
+            self._news.notify_all()
+
+    def _give(self, records: list[Record]) -> None:
+        chunks = [chunk_of(record) for record in records if record.kind in (CHUNK, GAP)]
+        if chunks:
+            self._store.ingest_chunks(chunks)
+
+    def _read(self, offset: int, length: int) -> Record:
+        try:
+            found = decode_at(os.pread(self._file, length, offset), 0)
+        except OSError as error:
+            raise CaptureFault(f"the segment cannot be read back: {error.strerror}", "look at the disk") from error
+        if found is None:
+            raise CaptureFault("the segment reads back otherwise than it was written", "look at the disk")
+        return found[0]

@@ -1,0 +1,298 @@
+"""The recorder of real runs: samples go from the driver's thread to the segment, from there to the database."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator, Callable
+from contextlib import ExitStack, asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from drivers.api import BarBatch
+from drivers.links.shielded import run_to_end
+from service.capture.drafts import BAR, Drafter
+from service.capture.file_io import FileIO, RealFileIO
+from service.capture.folder import folder_of
+from service.capture.ingest import Ingest
+from service.capture.log import CaptureLog, Published
+from service.capture.reserve import Reserve
+from service.capture.segment import Segment, fault
+from service.capture.settings import ORPHAN, CaptureSettings, is_memory, segment_path, set_aside
+from service.clock import Clock
+from service.errors import StoreError
+from service.storage.store import Store
+
+CATCH_UP_S = 120.0
+LASER = "laser"
+
+_active: set[tuple[str, int]] = set()
+
+
+def _key(path: Path) -> tuple[str, int]:
+    return str(path), os.getpid()
+
+
+def is_active(path: Path) -> bool:
+    """Tell whether this very process is recording into a segment, or has not closed its run yet."""
+    return _key(path) in _active
+
+
+class _Tap:
+    def __init__(self, log: CaptureLog, stream: int) -> None:
+        self._log, self._stream = log, stream
+
+    def take(self, batch: BarBatch) -> None:
+        self._log.put((self._stream, batch))
+
+    def warn(self, text: str) -> None:
+        self._log.warnings.append(text)
+
+
+class CaptureRecorder:
+    """Records one run. Open it with `recording`.
+
+    Attributes
+    ----------
+    log : CaptureLog
+        The segment and its thread.
+    ingest : Ingest
+        The way to the database.
+    behind : bool
+        The segment holds what the database does not; after the end: it must stay, and the run open, for the next start.
+    """
+
+    def __init__(self, log: CaptureLog, ingest: Ingest, keep: bool, io: FileIO, *, temporary: bool = False) -> None:
+        self.log, self.ingest = log, ingest
+        self._temporary = temporary
+        self.behind = True
+        self._keep, self._io = keep, io
+        self._streams = 0
+
+    def tap(self) -> _Tap:
+        """What a new stream gives every sample to."""
+        self._streams += 1
+        return _Tap(self.log, self._streams - 1)
+
+    async def add_bar(self, batch: BarBatch) -> None:
+        """Hear of a batch that the tap has taken.
+
+        Raises
+        ------
+        DiskFull, CaptureFault, CaptureConflict
+            Samples are not safe any more: the machine has to stop.
+        """
+        self.check()
+
+    async def add_record(self, record: dict[str, Any]) -> None:
+        """Take one record of the laser.
+
+        Raises
+        ------
+        DiskFull, CaptureFault, CaptureConflict
+            Samples are not safe any more: the machine has to stop.
+        """
+        self.check()
+        self.log.put((LASER, record))
+
+    async def flush(self) -> None:
+        """Wait until everything given so far is on the disk.
+
+        Raises
+        ------
+        DiskFull, CaptureFault, CaptureConflict
+            It will not get there.
+        """
+        await asyncio.to_thread(self.log.flush)
+        self.check()
+
+    def check(self) -> None:
+        """Raise what has gone wrong in the threads."""
+        error = self.log.error or self.ingest.error
+        if error is not None:
+            raise error
+
+    @property
+    def durable_seq(self) -> int:
+        """Every ball-bar sample up to this number of the present stream survives a kill and a power cut; -1: none yet."""
+        return self.log.durable.get(BAR, (0, -1))[1]
+
+    def close(self, status: str, reason: str) -> None:
+        """End the segment and wait for the database. Blocks. Whatever goes wrong here, ``behind`` is only taken back by the database."""
+        self.behind, taken = True, False
+        try:
+            self.log.close({"status": status, "reason": reason}, "" if status == "complete" else reason)
+        finally:
+            taken = self.ingest.finish(CATCH_UP_S)
+            self.behind = not taken or self.log.hangs
+
+    def doc(self) -> dict[str, Any]:
+        """What the end document says about the samples."""
+        log = self.log
+        capture = log.drafter.ledger.doc() | {
+            "records": log.segment.records,
+            "head_sha256": log.segment.head.hex(),
+            "warnings": log.warnings,
+            "streams": log.streams,
+        }
+        return {"gaps": [gap.doc() for gap in log.gaps], "capture": capture}
+
+    def discard(self) -> None:
+        """Delete the segment: the database has everything and the run is closed there."""
+        if not self._keep:
+            with suppress(OSError):  # the next start finds that all of it is in the database
+                self._io.remove(self.log.segment.path)
+        if self._temporary:
+            with suppress(OSError):  # other runs may be in it
+                self.log.segment.path.parent.rmdir()
+
+    def release(self) -> None:
+        """The run is closed, or stays open for the recovery: from now on this process may take the segment over as any other."""
+        _active.discard(_key(self.log.segment.path))
+
+
+async def close_run(store: Store, run_id: int, recorder: CaptureRecorder | None, status: str, reason: str, end: dict[str, Any]) -> None:
+    """Close a run in the database and delete its segment; a run whose samples are not all there stays open and visibly incomplete.
+
+    Parameters
+    ----------
+    recorder : CaptureRecorder or None
+        After its end; None when there was no recording.
+    status, reason, end : str, str, dict
+        As `Store.finish_run` takes them.
+
+    Raises
+    ------
+    StoreError
+        The database does not take it. The segment stays, and the next start closes the run.
+    """
+    try:
+        if recorder is not None and recorder.behind:
+            return  # the next start takes over what its segment holds, and closes it
+        await store.write(store.finish_run, run_id, status, reason, end)
+        if recorder is not None:
+            recorder.discard()
+    finally:
+        if recorder is not None:
+            recorder.release()
+
+
+@asynccontextmanager
+async def recording(
+    store: Store,
+    run_id: int,
+    settings: CaptureSettings,
+    clock: Clock,
+    about: dict[str, Any] | None = None,
+    *,
+    io: FileIO | None = None,
+    published: Published = lambda channel, stream, seq: None,
+) -> AsyncIterator[CaptureRecorder]:
+    """A recorder for one run.
+
+    Parameters
+    ----------
+    store : Store
+        The database.
+    run_id : int
+        Run in it.
+    settings : CaptureSettings
+        Folder and reserve.
+    clock : Clock
+        For the UTC offset that is noted beside every chunk; no sample time depends on it.
+    about : dict, optional
+        Who measures what, for the segment's first record.
+    io : FileIO, optional
+        For tests.
+    published : callable, optional
+        Called in the capture's thread whenever more samples are durable.
+
+    Raises
+    ------
+    DiskFull, CaptureFault
+        Nothing can be written, before anything moves; or not all samples could be made safe.
+    StoreError
+        At the end: the database did not take everything in time. The segment keeps it, and the next start catches up.
+    """
+    recorder = await _opened_or_closed(lambda: _opened(store, run_id, settings, clock, about or {}, io or RealFileIO(), published))
+    status, reason = "failed", "stopped"
+    try:
+        yield recorder
+        status, reason = "complete", ""
+    except BaseException as error:
+        reason = str(error) or type(error).__name__
+        raise
+    finally:
+        await run_to_end(asyncio.to_thread(recorder.close, status, reason))
+    recorder.check()
+    if recorder.behind:
+        raise StoreError(
+            f"the database did not take all samples within {CATCH_UP_S:g} s; they are safe in {recorder.log.segment.path}",
+            "see to the database; the next `abbe` command that connects to the machine takes them over",
+        )
+
+
+async def _opened_or_closed(work: Callable[[], CaptureRecorder]) -> CaptureRecorder:
+    """Open a recorder; if the caller is cancelled meanwhile, what comes back is closed again."""
+    found: list[CaptureRecorder] = []
+
+    async def opening() -> None:
+        found.append(await asyncio.to_thread(work))
+
+    try:
+        await run_to_end(opening())
+    except BaseException:
+        for one in found:
+            await run_to_end(asyncio.to_thread(one.close, "failed", ""))  # nothing was measured: there is no gap either
+            one.release()
+        raise
+    return found[0]
+
+
+def _opened(
+    store: Store, run_id: int, settings: CaptureSettings, clock: Clock, about: dict[str, Any], io: FileIO, published: Published
+) -> CaptureRecorder:
+    folder = folder_of(store, settings)
+    temporary = is_memory(store.url) and not settings.folder
+    reserve = Reserve(io, folder, 0 if temporary else settings.reserve_bytes)
+    opening = about | {"run": run_id, "utc": clock.utc().isoformat(), "started_utc": store.run(run_id).started_utc}
+    _make(folder, io)
+    reserve.hold()
+    path = segment_path(folder, run_id)
+    _active.add(_key(path))  # before there is a file that a recovery could find
+    try:
+        if path.exists():  # of a database that was deleted since: the same numbers come again
+            set_aside(path, ORPHAN)
+        drafter = Drafter(run_id, lambda: clock.utc().timestamp() - clock.monotonic_s())
+        log, ingest = _begun(store, Segment(io, path), drafter, reserve, opening, published)
+    except BaseException as error:
+        _active.discard(_key(path))
+        if isinstance(error, OSError):
+            raise fault(path, "open", error) from error
+        raise
+    return CaptureRecorder(log, ingest, settings.keep, io, temporary=temporary)
+
+
+def _make(folder: Path, io: FileIO) -> None:
+    """Make a folder whose every new level survives a power cut."""
+    made = [one for one in (folder, *folder.parents) if not one.exists()] or [folder]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for one in reversed(made):
+            io.sync_folder(one.parent)
+    except OSError as error:
+        raise fault(folder, "make the folder", error) from error
+
+
+def _begun(
+    store: Store, segment: Segment, drafter: Drafter, reserve: Reserve, opening: dict[str, Any], published: Published
+) -> tuple[CaptureLog, Ingest]:
+    """The two threads of a recording; without both of them there is none, and the file is given back."""
+    logs: list[CaptureLog] = []
+    with ExitStack() as undo:
+        undo.callback(segment.close)
+        ingest = Ingest(store, segment.path, lambda: logs[0].disk_full() if logs else None)
+        undo.callback(ingest.finish, 0.0)
+        logs.append(CaptureLog(segment, drafter, reserve, opening, ingest.add, published))
+        undo.pop_all()
+    return logs[0], ingest

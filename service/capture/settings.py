@@ -1,0 +1,122 @@
+"""Where segments lie until the database has everything: beside a SQLite file, else in a folder of the machine file."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tempfile
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from service.errors import ConfigError
+from service.storage.engine import parse_url
+
+MIB = 1 << 20
+SUFFIX = ".seg"
+ORPHAN = ".orphan"
+"""Set aside: a segment of no run of this database, or of a closed run that does not have all of it."""
+CONFLICT = ".conflict"
+"""Set aside: a segment that contradicts the database or cannot be read."""
+DAMAGED_SUFFIX = ".damaged"
+"""Set aside: a segment with damage between good records; what could be read is in the database."""
+TAIL = ".tail"
+"""A copy of what was cut off the end of a segment."""
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureSettings:
+    """How samples are made safe.
+
+    Parameters
+    ----------
+    folder : str
+        Local folder for segments; empty: beside the SQLite file.
+    reserve_bytes : int
+        Disk space held back to close a run when the disk is full.
+    keep : bool
+        Keep segments although the database has everything.
+    """
+
+    folder: str = ""
+    reserve_bytes: int = 16 * MIB
+    keep: bool = False
+
+
+def is_memory(database_url: str) -> bool:
+    """Tell whether the database ends with the process; segments that outlive it would be nobody's."""
+    parsed = parse_url(database_url)
+    return parsed.drivername == "sqlite" and parsed.database in {None, "", ":memory:"}
+
+
+def segment_folder(database_url: str, settings: CaptureSettings, database_id: str = "") -> Path:
+    """Folder of the segments of a database, however its address is written; not created.
+
+    Parameters
+    ----------
+    database_url : str
+        As the store was opened; a password in it does not matter. Of SQLite the file counts that it leads to, be it by a link.
+    settings : CaptureSettings
+        Of the machine file.
+    database_id : str
+        Of a database on a server: what it calls itself (`Store.database_id`), for it has many addresses.
+
+    Raises
+    ------
+    ConfigError
+        A PostgreSQL database, and no folder is configured.
+    """
+    parsed = parse_url(database_url)
+    if is_memory(database_url):
+        return Path(settings.folder or tempfile.gettempdir()) / f"abbe-capture-{os.getpid()}"
+    if parsed.drivername == "sqlite":
+        file = Path(str(parsed.database)).resolve()
+        return _named(settings.folder, file.stem, str(file)) if settings.folder else Path(f"{file}-capture")
+    if not settings.folder:
+        raise ConfigError(
+            "samples are written to a local file before they go to PostgreSQL, and no folder for it is configured",
+            'add capture = "/var/lib/abbe/capture" under [store] of the machine file',
+        )
+    return _named(settings.folder, "postgresql", database_id)
+
+
+def _named(folder: str, name: str, what: str) -> Path:
+    """A folder may serve several databases, whose runs have the same numbers."""
+    readable = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
+    return Path(folder) / f"{readable}-{hashlib.sha256(what.encode()).hexdigest()[:8]}"
+
+
+def other_folders(database_url: str, settings: CaptureSettings, present: Path) -> list[Path]:
+    """Where earlier versions, which named the folder by the address, or another machine file may have left segments of this database.
+
+    What lies there may as well be of other databases: only what names a run of this one may be touched.
+    """
+    parsed = parse_url(database_url)
+    found = []
+    if parsed.drivername == "sqlite" and not is_memory(database_url):
+        file = Path(str(parsed.database))
+        found = [Path(f"{file}-capture"), Path(f"{file.resolve()}-capture")]
+    if settings.folder and Path(settings.folder).is_dir():
+        found += sorted(one for one in Path(settings.folder).iterdir() if one.is_dir())
+    different = {one.resolve(): one for one in found if one.is_dir()}
+    different.pop(present.resolve(), None)
+    return list(different.values())
+
+
+def segment_path(folder: Path, run_id: int) -> Path:
+    """The segment of a run."""
+    return folder / f"run-{run_id:08d}{SUFFIX}"
+
+
+def free_name(path: Path, suffix: str) -> Path:
+    """Name beside a file with another suffix that nothing has yet, e.g. ``run-00000012.orphan-2``."""
+    names = (path.with_suffix(suffix if k == 1 else f"{suffix}-{k}") for k in count(1))
+    return next(name for name in names if not name.exists())
+
+
+def set_aside(path: Path, suffix: str) -> Path:
+    """Rename a file so that nobody takes it for a segment any more, and nothing is overwritten. Raises OSError."""
+    name = free_name(path, suffix)
+    path.rename(name)
+    return name

@@ -1,0 +1,218 @@
+"""`abbe comp`: compensation tables - as the files that controls read, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+
+if TYPE_CHECKING:
+    from service.config_schema import MachineFile
+    from service.formats.choice import Choice
+    from service.formats.model import Compensation
+
+comp = typer.Typer(help="Compensation tables: as the files that controls read, and back.", no_args_is_help=True)
+
+FormatOption = Annotated[
+    str, typer.Option("--format", metavar="F", help="Format or control; abbe comp formats lists them.", show_default=False)
+]
+ReferenceOption = Annotated[
+    str | None,
+    typer.Option("--reference", metavar="X,Y,Z", help="Where tables are zero, mm. Default: start of every stroke.", show_default=False),
+]
+
+
+@comp.command("formats")
+def list_formats(as_json: JsonOption = False) -> None:
+    """List formats and controls: what each can hold, how its sign is known."""
+    from service.formats.controls import CONTROLS
+    from service.formats.registry import FORMATS
+
+    rows = [(f.key, f.name, _holds(f.limits), str(f.limits.points), f.sign.evidence, f.sign.words) for f in FORMATS.values()]
+    if as_json:
+        keys = ("format", "name", "holds", "points", "evidence", "sign")
+        print_json({"formats": [dict(zip(keys, r, strict=True)) for r in rows], "controls": {c.key: c.name for c in CONTROLS.values()}})
+        return
+    print_table(("format", "what", "holds", "points", "evidence", "sign"), rows)
+    print_table(("control", "what"), [(c.key, c.name) for c in CONTROLS.values()])
+
+
+@comp.command("export")
+def export_tables(  # noqa: PLR0913 - one argument for each option
+    solution: Annotated[
+        str, typer.Argument(metavar="SOLUTION", help="Number of a stored solution, or a file of abbe solve --json.", show_default=False)
+    ],
+    form: FormatOption,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="File; a new folder if the format has several files.", show_default=False)
+    ],
+    reference: ReferenceOption = None,
+    without_table: Annotated[
+        bool, typer.Option("--without-table", help="I know that no correction was in force while this was measured.")
+    ] = False,
+    sign: Annotated[
+        Path | None, typer.Option("--sign", metavar="KEY", help="Sign for the machine of --machine: FILE.sig.", show_default=False)
+    ] = None,
+    days: Annotated[float, typer.Option("--days", help="With --sign: how long the files may be taken in.")] = 30.0,
+    base: Annotated[str, typer.Option("--base", help="With --sign: fingerprint of the table that was active while measuring.")] = "none",
+    db: DbOption = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the best tables that a control can hold, with what each kind of table would leave."""
+    from service.clock import SystemClock
+    from service.workflows.comp_export import control_for, export, formats_in, identified, reference_of, write_files
+    from service.workflows.comp_signed import Seal, check_signing, sign_files
+
+    doc = _solution(solution, db, machine)
+    known = identified(doc)
+    seal = None if sign is None else Seal(sign, days, base)
+    config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
+    fresh = _fresh(solution, db, machine, said_so=without_table)
+    made = export(known, form, reference_of(reference), fresh=fresh)
+    written = [str(p) for p in write_files(made.files, out, folder=len(formats_in(control_for(form))) > 1)]
+    if seal is not None and config is not None:
+        written.append(str(sign_files(out, form, config, seal, SystemClock().utc())))
+    if as_json:
+        print_json({"files": written, "choices": [_choice(c) for c in made.choices], "notes": list(made.notes)})
+        return
+    headings = ("tables", "left: rms (µm)", "largest (µm)", "numbers", "")
+    rows = [(c.kind, f"{c.rms_mm * 1e3:.2f}", f"{c.max_mm * 1e3:.2f}", str(c.numbers), "written" if c.best else "") for c in made.choices]
+    print_table(headings, rows, title="left of the identified error over the volume, both directions, rigid motion removed")
+    for note in made.notes:
+        typer.echo(f"- {note}")
+    typer.echo(f"wrote {', '.join(written)}")
+
+
+@comp.command("import")
+def import_tables(  # noqa: PLR0913 - one argument for each option
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File, or the folder of several.", show_default=False)],
+    form: FormatOption,
+    solution: Annotated[
+        str | None, typer.Option("--solution", metavar="SOLUTION", help="Compare with what this solution would give.", show_default=False)
+    ] = None,
+    reference: ReferenceOption = None,
+    trust: Annotated[
+        list[str] | None,
+        typer.Option("--trust", metavar="KEY", help="Public key whose signature counts, besides the machine file's.", show_default=False),
+    ] = None,
+    base: Annotated[str | None, typer.Option("--base", help="Fingerprint of the table in force, if known.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Read a control's files as the control would: show the tables, what they are worth (signed for this machine, or only a candidate),
+    and how they differ from a solution's.
+    """
+    from service.clock import SystemClock
+    from service.formats.compare import check_same
+    from service.workflows.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
+    from service.workflows.comp_signed import Asked, standing
+
+    control, known, at = control_for(form), None, reference_of(reference)
+    if solution is not None:
+        known = identified(_solution(solution, db, machine))
+    nominal = known.machine if known is not None else _machine(machine)
+    start = at if at is not None else nominal.stroke_mm[:, 0]
+    files = read_files(file)
+    worth = standing(file, files, _machine_file(machine), Asked(form, tuple(trust or ()), base), SystemClock().utc())
+    found = read_key(form, files, settings_for(control, nominal, start))
+    doc: dict[str, Any] = {"tables": _tables(found), "standing": "signed" if worth.signed else "candidate", "why": worth.why}
+    if known is not None:
+        same = check_same(found, expected(known, control, at), 0.51 * control.unit_mm + 1e-6)
+        doc["differences_um"] = {d.axis: d.size_mm * 1e3 for d in same}
+    if as_json:
+        print_json(doc)
+        return
+    print_table(
+        ("table", "points", "from (mm)", "to (mm)", "smallest", "largest", "unit"), [tuple(map(str, t.values())) for t in doc["tables"]]
+    )
+    typer.echo(f"{doc['standing']}: {worth.why}")
+    if "differences_um" in doc:
+        words = ", ".join(f"{a} {v:.4f} µm" for a, v in doc["differences_um"].items())
+        typer.echo(f"these are the tables of solution {solution}; largest difference: {words}")
+
+
+def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, Any]:
+    from service.workflows.comp_export import solution_document
+
+    def stored(number: int) -> dict[str, Any]:
+        with open_store(database_url(db, machine)) as store:
+            return dict(store.solution(number).doc)
+
+    return solution_document(source, stored)
+
+
+def _fresh(source: str, db: str | None, machine: Path | None, *, said_so: bool) -> bool:
+    """Whether a solution is known to have been measured without a correction; refused where there was one."""
+    from service.workflows.comp_export import solution_document
+    from service.workflows.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
+
+    if not source.isdigit():
+        return check_fresh(tables_of(solution_document(source, lambda _: {})), no_images, said_so=said_so)
+    with open_store(database_url(db, machine)) as store:
+        return check_fresh(stored_tables(store, int(source)), images_of(store), said_so=said_so)
+
+
+def _machine_file(file: Path | None) -> MachineFile | None:
+    """What a machine file says; None without one."""
+    from service.config import load_machine
+
+    return None if file is None else load_machine(file).machine
+
+
+def _machine(file: Path | None) -> Any:
+    """Nominal geometry of a machine file; without one, a machine that only says where zero is."""
+    import numpy as np
+
+    from models.machine import Machine
+    from service.config import load_machine
+    from service.site import site_of
+
+    if file is not None:
+        return site_of(load_machine(file).machine).machine
+    return Machine("w-X-Y-b-Z-t", np.array([[0.0, 1.0]] * 3))
+
+
+def _choice(c: Choice) -> dict[str, Any]:
+    return {"kind": c.kind, "rms_um": c.rms_mm * 1e3, "max_um": c.max_mm * 1e3, "numbers": c.numbers, "best": c.best}
+
+
+def _holds(limits: Any) -> str:
+    words = ("own", "cross", "products", "lattice", "motions")
+    held = [w for w in words if getattr(limits, w)]
+    return ", ".join(held) + ("; both directions" if limits.directional and limits.own else "")
+
+
+def _tables(found: Compensation) -> list[dict[str, Any]]:
+    """One line per table: name, points, range, smallest and largest number as a correction."""
+    rows = []
+    for t in found.tables:
+        ways = [("", t.forward_mm)] if not t.directional else [(", moving in +", t.forward_mm), (", moving in −", t.backward_mm)]
+        rows += [_row(f"{t.name}{word}", t.position_mm, v * 1e3, "µm") for word, v in ways]
+    for p in found.products:
+        rows.append(_row(f"{p.name}: angle", p.angle.position_mm, p.angle.value * 1e6, "µrad"))
+        rows.append(_row(f"{p.name}: lever", p.lever.position_mm, p.lever.value, "mm"))
+    if found.lattice is not None:
+        for a, axis in enumerate("XYZ"):
+            rows.append(_row(f"3-D grid, {axis}", found.lattice.position_mm[a], found.lattice.correction_mm[..., a] * 1e3, "µm"))
+    if found.motions is not None:
+        for name, c in found.motions.curves.items():
+            angle = name[1] in "ABC"
+            rows.append(_row(f"error motion {name}", c.position_mm, c.value * (1e6 if angle else 1e3), "µrad" if angle else "µm"))
+    return rows
+
+
+def _row(name: str, position: Any, value: Any, unit: str) -> dict[str, Any]:
+    return {
+        "table": name,
+        "points": int(position.size),
+        "from_mm": float(position[0]),
+        "to_mm": float(position[-1]),
+        "smallest": round(float(value.min()), 4),
+        "largest": round(float(value.max()), 4),
+        "unit": unit,
+    }

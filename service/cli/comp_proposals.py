@@ -1,0 +1,195 @@
+"""`abbe comp propose | show | diff | approve`: tables as proposals, looked at and agreed to before anything is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from service.cli.measure import MachineArgument, ready_session
+
+if TYPE_CHECKING:
+    from service.storage.store import Store
+    from service.workflows.proposal_doc import Proposed
+    from service.workflows.proposals import Made
+
+ProposalArgument = Annotated[int, typer.Argument(metavar="PROPOSAL", help="Number of a proposal; abbe comp show lists them.")]
+
+
+def propose(
+    machine: MachineArgument,
+    campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Identification campaign in the store.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Solve a campaign and store the tables that follow as a proposal; writes nothing to the controller (exit code 1: reasons against)."""
+    from dataclasses import replace
+
+    from service.cli.progress import display
+    from service.cli.running import run_job
+    from service.config import load_machine
+    from service.devices.session import DeviceUrls
+    from service.site import site_of
+    from service.storage.store import Store
+    from service.workflows.proposals import gather, make
+
+    loaded = load_machine(machine)
+    site = site_of(loaded.machine)
+
+    async def work(store: Store) -> Made:
+        store.campaign(campaign)
+        with display() as sink:
+            async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
+                return await make(store, site, await gather(session.controller, store, site, campaign), progress=sink)
+
+    with Store.open(loaded.database_url) as store:
+        made = run_job(work(store))
+        _print_made(store, made, as_json=as_json)
+    raise typer.Exit(1 if made.proposed.reasons else 0)
+
+
+def _print_made(store: Store, made: Made, *, as_json: bool) -> None:
+    if as_json:
+        print_json(_row(store, made.number, made.proposed))
+        return
+    typer.echo(f"proposal {made.number}: {_promise(made.proposed)}")
+    for reason in made.proposed.reasons:
+        typer.echo(f"against it: {reason}")
+    for line in made.proposed.not_for_tables:
+        typer.echo(f"not in the tables: {line}")
+    if made.proposed.reasons:
+        typer.echo("it is stored to be looked at, and cannot be approved or pushed")
+
+
+def show_proposals(
+    proposal: Annotated[
+        int | None, typer.Argument(metavar="PROPOSAL", help="Number; without it all are listed.", show_default=False)
+    ] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Proposals: what they promise, with uncertainty, where they stand, what spoke against them."""
+    from service.workflows.proposal_doc import load
+
+    with open_store(database_url(db, machine)) as store:
+        if proposal is None:
+            _print_list(store, as_json=as_json)
+            return
+        proposed = load(store, proposal)
+        row = _row(store, proposal, proposed)
+    if as_json:
+        print_json(row)
+        return
+    typer.echo(f"proposal {proposal}: {row['state']}{': ' if row['why'] else ''}{row['why']}")
+    typer.echo(_promise(proposed))
+    for name in ("machine", "campaign", "solution", "by", "utc", "valid_until", "base_crc", "generation", "digest"):
+        typer.echo(f"{name.replace('_', ' ')}: {row[name]}")
+    for word, lines in (("against it", row["reasons"]), ("not in the tables", row["not_for_tables"])):
+        for line in lines:
+            typer.echo(f"{word}: {line}")
+    for a in row["approvals"]:
+        typer.echo(f"approved by {a['name']} (account {a['login']}) at {a['utc']} until {a['expiry']}")
+
+
+def _print_list(store: Store, *, as_json: bool) -> None:
+    from service.errors import StoreError
+    from service.workflows.proposal_doc import load
+
+    rows: list[dict[str, Any]] = []
+    for record in store.proposals():
+        try:
+            rows.append(_row(store, record.id, load(store, record.id)))
+        except StoreError as error:  # one bad row must not hide the others
+            blank = dict.fromkeys(("campaign", "by", "utc"), "")
+            rows.append({"proposal": record.id, "machine": record.machine, "state": "changed", "why": error.detail, "promise": ""} | blank)
+    if as_json:
+        print_json({"proposals": rows})
+        return
+    keys = ("proposal", "machine", "campaign", "by", "utc", "promise", "state", "why")
+    print_table(("no", *keys[1:]), [tuple(str(r[k]) for k in keys) for r in rows])
+
+
+def diff(
+    proposal: ProposalArgument,
+    other: Annotated[
+        str, typer.Option("--with", metavar="ACTIVE|PROPOSAL", help="The table in force when it was made, or another proposal.")
+    ] = "ACTIVE",
+    html: Annotated[Path | None, typer.Option("--html", metavar="FILE.html", help="Write numbers and picture.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """What a proposal changes: each of the nine tables in numbers, and as a picture."""
+    from service.report.page_file import write_page
+    from service.workflows.proposal_diff import HEADINGS, compare, diff_html, diff_json, largest, rows
+    from service.workflows.proposal_doc import load
+
+    with open_store(database_url(db, machine)) as store:
+        found = compare(store, proposal, other)
+        proposed = load(store, proposal)
+    if html is not None:
+        write_page(diff_html(found, proposed), html)
+    if as_json:
+        print_json(diff_json(found))
+        return
+    print_table(HEADINGS, rows(found), title=f"{found.new} against {found.old}; U: k = 2")
+    typer.echo(largest(found))
+    if html is not None:
+        typer.echo(f"wrote {html}")
+
+
+def approve(
+    proposal: ProposalArgument,
+    name: Annotated[str, typer.Option("--as", metavar="NAME", help="Who approves. Default: the account.", show_default=False)] = "",
+    hours: Annotated[float, typer.Option("--hours", metavar="H", help="How long it holds, at most.", min=0.01, max=720.0)] = 24.0,
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Approve exactly this table on exactly this base, for this machine, under these limits (exit code 1: it cannot be approved)."""
+    from service.clock import SystemClock
+    from service.errors import TableRefused
+    from service.workflows.proposal_checks import approve as work_approve
+    from service.workflows.proposal_doc import load
+    from service.workflows.proposal_states import check_waiting
+    from service.workflows.proposals import login
+
+    with open_store(database_url(db, machine)) as store:
+        proposed = load(store, proposal)
+        try:
+            check_waiting(store, proposal, proposed, SystemClock().utc().timestamp())
+            done = work_approve(store, proposal, proposed, name.strip() or login(), hours, SystemClock())
+        except TableRefused as error:
+            typer.echo(f"not approved: {error}")
+            raise typer.Exit(1) from None
+    typer.echo(f"proposal {proposal} is approved by {done.name} until {done.expiry}")
+
+
+def _promise(proposed: Proposed) -> str:
+    p = proposed.predicted
+    before, after, expanded = p.before_mm * 1e3, p.after_mm * 1e3, 2e3 * p.u_model_mm
+    return f"{before:.1f} → {after:.1f} µm rms over the volume, better by {before - after:.1f} ± {expanded:.1f} µm (U, k = 2)"
+
+
+def _row(store: Store, number: int, proposed: Proposed) -> dict[str, Any]:
+    """Everything about a proposal that people and programs ask for, and where it stands."""
+    from datetime import UTC, datetime
+
+    from service.clock import SystemClock
+    from service.storage.base import utc_text
+    from service.workflows.proposal_states import standing
+
+    now = standing(store, number, proposed, SystemClock().utc().timestamp())
+    p, c = proposed.predicted, proposed.candidate
+    approvals = [{"name": a.name, "login": a.login, "utc": a.utc, "expiry": a.expiry} for a in store.approvals(number)]
+    return {
+        "proposal": number, "machine": c.machine, "campaign": proposed.campaign, "solution": proposed.solution_id,
+        "state": now.word, "why": now.text, "by": proposed.by, "utc": proposed.utc,
+        "valid_until": utc_text(datetime.fromtimestamp(proposed.valid_until_s, UTC)),
+        "promise": f"{p.before_mm * 1e3:.1f} → {p.after_mm * 1e3:.1f} µm, U {2e3 * p.u_model_mm:.1f}",
+        "predicted_rms_um": {"before": p.before_mm * 1e3, "after": p.after_mm * 1e3, "u_model": p.u_model_mm * 1e3},
+        "base_crc": f"{c.base_crc:08X}", "generation": proposed.base.gen, "boot": f"{proposed.base.boot:08X}", "digest": c.digest,
+        "two_people": proposed.two_people, "reasons": list(proposed.reasons), "not_for_tables": list(proposed.not_for_tables),
+        "approvals": approvals,
+    }  # fmt: skip

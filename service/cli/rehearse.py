@@ -1,0 +1,90 @@
+"""What `abbe measure` does without a machine: say it, draw it, or write it as an NC program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from service.sequences.check import DryRun
+    from service.sequences.steps import CampaignPlan
+    from service.site import Site
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What is wanted: a dry run (with every position, with a picture), or an NC program in a dialect."""
+
+    dry_run: bool
+    path: bool
+    picture: Path | None
+    nc: str
+    out: Path | None
+
+    def check(self, sources: tuple[Path, ...]) -> bool:
+        """Whether anything is wanted instead of a measurement.
+
+        Raises
+        ------
+        ConfigError
+            Options that do not go together, or a file that would overwrite what it is made of.
+        """
+        from service.errors import ConfigError
+
+        if self.picture is not None and not self.dry_run:
+            raise ConfigError("--picture draws a dry run", "add --dry-run")
+        if self.path and not self.dry_run:
+            raise ConfigError("--path prints the positions of a dry run", "add --dry-run")
+        if bool(self.nc) != (self.out is not None):
+            raise ConfigError("--nc DIALECT and --out FILE go together", "give both")
+        if self.nc and self.dry_run:
+            raise ConfigError("--nc and --dry-run do not go together", "give one of them")
+        for target in (self.picture, self.out):
+            if target is not None and any(target.resolve() == s.resolve() for s in sources):
+                raise ConfigError(f"{target} would be overwritten", "give another file name")
+        return self.dry_run or bool(self.nc)
+
+    def run(self, site: Site, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> None:
+        """Print, draw or write it."""
+        from service.report.page_file import write_page
+        from service.sequences.nc.write import nc_program
+        from service.workflows.dry_page import dry_page
+
+        if self.nc and self.out is not None:
+            made = nc_program(site.name, site.machine, plan, self.nc, site.nc)
+            write_page(made.text, self.out)
+            typer.echo(f"NC program: {self.out} ({self.nc}), {made.size}; read it before it runs")
+            if made.warning:
+                typer.echo(f"warning: {made.warning}", err=True)
+            return
+        print_path(plan) if self.path else print_dry_run(plan.name, runs)
+        if self.picture is not None:
+            write_page(dry_page(site.name, site.machine, plan, runs), self.picture)
+            typer.echo(f"picture: {self.picture}")
+
+
+def print_path(plan: CampaignPlan) -> None:
+    """Every commanded position of the plan, one CSV line each: test, X, Y, Z in mm."""
+    from service.sequences.check import positions
+
+    typer.echo("test,x_mm,y_mm,z_mm")
+    for test in plan.tests:
+        for x, y, z in positions(test.steps):
+            typer.echo(f"{test.label},{x:.5f},{y:.5f},{z:.5f}")
+
+
+def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
+    """One line a test: time, path, extent, largest speed, readings."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{name}: {sum(r.duration_s for r in runs) / 60:.1f} min of machine time, mounting not counted")
+    for column in ("test", "kind", "s", "path mm", "X", "Y", "Z", "mm/min", "readings"):
+        table.add_column(column, justify="left" if column in ("test", "kind") else "right")
+    for r in runs:
+        extent = [f"{r.lowest_mm[a]:.0f}..{r.highest_mm[a]:.0f}" for a in range(3)]
+        table.add_row(r.label, r.test, f"{r.duration_s:.0f}", f"{r.path_mm:.0f}", *extent, f"{r.fastest_mm_min:.0f}", str(r.readings))
+    Console().print(table)

@@ -1,0 +1,76 @@
+"""``abbe report``: a report that can be signed, as PDF, HTML, CSV or JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.common import DbOption, MachineOption, database_url, open_store, run_or_campaign
+
+if TYPE_CHECKING:
+    from service.report.document import Document
+    from service.workflows.report_parts import Rules
+
+
+def report(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN|CAMPAIGN|FOLDER|push|discovery|verification",
+            help="What the report is about: as for abbe show, or a kind and its number.",
+        ),
+    ],
+    number: Annotated[
+        int | None, typer.Argument(metavar="[N]", help="Number of the push, discovery or verification.", show_default=False)
+    ] = None,
+    out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--out", metavar="FILE", help="FILE.pdf, .html, .csv or .json; may be repeated. Default: a PDF here.", show_default=False
+        ),
+    ] = None,
+    of: Annotated[
+        str | None, typer.Option("--of", metavar="MACHINE", help="Whose push, where several machines are stored.", show_default=False)
+    ] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
+
+    --machine FILE takes its database, and adds limits, certificates and the allowed temperature. Nothing is measured or computed anew;
+    the same data give the same bytes.
+    """
+    from service.config import load_machine
+    from service.workflows.report import default_name, form_of, rules_of, write_report
+
+    for target in out or []:
+        form_of(target)  # before the work: a wrong ending is told at once
+    rules = rules_of(None if machine is None else load_machine(machine).machine)
+    # Both may be given: the machine file for its limits, and a database elsewhere (an archive, a fleet's).
+    url = database_url(db, machine if db is None else None)
+    document = _document(what, number, of, url, rules)
+    for target in out or [Path(default_name(document))]:
+        write_report(document, target)
+        typer.echo(f"report: {target}")
+    _, word, text = document.verdict
+    typer.echo(f"{document.title}: {word}. {text}".strip())
+
+
+def _document(what: str, number: int | None, of: str | None, url: str, rules: Rules) -> Document:
+    from service.errors import ConfigError
+    from service.workflows.campaign_folder import is_folder
+    from service.workflows.report import NUMBERED, folder_report, numbered_report, stored_report
+
+    if what in NUMBERED:
+        if number is None:
+            raise ConfigError(f"which {what}?", f"give its number: abbe report {what} N")
+        with open_store(url) as store:
+            return numbered_report(store, what, number, rules, of)
+    if number is not None:
+        raise ConfigError(f"{what} {number}: only {', '.join(NUMBERED)} have a number", "give one name: a run, a campaign or a folder")
+    if is_folder(what):
+        return folder_report(Path(what), rules)
+    with open_store(url) as store:
+        return stored_report(store, run_or_campaign(store, what), rules)

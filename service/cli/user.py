@@ -1,0 +1,141 @@
+"""`abbe user`: who may use the page and the interface, and as what."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+
+if TYPE_CHECKING:
+    from service.storage.store import Store
+    from service.users.people import People
+
+user = typer.Typer(help="Users of the page and of the interface: viewer, operator, metrologist, approver, admin.", no_args_is_help=True)
+token = typer.Typer(help="Tokens of programs: the rights of a user, at most those of their scopes.", no_args_is_help=True)
+user.add_typer(token, name="token")
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the user.", show_default=False)]
+RoleArgument = Annotated[str, typer.Argument(metavar="ROLE", help="viewer, operator, metrologist, approver or admin.", show_default=False)]
+
+
+@user.command("add")
+def add_user(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None) -> None:
+    """Add a user. The password is asked for, or read from the first line of standard input."""
+    with _people(db, machine, must_exist=False) as (people, _):
+        people.add(name, role, _password())
+    typer.echo(f"user {name!r} is {role}")
+
+
+@user.command("list")
+def list_users(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
+    """List users with their roles."""
+    with _people(db, machine) as (_, store):
+        found = store.users()
+    if as_json:
+        print_json([{"name": u.name, "role": u.role, "disabled_utc": u.disabled_utc, "created_utc": u.created_utc} for u in found])
+        return
+    rows = [(u.name, u.role, u.created_utc[:19], (u.disabled_utc or "")[:19]) for u in found]
+    print_table(("name", "role", "since (UTC)", "disabled (UTC)"), rows)
+
+
+@user.command("role")
+def set_role(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None) -> None:
+    """Give a user another role. His sessions end; his tokens keep what of their scopes the new role has."""
+    with _people(db, machine) as (people, _):
+        people.set_role(name, role)
+    typer.echo(f"user {name!r} is {role}")
+
+
+@user.command("password")
+def set_password(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
+    """Give a user another password: asked for, or read from standard input. His sessions end."""
+    with _people(db, machine) as (people, _):
+        people.get(name)
+        people.set_password(name, _password())
+    typer.echo(f"user {name!r} has a new password")
+
+
+@user.command("disable")
+def disable_user(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
+    """Shut a user out at once, with sessions and tokens. Users are not deleted: the audit names them."""
+    with _people(db, machine) as (people, _):
+        people.disable(name)
+    typer.echo(f"user {name!r} is shut out")
+
+
+@user.command("enable")
+def enable_user(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
+    """Let a user in again."""
+    with _people(db, machine) as (people, _):
+        people.disable(name, enable=True)
+    typer.echo(f"user {name!r} may log in")
+
+
+@token.command("new")
+def new_token(
+    name: Name,
+    title: Annotated[str, typer.Argument(metavar="TOKEN", help="Name of the token.", show_default=False)],
+    scope: Annotated[list[str], typer.Option("--scope", help="What it may do; may be repeated. A part of what the user may.")],
+    days: Annotated[float, typer.Option("--days", help="How long it holds.")] = 90.0,
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Make a token and print it, once: only its hash is kept."""
+    with _people(db, machine) as (people, _):
+        text = people.add_token(name, title, scope, days)
+    typer.echo(text)
+
+
+@token.command("list")
+def list_tokens(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
+    """List tokens: whose, what they may, until when."""
+    with _people(db, machine) as (_, store):
+        found = store.tokens()
+    rows = [(owner, t.name, t.prefix, ", ".join(t.scopes), t.expires_utc[:19], (t.revoked_utc or "")[:19]) for t, owner in found]
+    headings = ("user", "token", "begins with", "scopes", "until (UTC)", "revoked (UTC)")
+    if as_json:
+        print_json([dict(zip(("user", "token", "prefix", "scopes", "expires_utc", "revoked_utc"), row, strict=True)) for row in rows])
+        return
+    print_table(headings, rows)
+
+
+@token.command("revoke")
+def revoke_token(
+    name: Name,
+    title: Annotated[str, typer.Argument(metavar="TOKEN", help="Name of the token.", show_default=False)],
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Revoke a token, at once and for ever."""
+    with _people(db, machine) as (people, _):
+        people.revoke_token(name, title)
+    typer.echo(f"token {title!r} of {name!r} is revoked")
+
+
+@contextmanager
+def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) -> Iterator[tuple[People, Store]]:
+    from service.clock import SystemClock
+    from service.users.people import People
+
+    with open_store(database_url(db, machine), must_exist=must_exist) as store:
+        yield People(store, SystemClock()), store
+
+
+def _password() -> str:
+    """From a terminal, typed twice and not shown; else the first line of standard input. Never an argument: those are seen by everybody."""
+    from service.errors import PasswordRefused
+
+    if not sys.stdin.isatty():
+        return sys.stdin.readline().rstrip("\r\n")
+    import getpass
+
+    first = getpass.getpass("password: ")
+    if getpass.getpass("again: ") != first:
+        raise PasswordRefused("the two passwords differ", "type it again")
+    return first

@@ -1,0 +1,75 @@
+"""Centroid ballscrew table, version 1 (.tab; CNC7 v6.00 on): encoder counts, one direction (cncsnw.com, "Laser Compensation").
+
+First line: number of values, and the travel from the first to the last in counts with its sign; then one whole number per line, the first
+at the reference. The page's own example (24 values over -1448819 counts) is 40 mm a point at 40000 counts an inch. Versions 2
+and 3 (two directions, a longer heading) are described in the same place, but their text was not at hand: they are not written here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.machine import AXES
+from service.errors import FormatRefused
+from service.formats.limits import NOTHING, Limits, check_kinds, check_table
+from service.formats.model import AxisTable, Compensation
+from service.formats.settings import Settings
+from service.formats.signs import from_file, to_file
+from service.formats.text import TextFile, integers
+
+LIMITS = Limits(points=1000, equidistant=True, directional=False)
+WHAT = "Centroid ballscrew table"
+
+
+def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+    """One file per axis; the reference must be one end of the table.
+
+    Raises
+    ------
+    FormatRefused
+        Another kind of table, two directions, no reference, or one that is neither end.
+    """
+    check_kinds(comp, LIMITS, WHAT)
+    files = []
+    for table in comp.tables:
+        check_table(table, LIMITS, WHAT, settings.reference_mm, 1.0 / settings.counts_per_mm)
+        ends = (table.position_mm[0], table.position_mm[-1])
+        reference = ends[0] if settings.reference_mm is None else settings.reference_mm[AXES.index(table.axis)]
+        if min(abs(reference - e) for e in ends) > 1e-6:
+            raise FormatRefused(f"{WHAT}, table {table.name}: the reference {reference:g} is neither end of the table", NOTHING)
+        way = 1 if abs(reference - ends[0]) <= 1e-6 else -1
+        travel = way * round(float(np.ptp(table.position_mm)) * settings.counts_per_mm)
+        counts = integers(to_file("centroid", table.forward_mm, table.position_mm), 1.0 / settings.counts_per_mm)[::way]
+        lines = [f"{table.position_mm.size} {travel}", *map(str, counts)]
+        files.append(TextFile(f"cnc-{table.axis.lower()}.tab", "\n".join(lines) + "\n"))
+    return tuple(files)
+
+
+def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+    """The tables of version 1 files; the axis is the letter before ``.tab``, positions count from the reference.
+
+    Raises
+    ------
+    TableFileError
+        A first line that is not two whole numbers, another number of values than stated, a value that is none.
+    """
+    return Compensation(tuple(_read_one(f, settings) for f in files))
+
+
+def _read_one(file: TextFile, settings: Settings) -> AxisTable:
+    axis = file.name.rpartition(".")[0][-1:].upper()
+    lines = list(file.lines())
+    if axis not in AXES or not lines:
+        raise file.wrong(1, "the name does not end in its axis, or the file is empty", "name it cnc-x.tab, cnc-y.tab or cnc-z.tab")
+    head = lines[0][1].split()
+    if len(head) != 2 or not head[0].isdigit():
+        raise file.wrong(1, f"{lines[0][1]!r} is no heading of version 1 (number of values, travel in counts)")
+    count, travel = int(head[0]), file.number(1, head[1], "the travel")
+    values = np.array([file.number(line, text.strip(), "the correction") for line, text in lines[1:]])
+    if values.size != count or count < 2 or travel == 0.0:
+        raise file.wrong(len(lines), f"{values.size} values, {count} stated")
+    start = 0.0 if settings.reference_mm is None else settings.reference_mm[AXES.index(axis)]
+    position = start + np.linspace(0.0, travel / settings.counts_per_mm, count)
+    way = 1 if travel > 0 else -1
+    value = from_file("centroid", values / settings.counts_per_mm, position)[::way]
+    return AxisTable(axis, axis, position[::way], value, value)

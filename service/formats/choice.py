@@ -1,0 +1,194 @@
+"""The best use of a control: what each kind of table would leave of an identified machine, and the one to take.
+
+Judged over the whole volume, both directions of motion, best-fit rigid motion removed, with the numbers rounded as the control holds them.
+A control with a limited number of tables gets those that take out most, one after the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.machine import AXES
+from models.volumetric import remove_rigid, volume_grid
+from service.formats.controls import Control
+from service.formats.identified import Identified, Values, axis_tables, grid_mm, lattice_of, motions_of, products_of, table_values
+from service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable, correction_at
+
+JUDGE_NODES, COARSE_NODES = 12, 6
+WORTH = 0.02
+"""A larger set of tables is taken only if it leaves at least this share less (rms) than a smaller one."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One kind of tables: what is left (rms and largest vector over the volume, mm), how many numbers it takes, whether it is the one."""
+
+    kind: str
+    compensation: Compensation
+    rms_mm: float
+    max_mm: float
+    best: bool = False
+
+    @property
+    def numbers(self) -> int:
+        """Numbers that the control has to hold."""
+        return self.compensation.numbers
+
+
+class Judge:
+    """The identified field at the places where tables are judged, computed once."""
+
+    def __init__(self, known: Identified, control: Control, nodes: int = JUDGE_NODES) -> None:
+        self.points_mm: F2 = volume_grid(known.machine.stroke_mm, nodes)
+        self._moving = {way: known.moving_mm(self.points_mm, way) for way in (1, -1)}
+        self._control = control
+
+    def left_mm(self, comp: Compensation) -> F1:
+        """Length of what is left at every place, moving in + and in −, shape (2 n,)."""
+        stored = rounded(comp, self._control.unit_mm)
+        parts = []
+        for way, field in self._moving.items():
+            direction = np.full(self.points_mm.shape, float(way))
+            parts.append(field + correction_at(stored, self.points_mm, direction, lookup=self._control.lookup))
+        both = np.concatenate([self.points_mm, self.points_mm])
+        return np.asarray(np.linalg.norm(remove_rigid(both, np.concatenate(parts)), axis=1))
+
+    def choice(self, kind: str, comp: Compensation) -> Choice:
+        """A kind of tables with its figures."""
+        left = self.left_mm(comp)
+        return Choice(kind, comp, float(np.sqrt(np.mean(left**2))), float(left.max()))
+
+
+def choices(known: Identified, control: Control, reference_mm: F1) -> tuple[Choice, ...]:
+    """Every kind of tables the control can hold, from none to all, one of them marked as the best."""
+    judge = Judge(known, control)
+    found = [judge.choice("no table", Compensation())]
+    if control.own:
+        build = _Builder(known, control, reference_mm)
+        found.append(judge.choice("one-axis tables", build.together((), ())))
+        found += _crossed(control, build, judge) if control.cross else []
+    if control.lattice:
+        nodes = _grids(known, control.nodes, reference_mm)
+        grid = Compensation(lattice=lattice_of(known, nodes, reference_mm), lost_motion_mm=dict(known.lost_motion_mm))
+        found.append(judge.choice(f"3-D grid of {' x '.join(str(g.size) for g in nodes)} nodes", grid))
+    if control.motions:
+        grids = _grids(known, control.own_points, reference_mm)
+        comp = Compensation(motions=motions_of(known, grids), lost_motion_mm=dict(known.lost_motion_mm))
+        found.append(judge.choice("error motions, worked out by the control", comp))
+    return _marked(found)
+
+
+def best_of(found: tuple[Choice, ...]) -> Choice:
+    """The one that is marked."""
+    return next(c for c in found if c.best)
+
+
+def _marked(found: list[Choice]) -> tuple[Choice, ...]:
+    best = found[0]
+    for c in sorted(found[1:], key=lambda c: c.numbers):
+        if c.rms_mm < (1.0 - WORTH) * best.rms_mm:
+            best = c
+    return tuple(replace(c, best=c is best) for c in found)
+
+
+def _grids(known: Identified, points: int, reference_mm: F1) -> tuple[F1, F1, F1]:
+    x, y, z = (grid_mm(known.machine, a, points, reference_mm) for a in range(3))
+    return x, y, z
+
+
+def _own(known: Identified, control: Control, tables: tuple[AxisTable, ...]) -> Compensation:
+    """Own-axis tables as the control holds lost motion: in their columns, or as its backlash parameter."""
+    if control.both_directions:
+        return Compensation(tables)
+    plain = tuple(replace(t, backward_mm=t.forward_mm) for t in tables)
+    return Compensation(plain, lost_motion_mm=dict(known.lost_motion_mm))
+
+
+def _crossed(control: Control, build: _Builder, judge: Judge) -> list[Choice]:
+    """Own-axis tables with cross tables, and with products; as many as the control has room for."""
+    kinds: list[tuple[str, tuple[ProductTable, ...]]] = [("one-axis and cross tables", ())]
+    kinds += [("one-axis, cross and product tables", build.offered)] if control.products else []
+    out = []
+    for kind, offered in kinds:
+        chosen, pairs = offered, PAIRS
+        if control.tables is not None:
+            chosen, pairs = build.greedy(Judge(build.known, control, nodes=COARSE_NODES), offered, control.tables)
+        out.append(judge.choice(kind, build.together(chosen, pairs)))
+    return out
+
+
+Pair = tuple[str, str]
+PAIRS: tuple[Pair, ...] = tuple((a, o) for a in AXES for o in AXES if a != o)
+
+
+class _Builder:
+    """Puts tables together; what some hold is not in the others. Everything is linear, so every part is worked out once."""
+
+    def __init__(self, known: Identified, control: Control, reference_mm: F1) -> None:
+        self.known, self._control = known, control
+        self._sets = tuple(_grids(known, n, reference_mm) for n in (control.own_points, control.cross_points))
+        self.offered = products_of(known, self._sets[1], reference_mm) if control.products else ()
+        self._whole = table_values(known, known.deviation_mm, self._sets, reference_mm, smooth=True)
+        self._of = {p.name: table_values(known, partial(_alone, p), self._sets, reference_mm) for p in self.offered}
+
+    def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
+        """Own-axis tables on their grid, cross tables (axis, output) on theirs, both for what the products leave."""
+        fine, coarse = (axis_tables(self.known, grids, self._values(k, products)) for k, grids in enumerate(self._sets))
+        own = _own(self.known, self._control, tuple(t for t in fine if t.own))
+        cross = tuple(t for t in coarse if (t.axis, t.output) in pairs)
+        return replace(own, tables=(*own.tables, *cross), products=products)
+
+    def _values(self, k: int, products: tuple[ProductTable, ...]) -> Values:
+        x, y, z = (self._whole[k][a] + sum((self._of[p.name][k][a] for p in products), np.zeros((1, 3))) for a in range(3))
+        return x, y, z
+
+    def greedy(self, judge: Judge, offered: tuple[ProductTable, ...], room: int) -> tuple[tuple[ProductTable, ...], tuple[Pair, ...]]:
+        """Again and again what takes out most per table that it needs, until the room is full or nothing helps."""
+        products: tuple[ProductTable, ...] = ()
+        pairs: tuple[Pair, ...] = ()
+        left = float(np.mean(judge.left_mm(self.together(products, pairs)) ** 2))
+        while True:
+            free = room - len(pairs) - 2 * len(products)
+            steps = [((*products, p), pairs, 2) for p in offered if p not in products]
+            steps += [(products, (*pairs, pair), 1) for pair in PAIRS if pair not in pairs]
+            tried = []
+            for more, cross, cost in steps:
+                if cost <= free:
+                    now = float(np.mean(judge.left_mm(self.together(more, cross)) ** 2))
+                    tried.append(((left - now) / cost, now, more, cross))
+            gain, left, products_, pairs_ = max(tried, key=lambda t: t[0], default=(0.0, left, products, pairs))
+            if gain <= 0.0:
+                return products, pairs
+            products, pairs = products_, pairs_
+
+
+def _alone(product: ProductTable, points_mm: F2) -> F2:
+    """What one product adds: tables beside it have to take as much less out."""
+    return correction_at(Compensation(products=(product,)), points_mm)
+
+
+def rounded(comp: Compensation, unit_mm: float) -> Compensation:
+    """All corrections in whole units, angles a thousand times finer, as the control will hold them."""
+
+    def to(v: F1, unit: float = unit_mm) -> F1:
+        return np.asarray(np.round(v / unit) * unit)
+
+    def curve(c: Curve, unit: float) -> Curve:
+        return replace(c, value=to(c.value, unit))
+
+    tables = tuple(replace(t, forward_mm=to(t.forward_mm), backward_mm=to(t.backward_mm)) for t in comp.tables)
+    products = tuple(replace(p, angle=curve(p.angle, unit_mm * 1e-3), lever=curve(p.lever, unit_mm)) for p in comp.products)
+    lattice = comp.lattice
+    if lattice is not None:
+        lattice = Lattice(lattice.position_mm, np.round(lattice.correction_mm / unit_mm) * unit_mm)
+    motions = comp.motions
+    if motions is not None:
+        curves = {n: curve(c, unit_mm * (1e-3 if n[1] in "ABC" else 1.0)) for n, c in motions.curves.items()}
+        motions = Motions(
+            motions.machine, curves, {n: round(v / unit_mm * 1e3) * unit_mm * 1e-3 for n, v in motions.squareness_rad.items()}
+        )
+    return Compensation(tables, products, lattice, motions, comp.lost_motion_mm)

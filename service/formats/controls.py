@@ -1,0 +1,112 @@
+"""What controls can hold, as far as documents say: which tables, how many, how fine, in which order they act (controllers.md 1, 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.errors import FormatRefused
+from service.formats.model import Lookup
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """One control.
+
+    Attributes
+    ----------
+    key, name : str
+    own, cross : str
+        Format of own-axis tables; of cross and product tables; empty: it has none.
+    own_points, cross_points : int
+        Points of a table.
+    both_directions : bool
+        Own-axis tables have two columns. Without, lost motion is left to the control's backlash parameter.
+    products : bool
+    tables : int, optional
+        Most tables of the ``cross`` format, a product being two; none: as many as needed.
+    lattice, nodes : str, int
+        Format of a 3-D grid, nodes per axis.
+    motions : str
+        Format of error motions for the control's own chain.
+    lookup : str
+        Where all but the own-axis tables are looked up.
+    unit_mm : float
+        Unit of its numbers.
+    """
+
+    key: str
+    name: str
+    own: str = ""
+    own_points: int = 25
+    both_directions: bool = True
+    cross: str = ""
+    cross_points: int = 25
+    products: bool = False
+    tables: int | None = None
+    lattice: str = ""
+    nodes: int = 0
+    motions: str = ""
+    lookup: Lookup = "command"
+    unit_mm: float = 1e-6
+
+
+CONTROLS: dict[str, Control] = {
+    c.key: c
+    for c in (
+        Control(
+            "linuxcnc",
+            "LinuxCNC: COMP_FILE and HAL network",
+            own="linuxcnc-1",
+            own_points=101,
+            cross="linuxcnc-hal",
+            cross_points=16,
+            products=True,
+        ),
+        Control(
+            "siemens-840d",
+            "SINUMERIK 840D sl: ENC_COMP and CEC",
+            own="siemens-eec",
+            own_points=101,
+            both_directions=False,
+            cross="siemens-cec",
+            products=True,
+        ),
+        Control(
+            "siemens-828d",
+            "SINUMERIK 828D with the option: ENC_COMP and 8 CEC tables",
+            own="siemens-eec",
+            own_points=101,
+            both_directions=False,
+            cross="siemens-cec",
+            products=True,
+            tables=8,
+        ),
+        Control("fanuc", "Fanuc with pitch error compensation only", own="fanuc-pitch", own_points=101, unit_mm=1e-3),
+        Control("fanuc-30i", "Fanuc 30i with 3-D error compensation", own="fanuc-pitch", lattice="fanuc-lattice", nodes=9, unit_mm=1e-3),
+        Control(
+            "heidenhain",
+            "Heidenhain TNC: .COM tables",
+            own="heidenhain",
+            own_points=101,
+            cross_points=101,
+            cross="heidenhain",
+            unit_mm=1e-4,
+        ),
+        Control("isg", "Beckhoff/ISG kernel with TF5280", motions="isg"),
+        Control("mach4", "Mach4", own="mach4", own_points=101, unit_mm=1e-4),
+        Control("centroid", "Centroid, table version 1", own="centroid", own_points=101, both_directions=False, unit_mm=1e-3),
+    )
+}
+
+
+def control_of(key: str) -> Control:
+    """The control of a key.
+
+    Raises
+    ------
+    FormatRefused
+        There is none; the message names those there are.
+    """
+    if key not in CONTROLS:
+        raise FormatRefused(f"there is no control {key!r}", f"known are {', '.join(CONTROLS)}")
+    return CONTROLS[key]

@@ -1,0 +1,152 @@
+"""Heidenhain .COM value tables and the .CMA that assigns them (controllers.md 5.3; MANUALplus 620 pp. 716-718, TNC 407 pp. 153-156).
+
+One .COM per axis that something depends on: column X, Y or Z holds what that axis gets as a function of the table's axis, so straightness
+and sag are native. BACKLASH holds the own axis' values measured in −. The heading differs per control: export a table from the target
+control and compare; the sign of the values differs between manuals: see the step first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.arrays import F1
+from models.machine import AXES
+from service.errors import FormatRefused
+from service.formats.limits import NOTHING, Limits, check_kinds, check_table
+from service.formats.model import AxisTable, Compensation
+from service.formats.settings import Settings
+from service.formats.signs import from_file, to_file
+from service.formats.text import TextFile, fixed, increasing
+
+LIMITS = Limits(points=256, cross=True)
+WHAT = "Heidenhain .COM"
+POSITION_DECIMALS = 4
+ASSIGNMENT = "CONFIG.CMA"
+UNIT_MM = 1e-4
+STEEPEST = 64
+"""TNC 4xx: two neighbouring values may differ by the spacing over this."""
+
+
+def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+    """One .COM per axis that something depends on, and CONFIG.CMA with its only line active.
+
+    Raises
+    ------
+    FormatRefused
+        Another kind of table; a direction-dependent cross table (BACKLASH is the own axis'); a limit; positions finer than 0.1 µm.
+    """
+    check_kinds(comp, LIMITS, WHAT)
+    files, names = [], {}
+    for axis in AXES:
+        mine = [t for t in comp.tables if t.axis == axis]
+        if not mine:
+            continue
+        for table in mine:
+            check_table(table, LIMITS, WHAT, settings.reference_mm, settings.step_mm)
+            if table.directional and not table.own:
+                raise FormatRefused(f"{WHAT}, table {table.name}: only the own axis has a BACKLASH column", f"give the mean; {NOTHING}")
+            if not np.array_equal(table.position_mm, mine[0].position_mm):
+                raise FormatRefused(f"{WHAT}: tables over {axis} have different points, one file has one column of them", NOTHING)
+        _check_positions(mine, settings)
+        names[axis] = f"{axis}.COM"
+        files.append(TextFile(names[axis], _com(axis, mine, settings)))
+    head = "NR   " + "".join(f"{a:<12}" for a in AXES) + "ACTIVE"
+    row = "0    " + "".join(f"{names.get(a, ''):<12}" for a in AXES) + "*"
+    files.append(TextFile(ASSIGNMENT, "\n".join([f"BEGIN {ASSIGNMENT}", head, row, "[END]"]) + "\n"))
+    return tuple(files)
+
+
+def _check_positions(tables: list[AxisTable], settings: Settings) -> None:
+    position = tables[0].position_mm
+    if np.abs(np.round(position, POSITION_DECIMALS) - position).max() > 1e-7:
+        raise FormatRefused(f"{WHAT}: positions over {tables[0].axis} are finer than 0.1 µm", f"choose another grid; {NOTHING}")
+    if not settings.power_of_two:
+        return
+    units = np.diff(position) / UNIT_MM
+    power = np.log2(units[0])
+    if np.ptp(units) > 1e-3 or abs(power - round(power)) > 1e-6:
+        raise FormatRefused(
+            f"{WHAT}: spacing over {tables[0].axis} is {units[0] * UNIT_MM:g} mm, this control wants a power of two times 0.1 µm",
+            f"take 6.5536 mm (2^16) or its multiples; {NOTHING}",
+        )
+    steepest = max(float(np.abs(np.diff(v)).max()) for t in tables for v in (t.forward_mm, t.backward_mm))
+    if steepest > units[0] * UNIT_MM / STEEPEST:
+        raise FormatRefused(f"{WHAT}: values over {tables[0].axis} change by {steepest * 1e3:.1f} µm from point to point", NOTHING)
+
+
+def _com(axis: str, tables: list[AxisTable], settings: Settings) -> str:
+    position = tables[0].position_mm
+    own = next((t for t in tables if t.own), None)
+    columns: dict[str, F1] = {}
+    if own is not None and own.directional:
+        columns["BACKLASH"] = to_file("heidenhain", own.backward_mm, position)
+    columns |= {t.output: to_file("heidenhain", t.forward_mm, position) for t in sorted(tables, key=lambda t: t.output)}
+    lines = [f"BEGIN {axis}.COM MM", "NR   AXISPOS      " + "".join(f"{c:<12}" for c in columns).rstrip()]
+    for k, p in enumerate(position):
+        cells = "".join(f"{fixed(v[k], settings.decimals):<12}" for v in columns.values())
+        lines.append(f"{k:<5}{fixed(p, POSITION_DECIMALS):<13}{cells}".rstrip())
+    return "\n".join([*lines, "[END]"]) + "\n"
+
+
+def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+    """What the control would take from the tables that the active line of the .CMA names (all .COM files if there is no .CMA).
+
+    Raises
+    ------
+    TableFileError
+        No active line or two, a named file that is missing, no [END] (half a file), too many points, positions that do not increase.
+    """
+    by_name = {f.name.upper(): f for f in files}
+    cma = next((f for n, f in by_name.items() if n.endswith(".CMA")), None)
+    names = {n[:1]: n for n in by_name if n.endswith(".COM")} if cma is None else _active(cma)
+    tables: list[AxisTable] = []
+    for axis, name in sorted(names.items()):
+        if name not in by_name:
+            assert cma is not None
+            raise cma.wrong(3, f"the table {name} is not there")
+        tables += _read_com(by_name[name], axis)
+    return Compensation(tuple(tables))
+
+
+def _body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Names of the columns, and the rows with their lines, of a table between BEGIN and [END]."""
+    lines = list(file.lines())
+    if not lines or not lines[0][1].startswith("BEGIN "):
+        raise file.wrong(1, "the first line is not BEGIN")
+    if lines[-1][1].strip() != "[END]":
+        raise file.wrong(len(lines), "[END] is missing: the file is cut off")
+    if len(lines) < 3:
+        raise file.wrong(1, "the table has no columns")
+    return lines[1][1].split(), [(n, text.split()) for n, text in lines[2:-1]]
+
+
+def _active(cma: TextFile) -> dict[str, str]:
+    lines = list(cma.lines())
+    columns, rows = _body(cma)
+    active = [n for n, words in rows if words and words[-1] == "*"]
+    if len(active) != 1:
+        raise cma.wrong(active[1] if active else 3, f"{len(active)} lines are active, expected one")
+    head, row = lines[1][1], lines[active[0] - 1][1]
+    at = {c: head.index(f" {c}") + 1 for c in columns if c in AXES}  # columns are found by where they begin: cells may be empty
+    found = {c: row[k : k + 12].strip().rstrip("*").strip().upper() for c, k in at.items()}
+    return {c: v for c, v in found.items() if v}
+
+
+def _read_com(file: TextFile, axis: str) -> list[AxisTable]:
+    columns, rows = _body(file)
+    if columns[:2] != ["NR", "AXISPOS"] or not set(columns[2:]) <= {"BACKLASH", *AXES} or not set(columns) & set(AXES):
+        raise file.wrong(2, f"columns {' '.join(columns)}, expected NR AXISPOS [BACKLASH] and axes")
+    if len(rows) > LIMITS.points:
+        raise file.wrong(rows[LIMITS.points][0], f"more than {LIMITS.points} points")
+    values: list[list[float]] = []
+    for line, words in rows:
+        if len(words) != len(columns):
+            raise file.wrong(line, f"{len(words)} values for {len(columns)} columns")
+        values.append([file.number(line, w, c) for w, c in zip(words, columns, strict=True)])
+    if len(values) < 2:
+        raise file.wrong(3, "fewer than 2 points")
+    increasing(file, [v[1] for v in values], [n for n, _ in rows])
+    position = np.array([v[1] for v in values])
+    column = {c: from_file("heidenhain", np.array([v[k] for v in values]), position) for k, c in enumerate(columns) if k > 1}
+    back = column.get("BACKLASH")
+    return [AxisTable(axis, c, position, v, back if c == axis and back is not None else v) for c, v in column.items() if c != "BACKLASH"]

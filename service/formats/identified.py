@@ -1,0 +1,190 @@
+"""A machine as it was identified, as far as tables need it, and its error taken apart into what controls can hold.
+
+Rule G (docs/conventions.md): a carriage's angle times a travel of ANOTHER axis is a product of two functions of one axis each; everything
+else of a first-order machine is a sum of functions of one axis. So one-axis tables, cross tables and products are all there is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.compensation.additive import additive
+from models.compensation.grid import nodes_mm
+from models.compensation.interpolation import FIT_SAMPLES, cells
+from models.functions.legendre import legendre_values
+from models.functions.motions import PLACES, SQUARENESS
+from models.geometry.bases import Term, term_values
+from models.geometry.chain import design
+from models.machine import AXES, Machine, lever_masks
+from service.formats.model import AxisTable, Curve, Lattice, Motions, ProductTable
+
+Grids = tuple[F1, F1, F1]
+NODES = 9
+BEND_WEIGHT = 1e-3
+SPACING_DECIMALS = 4
+"""Pitch of every grid in whole 0.1 µm: the coarsest that a format writes positions with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """``coefficients`` of ``terms`` (mm, rad); lost motion B of each axis, mm: moving in s it is off by design @ coefficients − s B/2."""
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    coefficients: F1
+    lost_motion_mm: Mapping[str, float] = field(default_factory=dict)
+
+    def deviation_mm(self, axes_mm: F2) -> F2:
+        """Mean of both directions, shape (n, 3)."""
+        return np.asarray(design(self.machine, self.terms, axes_mm) @ self.coefficients)
+
+    def moving_mm(self, axes_mm: F2, direction: int) -> F2:
+        """While all axes move in + (1) or in − (−1), shape (n, 3)."""
+        lost = np.array([self.lost_motion_mm.get(a, 0.0) for a in AXES])
+        return self.deviation_mm(axes_mm) - 0.5 * direction * lost
+
+    def motion(self, name: str, position_mm: F1) -> F1:
+        """One of the 18 error motions (squareness not in it) over positions of its axis, mm or rad."""
+        axis = PLACES[name][0]
+        mine = [i for i, t in enumerate(self.terms) if t.motion == name]
+        points = np.tile(self.machine.centre_mm, (position_mm.size, 1))
+        points[:, axis] = position_mm
+        chosen = tuple(self.terms[i] for i in mine)
+        return np.asarray(term_values(chosen, points, self.machine.stroke_mm) @ self.coefficients[mine])
+
+
+def grid_mm(machine: Machine, axis: int, points: int, reference_mm: F1) -> F1:
+    """Equidistant points that reach at least over the stroke, one of them the reference: what incremental formats need."""
+    low, high = machine.stroke_mm[axis]
+    reference = float(np.clip(reference_mm[axis], low, high))
+    pitch = np.ceil((high - low) / max(1, points - 2) * 10**SPACING_DECIMALS - 1e-6) / 10**SPACING_DECIMALS
+    if abs(reference - low) < 1e-9 or abs(reference - high) < 1e-9:
+        pitch = np.ceil((high - low) / (points - 1) * 10**SPACING_DECIMALS - 1e-6) / 10**SPACING_DECIMALS
+    before, after = (int(np.ceil(v / pitch - 1e-9)) for v in (reference - low, high - reference))
+    return np.asarray(np.round(reference + pitch * np.arange(-before, after + 1), SPACING_DECIMALS))
+
+
+def line_fit(grid: F1, stroke_mm: F1) -> tuple[F1, F2]:
+    """Positions inside the stroke at which a function is asked for, and the operator from its values to the best broken line on a grid.
+
+    A grid may reach beyond the stroke by part of a cell: what stands there only continues the line (a weak pull towards no bend).
+    """
+    low, high = stroke_mm
+    inside = np.clip(grid, low, high)
+    cells_ = np.flatnonzero(np.diff(inside) > 0)
+    part = (np.arange(FIT_SAMPLES) + 0.5) / FIT_SAMPLES
+    at = (inside[cells_, None] + np.diff(inside)[cells_, None] * part).ravel()
+    index, share = cells(grid, at)
+    hat = np.zeros((at.size, grid.size))
+    hat[np.arange(at.size), index], hat[np.arange(at.size), index + 1] = 1.0 - share, share
+    weight = np.sqrt(np.repeat(np.diff(inside)[cells_] / np.diff(grid)[cells_], FIT_SAMPLES))
+    bend = BEND_WEIGHT * np.diff(np.eye(grid.size), 2, axis=0)
+    solve = np.linalg.pinv(np.concatenate([hat * weight[:, None], bend]))
+    return at, np.asarray(solve[:, : at.size] * weight)
+
+
+def products_of(known: Identified, grids: Grids, reference_mm: F1) -> tuple[ProductTable, ...]:
+    """All products of rule G, as corrections: minus angle over its own axis, times the travel from the reference of another axis."""
+    masks, unit = lever_masks(known.machine.chain), np.eye(3)
+    out = []
+    for j, k, c in product(range(3), range(3), range(3)):
+        name = f"E{'ABC'[c]}{AXES[j]}"
+        effect = np.cross(unit[c], unit[k])
+        if j == k or masks[j, k] == 0.0 or not effect.any() or not any(t.motion == name for t in known.terms):
+            continue
+        output = int(np.flatnonzero(effect)[0])
+        angle = Curve(AXES[j], grids[j], -effect[output] * _sampled(known, name, grids[j]))
+        out.append(ProductTable(AXES[output], angle, Curve(AXES[k], grids[k], grids[k] - reference_mm[k])))
+    return tuple(out)
+
+
+def _sampled(known: Identified, name: str, grid: F1) -> F1:
+    """A motion as the best broken line on a grid."""
+    at, operator = line_fit(grid, known.machine.stroke_mm[PLACES[name][0]])
+    return np.asarray(operator @ known.motion(name, at))
+
+
+Values = tuple[F2, F2, F2]
+"""Corrections per axis, shape (points, 3 outputs), mm."""
+
+
+def table_values(
+    known: Identified, field: Callable[[F2], F2], sets: tuple[Grids, ...], reference_mm: F1, *, smooth: bool = False
+) -> tuple[Values, ...]:
+    """The best nine one-axis tables for minus a field, on several sets of grids, zero at the reference. Linear in the field.
+
+    ``field``: positions (n, 3) to values (n, 3), mm. ``smooth``: it is made of the terms, so its main effects are polynomials, and as many
+    positions as those have coefficients tell all.
+    """
+    stroke = known.machine.stroke_mm
+    fits = [[line_fit(grids[a], stroke[a]) for grids in sets] for a in range(3)]
+    x, y, z = (np.concatenate([at for at, _ in fits[a]]) for a in range(3))
+    order = max(t.order for t in known.terms) + 1
+    asked = [_chebyshev(s, order + 1) if smooth else p for s, p in zip(stroke, (x, y, z), strict=True)]
+    found_ = additive(lambda p: field(p)[:, :, None], stroke, (asked[0], asked[1], asked[2]), nodes=NODES, order=order)
+    effects = [e[:, :, 0] for e in found_]
+    if smooth:
+        bases = [(legendre_values(asked[a], stroke[a], order), legendre_values(p, stroke[a], order)) for a, p in enumerate((x, y, z))]
+        effects = [there @ np.linalg.solve(here, e) for (here, there), e in zip(bases, effects, strict=True)]
+    out = []
+    for s, grids in enumerate(sets):
+        found = []
+        for a in range(3):
+            first = sum(fits[a][k][0].size for k in range(s))
+            at, operator = fits[a][s]
+            values = -(operator @ effects[a][first : first + at.size])
+            found.append(values - [np.interp(reference_mm[a], grids[a], values[:, i]) for i in range(3)])
+        out.append((found[0], found[1], found[2]))
+    return tuple(out)
+
+
+def _chebyshev(stroke_mm: F1, n: int) -> F1:
+    """Positions of a stroke at which a polynomial with n coefficients is asked for."""
+    return np.asarray(stroke_mm.mean() - 0.5 * np.ptp(stroke_mm) * np.cos((np.arange(n) + 0.5) * np.pi / n))
+
+
+def axis_tables(known: Identified, grids: Grids, values: Values) -> tuple[AxisTable, ...]:
+    """Nine tables of values; own tables have both directions.
+
+    Forward columns are zero at the reference: it is approached in +. While moving in − an axis with lost motion B stands B further, so its
+    backward column is the forward one less B.
+    """
+    out = []
+    for a, axis in enumerate(AXES):
+        for i, output in enumerate(AXES):
+            forward = values[a][:, i]
+            backward = forward - known.lost_motion_mm.get(axis, 0.0) if i == a else forward
+            out.append(AxisTable(axis, output, grids[a], forward, backward))
+    return tuple(out)
+
+
+def lattice_of(known: Identified, grids: Grids, reference_mm: F1) -> Lattice:
+    """The best 3-D grid, zero at the reference: every term is fitted along its own axis, where alone it bends (rule G)."""
+    counts = tuple(g.size for g in grids)
+    total: F2 = np.zeros((int(np.prod(counts)), 3))
+    for a in range(3):
+        mine = [i for i, t in enumerate(known.terms) if t.axis == a]
+        stroke = known.machine.stroke_mm
+        along, operator = line_fit(grids[a], stroke[a])
+        at = [along if k == a else np.clip(g, *stroke[k]) for k, g in enumerate(grids)]
+        values = design(known.machine, tuple(known.terms[i] for i in mine), nodes_mm((at[0], at[1], at[2]))) @ known.coefficients[mine]
+        cube = values.reshape(*(p.size for p in at), 3)
+        total = total + np.moveaxis(np.tensordot(operator, cube, (1, a)), 0, a).reshape(-1, 3)
+    found = Lattice(grids, -total.reshape(*counts, 3))
+    here = tuple(int(np.argmin(np.abs(g - reference_mm[a]))) for a, g in enumerate(grids))
+    return Lattice(grids, found.correction_mm - found.correction_mm[here])
+
+
+def motions_of(known: Identified, grids: Grids) -> Motions:
+    """All error motions as identified: right for the tool that was measured with, whatever the readings tell apart."""
+    curves = {}
+    for name, (axis, _) in PLACES.items():
+        if any(t.motion == name for t in known.terms):
+            curves[name] = Curve(AXES[axis], grids[axis], _sampled(known, name, grids[axis]))
+    square = {t.motion: float(v) for t, v in zip(known.terms, known.coefficients, strict=True) if t.motion in SQUARENESS}
+    return Motions(known.machine, curves, square)

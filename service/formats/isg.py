@@ -1,0 +1,144 @@
+"""Beckhoff/ISG volumetric CSV (controllers.md 5.4): ISO 230-1 error motions per axis. The neutral exchange format.
+
+Blank-separated columns under a heading; ``//`` comment; ``#`` begins a new heading. Arguments mm, errors mm and rad. The kernel works the
+correction out by its own chain; its parameter ``negate`` turns single axes over, so the step must be seen first. Squareness (C0Y, B0Z, A0Z)
+is one row without argument and counts travel from the start of the stroke here; another zero is a constant shift of the whole map.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.functions.motions import PLACES, SQUARENESS
+from models.machine import AXES
+from service.errors import FormatRefused
+from service.formats.limits import NOTHING, Limits, check_kinds, check_positions, check_size, check_table
+from service.formats.model import Compensation, Curve, Motions
+from service.formats.settings import Settings
+from service.formats.signs import from_file, to_file
+from service.formats.text import TextFile, increasing, short
+
+LIMITS = Limits(points=2000, directional=False, cross=True, motions=True, zero_at_reference=False)
+WHAT = "ISG volumetric CSV"
+NAME = "volcomp.csv"
+ANGLE_DECIMALS = 3
+
+
+def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+    """Error motions (or one-axis tables, as the translations they correct) in one file.
+
+    Raises
+    ------
+    FormatRefused
+        Products or a grid; motions and tables at once; two directions; motions of one axis at different points.
+    """
+    check_kinds(comp, LIMITS, WHAT)
+    if comp.motions is not None and comp.tables:
+        raise FormatRefused(f"{WHAT}: error motions and tables at once", f"give one of them; {NOTHING}")
+    curves = _curves(comp, settings)
+    lines = ["// error motions, actual - nominal; arguments mm, errors mm and rad"]
+    square = {} if comp.motions is None else {n: v for n, v in comp.motions.squareness_rad.items() if v}
+    blocks = []
+    if square:
+        numbers = to_file("isg", -np.array(list(square.values())), np.zeros(len(square)))
+        blocks.append([" ".join(square), " ".join(short(v, settings.decimals + ANGLE_DECIMALS) for v in numbers)])
+    blocks += [_block(axis, mine, settings) for axis in AXES if (mine := {n: c for n, c in curves.items() if c.axis == axis})]
+    for k, block in enumerate(blocks):
+        lines += (["#"] if k else []) + block
+    return (TextFile(NAME, "\n".join(lines) + "\n"),)
+
+
+def _curves(comp: Compensation, settings: Settings) -> dict[str, Curve]:
+    """Error motions by name, in ISO order."""
+    if comp.motions is not None:
+        found = {n: Curve(c.axis, c.position_mm, to_file("isg", -c.value, c.position_mm)) for n, c in comp.motions.curves.items()}
+    else:
+        found = {}
+        for t in comp.tables:
+            check_table(t, LIMITS, WHAT, settings.reference_mm, settings.step_mm)
+            found[f"E{t.output}{t.axis}"] = Curve(t.axis, t.position_mm, to_file("isg", t.forward_mm, t.position_mm))
+    return {name: found[name] for name in PLACES if name in found}
+
+
+def _block(axis: str, mine: dict[str, Curve], settings: Settings) -> list[str]:
+    position = next(iter(mine.values())).position_mm
+    check_positions(position, LIMITS, f"{WHAT}, {axis}")
+    for name, curve in mine.items():
+        if not np.array_equal(curve.position_mm, position):
+            raise FormatRefused(f"{WHAT}: motions of {axis} have different points, one block has one column of them", NOTHING)
+        check_size(position, curve.value, LIMITS, f"{WHAT}, {name}")
+    decimals = [settings.decimals + (ANGLE_DECIMALS if PLACES[n][1] > 2 else 0) for n in mine]
+    lines = [" ".join([axis, *mine])]
+    for k, p in enumerate(position):
+        lines.append(" ".join([short(p, 6), *(short(c.value[k], d) for c, d in zip(mine.values(), decimals, strict=True))]))
+    return lines
+
+
+def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+    """The error motions of a file; ``settings.machine`` is the chain that the kernel is configured with.
+
+    Raises
+    ------
+    TableFileError
+        A heading with an unknown name or two arguments (2-D tables are not read), a row of another length, positions that do not increase.
+    FormatRefused
+        No machine was given: without its chain the file says nothing about a correction.
+    """
+    if settings.machine is None:
+        raise FormatRefused(f"{WHAT}: the control works with its machine's chain, and none is given", "give the machine")
+    file = files[0]
+    curves: dict[str, Curve] = {}
+    square: dict[str, float] = {}
+    for head, rows in _blocks(file):
+        _take(file, head, rows, curves, square)
+    if not curves and not square:
+        raise file.wrong(1, "there is no table")
+    return Compensation(motions=Motions(settings.machine, curves, square))
+
+
+Row = tuple[int, list[str]]
+
+
+def _blocks(file: TextFile) -> list[tuple[Row, list[Row]]]:
+    """Headings with their rows."""
+    blocks: list[tuple[Row, list[Row]]] = []
+    fresh = True
+    for line, text in file.lines():
+        bare = text.partition("//")[0].strip()
+        if bare == "#":
+            fresh = True
+        elif bare and fresh:
+            blocks.append(((line, bare.split()), []))
+            fresh = False
+        elif bare:
+            blocks[-1][1].append((line, bare.split()))
+    return blocks
+
+
+def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, Curve], square: dict[str, float]) -> None:
+    line, names = head
+    arguments = [n for n in names if n in AXES]
+    strange = [n for n in names if n not in AXES and n not in PLACES and n not in SQUARENESS]
+    if strange or len(arguments) > 1 or len(set(names)) != len(names):
+        raise file.wrong(line, f"heading {' '.join(names)}: {strange[0] if strange else 'more than one argument'} cannot be read")
+    again = [n for n in names if n in curves or n in square]
+    if again or not rows:
+        raise file.wrong(line, f"{again[0]} stands in two blocks" if again else "there are no rows under this heading")
+    for n, words in rows:
+        if len(words) != len(names):
+            raise file.wrong(n, f"{len(words)} values for {len(names)} columns")
+    table = np.array([[file.number(n, w, c) for w, c in zip(words, names, strict=True)] for n, words in rows])
+    if not arguments:
+        if len(rows) != 1 or not set(names) <= set(SQUARENESS):
+            raise file.wrong(rows[0][0], "a table without an argument has one row, of C0Y, B0Z, A0Z")
+        square.update({n: -float(v) for n, v in zip(names, from_file("isg", table[0], np.zeros(len(names))), strict=True)})
+        return
+    axis = arguments[0]
+    position = table[:, names.index(axis)]
+    increasing(file, position.tolist(), [n for n, _ in rows])
+    for k, name in enumerate(names):
+        if name == axis:
+            continue
+        if name not in PLACES or AXES[PLACES[name][0]] != axis:
+            raise file.wrong(line, f"{name} is no error motion of {axis}")
+        curves[name] = Curve(axis, position, -from_file("isg", table[:, k], position))

@@ -1,0 +1,123 @@
+"""What a control's format can hold, checked before anything is written: points, spacing, size, directions, zero at the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.arrays import F1
+from models.machine import AXES
+from service.errors import FormatRefused
+from service.formats.model import AxisTable, Compensation
+
+NOTHING = "nothing was written"
+PLAUSIBLE_MM = 1.0
+"""No machine that can be measured is off by this much: a larger correction is another unit, another type, or a position."""
+SPACING_TOLERANCE_MM = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """``points``: most per table; ``directional``: both directions can be held; ``size_mm``: largest absolute number."""
+
+    points: int
+    equidistant: bool = False
+    directional: bool = True
+    size_mm: float = PLAUSIBLE_MM
+    tables: int | None = None
+    own: bool = True
+    cross: bool = False
+    products: bool = False
+    lattice: bool = False
+    motions: bool = False
+    zero_at_reference: bool = True
+
+
+def check_kinds(comp: Compensation, limits: Limits, what: str) -> None:
+    """Refuse kinds of tables that the format does not know.
+
+    Raises
+    ------
+    FormatRefused
+        Which table, and why.
+    """
+    for table in comp.tables:
+        if not (limits.own if table.own else limits.cross):
+            raise FormatRefused(f"{what} cannot hold the table {table.name}", f"choose another format for it; {NOTHING}")
+    pairs = [t.name for t in comp.tables] + [p.name for p in comp.products]
+    twice = next((n for n in pairs if pairs.count(n) > 1), None)
+    if twice is not None:
+        raise FormatRefused(f"{what}: two tables {twice}", f"add them up; {NOTHING}")
+    kinds = (
+        (limits.products, bool(comp.products), "products of two tables"),
+        (limits.lattice, comp.lattice is not None, "a 3-D grid"),
+        (limits.motions, comp.motions is not None, "error motions"),
+        (False, any(comp.lost_motion_mm.values()), "a backlash parameter"),
+    )
+    for able, there, kind in kinds:
+        if there and not able:
+            raise FormatRefused(f"{what} cannot hold {kind}", f"choose another format; {NOTHING}")
+    if not (comp.tables or comp.products or comp.lattice or comp.motions):
+        raise FormatRefused(f"{what}: there is nothing to write", "give tables")
+
+
+def check_table(table: AxisTable, limits: Limits, what: str, reference_mm: tuple[float, float, float] | None, unit_mm: float) -> None:
+    """Refuse one table that the format cannot hold.
+
+    Raises
+    ------
+    FormatRefused
+        Which limit, where, by how much.
+    """
+    name = f"{what}, table {table.name}"
+    check_positions(table.position_mm, limits, name)
+    for values in (table.forward_mm, table.backward_mm):
+        check_size(table.position_mm, values, limits, name)
+    if table.directional and not limits.directional:
+        raise FormatRefused(f"{name}: the format knows no direction, and the two directions differ", f"give the mean of both; {NOTHING}")
+    if reference_mm is not None and limits.zero_at_reference:
+        here = float(np.interp(reference_mm[AXES.index(table.axis)], table.position_mm, table.forward_mm))
+        if abs(here) > 0.5 * unit_mm + 1e-9:
+            at = reference_mm[AXES.index(table.axis)]
+            raise FormatRefused(
+                f"{name}: {here * 1e3:+.3f} µm at the reference ({table.axis} {at:g}), must be zero there", f"shift the table; {NOTHING}"
+            )
+
+
+def check_positions(position_mm: F1, limits: Limits, name: str) -> None:
+    """Number, order and spacing of a table's points.
+
+    Raises
+    ------
+    FormatRefused
+        Which of them is wrong.
+    """
+    n = position_mm.size
+    if not 2 <= n <= limits.points:
+        raise FormatRefused(f"{name}: {n} points, the control holds 2 to {limits.points}", f"use fewer or more points; {NOTHING}")
+    step = np.diff(position_mm)
+    if not np.isfinite(position_mm).all() or not (step > 0).all():
+        raise FormatRefused(f"{name}: positions do not increase", f"sort the table; {NOTHING}")
+    if limits.equidistant and np.ptp(step) > SPACING_TOLERANCE_MM:
+        raise FormatRefused(
+            f"{name}: points are {step.min():g} to {step.max():g} mm apart, the control wants equal distances", f"resample it; {NOTHING}"
+        )
+
+
+def check_size(position_mm: F1, values: F1, limits: Limits, name: str) -> None:
+    """Refuse numbers that are none, or larger than a correction can be.
+
+    Raises
+    ------
+    FormatRefused
+        Where, and how large.
+    """
+    if not np.isfinite(values).all():
+        raise FormatRefused(f"{name}: holds values that are no numbers", f"check the solution; {NOTHING}")
+    k = int(np.argmax(np.abs(values)))
+    if abs(values[k]) > limits.size_mm:
+        raise FormatRefused(
+            f"{name}: {values[k]:+.4f} mm at {position_mm[k]:g} mm, the largest allowed is {limits.size_mm:g} mm",
+            f"check sign, unit and solution; {NOTHING}",
+        )

@@ -1,0 +1,87 @@
+"""LinuxCNC COMP_FILE, type 0 and 1 (controllers.md 1.4): bare triplets "nominal forward reverse", one file per joint.
+
+The control reads with sscanf and stops WITHOUT AN ERROR at the first line that is not three numbers: a comment, a heading or a blank line
+in front is an empty table. Lines whose nominal does not increase are skipped. So the writer writes nothing but triplets, and the reader
+refuses what the control would silently leave out. BACKLASH of the ini file has no effect on a joint with a table: lost motion stands in the
+two columns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.formats.limits import PLAUSIBLE_MM, Limits, check_kinds, check_table
+from service.formats.model import AxisTable, Compensation
+from service.formats.settings import Settings
+from service.formats.signs import SIGNS, from_file, to_file
+from service.formats.text import TextFile, fixed, increasing, whole
+
+LIMITS = Limits(points=256)
+POSITION_DECIMALS = 6
+
+
+def write(comp: Compensation, settings: Settings, *, kind: int = 1) -> tuple[TextFile, ...]:
+    """One file per own-axis table: ``x.comp`` ... for ``COMP_FILE`` with ``COMP_FILE_TYPE = kind``.
+
+    Raises
+    ------
+    FormatRefused
+        Another kind of table than own-axis, or a limit.
+    """
+    what = f"LinuxCNC COMP_FILE type {kind}"
+    check_kinds(comp, LIMITS, what)
+    files = []
+    for table in comp.tables:
+        check_table(table, LIMITS, what, settings.reference_mm, settings.step_mm)
+        columns = [to_file(f"linuxcnc-{kind}", v, table.position_mm) for v in (table.forward_mm, table.backward_mm)]
+        rows = zip(table.position_mm, *columns, strict=True)
+        lines = [f"{whole(p, POSITION_DECIMALS)} {fixed(f, settings.decimals)} {fixed(b, settings.decimals)}" for p, f, b in rows]
+        files.append(TextFile(f"{table.axis.lower()}.comp", "\n".join(lines) + "\n"))
+    return tuple(files)
+
+
+def read(files: tuple[TextFile, ...], settings: Settings, *, kind: int = 1) -> Compensation:
+    """What LinuxCNC would take from the files; the axis is the first letter of the file's name.
+
+    Raises
+    ------
+    TableFileError
+        A line at which the control would stop or that it would skip; a table of the other type; too many points.
+    """
+    return Compensation(tuple(_read_one(f, kind) for f in files))
+
+
+def _read_one(file: TextFile, kind: int) -> AxisTable:
+    axis = file.name[:1].upper()
+    if axis not in ("X", "Y", "Z"):
+        raise file.wrong(1, "the name of the file does not begin with its axis", "name it x.comp, y.comp or z.comp")
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for line, text in file.lines():
+        words = text.split()
+        if len(words) != 3:
+            found = "is blank" if not words else f"is {text.strip()!r}"
+            raise file.wrong(line, f"the line {found}: LinuxCNC ends the table here without an error", "write bare triplets only")
+        rows.append([file.number(line, w, n) for w, n in zip(words, ("the position", "forward", "reverse"), strict=True)])
+        lines.append(line)
+    if not rows:
+        raise file.wrong(1, "the file is empty: no compensation at all")
+    if len(rows) > LIMITS.points:
+        raise file.wrong(lines[LIMITS.points], f"LinuxCNC takes {LIMITS.points} points and leaves out the rest")
+    increasing(file, [r[0] for r in rows], lines)
+    position = np.array([r[0] for r in rows])
+    there, back = (from_file(f"linuxcnc-{kind}", np.array([r[k] for r in rows]), position) for k in (1, 2))
+    _right_type(file, kind, lines, np.maximum(np.abs(there), np.abs(back)))
+    return AxisTable(axis, axis, position, there, back)
+
+
+def _right_type(file: TextFile, kind: int, lines: list[int], size_mm: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+    """Refuse corrections that can be none: a table of the other type has positions where corrections should be, or the other way round."""
+    k = int(np.argmax(size_mm))
+    if size_mm[k] > PLAUSIBLE_MM:
+        other = "0 (positions reached)" if not SIGNS[f"linuxcnc-{kind}"].adds_position else "1 (corrections)"
+        raise file.wrong(
+            lines[k],
+            f"as type {kind} this is a correction of {size_mm[k]:.3f} mm: the file looks like type {other}",
+            "check COMP_FILE_TYPE",
+        )

@@ -1,0 +1,177 @@
+"""What is exported, in one form for all controls: corrections added to the command, and one function that does what a control would do.
+
+A machine that goes too far by e needs the correction −e (docs/conventions.md). Tables are broken lines with their end values held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from models.arrays import F1, F2, F4
+from models.compensation.interpolation import trilinear
+from models.functions.motions import PLACES, SQUARENESS
+from models.geometry.chain import deviation_mm
+from models.geometry.jacobian import squareness_motions
+from models.machine import AXES, Machine
+
+Lookup = Literal["command", "corrected"]
+"""Where a control looks cross, product and grid tables up: at the command, or at the position that the own-axis tables have corrected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A function of where one axis stands: ``value`` at increasing ``position_mm`` of ``axis`` (X, Y, Z)."""
+
+    axis: str
+    position_mm: F1
+    value: F1
+
+    def at(self, axes_mm: F2) -> F1:
+        """Values at positions, shape (n, 3) -> (n,)."""
+        return np.interp(axes_mm[:, AXES.index(self.axis)], self.position_mm, self.value)
+
+
+@dataclass(frozen=True, eq=False)
+class AxisTable:
+    """Correction of ``output`` as a function of ``axis``, mm: while ``axis`` moves in + (``forward_mm``) and in − (``backward_mm``)."""
+
+    axis: str
+    output: str
+    position_mm: F1
+    forward_mm: F1
+    backward_mm: F1
+
+    @property
+    def name(self) -> str:
+        """As people say it: ``Y over X``."""
+        return f"{self.output} over {self.axis}"
+
+    @property
+    def own(self) -> bool:
+        """Whether the axis corrects itself (positioning)."""
+        return self.axis == self.output
+
+    @property
+    def directional(self) -> bool:
+        """Whether the two directions differ."""
+        return not np.array_equal(self.forward_mm, self.backward_mm)
+
+    def at(self, axes_mm: F2, direction: F2) -> F1:
+        """Correction at positions, moving as ``direction`` says (+1, −1; 0: the mean of both), shape (n, 3) each -> (n,)."""
+        a = AXES.index(self.axis)
+        there = np.interp(axes_mm[:, a], self.position_mm, self.forward_mm)
+        back = np.interp(axes_mm[:, a], self.position_mm, self.backward_mm)
+        return np.asarray(0.5 * (1.0 + direction[:, a]) * there + 0.5 * (1.0 - direction[:, a]) * back)
+
+
+@dataclass(frozen=True, eq=False)
+class ProductTable:
+    """Correction of ``output`` = ``angle`` (rad) times ``lever`` (mm): what a turned carriage does at a distance."""
+
+    output: str
+    angle: Curve
+    lever: Curve
+
+    @property
+    def name(self) -> str:
+        """As people say it: ``X over Z times Y``."""
+        return f"{self.output} over {self.angle.axis} times {self.lever.axis}"
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Corrections (nx, ny, nz, 3), mm, at the nodes of a 3-D grid; trilinear between them."""
+
+    position_mm: tuple[F1, F1, F1]
+    correction_mm: F4
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """ERROR motions (ISO 230-1, not corrections; mm, rad) for a control that works the deviation out by its own chain (rule G)."""
+
+    machine: Machine
+    curves: Mapping[str, Curve]
+    squareness_rad: Mapping[str, float]
+
+    def correction_at(self, axes_mm: F2) -> F2:
+        """Minus the deviation of rule G, shape (n, 3); squareness counts travel from the start of the stroke."""
+        values = np.zeros((axes_mm.shape[0], 3, 6))
+        for name, curve in self.curves.items():
+            axis, component = PLACES[name]
+            values[:, axis, component] = curve.at(axes_mm)
+        angles = np.array([self.squareness_rad.get(name, 0.0) for name in SQUARENESS])
+        values += squareness_motions(axes_mm, self.machine.stroke_mm[:, 0]) @ angles
+        return -deviation_mm(self.machine, axes_mm, values)
+
+
+@dataclass(frozen=True, eq=False)
+class Compensation:
+    """All tables together; what they hold is added up.
+
+    ``lost_motion_mm``: per axis, what the control adds as its own backlash parameter: nothing while the axis moves in +, −B in −.
+    """
+
+    tables: tuple[AxisTable, ...] = ()
+    products: tuple[ProductTable, ...] = ()
+    lattice: Lattice | None = None
+    motions: Motions | None = None
+    lost_motion_mm: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def own(self) -> tuple[AxisTable, ...]:
+        """The own-axis tables."""
+        return tuple(t for t in self.tables if t.own)
+
+    @property
+    def cross(self) -> tuple[AxisTable, ...]:
+        """The tables between two axes."""
+        return tuple(t for t in self.tables if not t.own)
+
+    @property
+    def numbers(self) -> int:
+        """Numbers that the control has to hold."""
+        size = sum(t.position_mm.size * (2 if t.directional else 1) for t in self.tables)
+        size += sum(p.angle.value.size + p.lever.value.size for p in self.products)
+        size += 0 if self.lattice is None else int(self.lattice.correction_mm.size)
+        if self.motions is not None:
+            size += sum(c.value.size for c in self.motions.curves.values()) + len(self.motions.squareness_rad)
+        return size
+
+
+def correction_at(comp: Compensation, axes_mm: F2, direction: F2 | None = None, *, lookup: Lookup = "command") -> F2:
+    """What a control adds to commanded positions: the judge of every format.
+
+    Parameters
+    ----------
+    axes_mm : array, shape (n, 3)
+        Commanded positions.
+    direction : array, shape (n, 3), optional
+        Direction in which each axis moves, +1 or −1; none: the mean of both.
+    lookup : "command" or "corrected"
+        Where all but the own-axis tables are looked up.
+
+    Returns
+    -------
+    array, shape (n, 3), mm
+    """
+    way = np.zeros(axes_mm.shape) if direction is None else direction
+    out = np.zeros(axes_mm.shape)
+    for table in comp.own:
+        out[:, AXES.index(table.output)] += table.at(axes_mm, way)
+    for axis, lost in comp.lost_motion_mm.items():
+        out[:, AXES.index(axis)] -= 0.5 * (1.0 - way[:, AXES.index(axis)]) * lost
+    there = axes_mm + out if lookup == "corrected" else axes_mm
+    for table in comp.cross:
+        out[:, AXES.index(table.output)] += table.at(there, way)
+    for product in comp.products:
+        out[:, AXES.index(product.output)] += product.angle.at(there) * product.lever.at(there)
+    if comp.lattice is not None:
+        out += trilinear(comp.lattice.position_mm, comp.lattice.correction_mm, there)
+    if comp.motions is not None:
+        out += comp.motions.correction_at(there)
+    return out

@@ -1,0 +1,84 @@
+"""The 10 µm step: an error of +10 µm at one place, in every format: which number stands in the file, and what the axis then has to do.
+
+Written to a machine and measured there, it tells sign, axis, unit and scale of a control before the first real table (controllers.md 5.7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.machine import AXES, Machine
+from service.formats.model import AxisTable, Compensation, Curve, Lattice, ProductTable, correction_at
+from service.formats.registry import FORMATS, Format
+from service.formats.settings import Settings
+
+STEP_MM = 0.010
+POSITION_MM = np.array([0.0, 50.0, 100.0, 150.0, 200.0])
+AT = 2
+"""Index of the place of the step."""
+SETTINGS = Settings(
+    reference_mm=(0.0, 0.0, 0.0),
+    decimals=4,
+    machine=Machine("w-X-Y-b-Z-t", np.array([[0.0, 200.0]] * 3)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """One row: format, what was written, the lines of its file that a table of zeros has otherwise, where, what is added there (mm)."""
+
+    format: str
+    what: str
+    lines: tuple[str, ...]
+    axis: str
+    at_mm: tuple[float, float, float]
+    direction: int
+    added_mm: float
+
+
+def proofs(form: Format) -> tuple[Proof, ...]:
+    """Rows of all kinds of table that a format holds."""
+    out = []
+    for what, axis, at, way, step, nothing in _cases(form):
+        files, zeros = form.write(step, SETTINGS), form.write(nothing, SETTINGS)
+        blank = {line for f in zeros for line in f.text.splitlines()}
+        lines = tuple(line for f in files for line in f.text.splitlines() if line not in blank)
+        added = correction_at(form.read(files, SETTINGS), np.array([at]), np.full((1, 3), float(way)))[0, AXES.index(axis)]
+        out.append(Proof(form.key, what, lines, axis, at, way, float(added)))
+    return tuple(out)
+
+
+def all_proofs() -> tuple[Proof, ...]:
+    """Rows of all formats."""
+    return tuple(p for f in FORMATS.values() for p in proofs(f))
+
+
+Case = tuple[str, str, tuple[float, float, float], int, Compensation, Compensation]
+
+
+def _cases(form: Format) -> list[Case]:
+    """What is written: kind, output axis, place, the step (a correction of −10 µm there), and the same without it."""
+    spike = np.where(np.arange(POSITION_MM.size) == AT, -STEP_MM, 0.0)
+    place = float(POSITION_MM[AT])
+    cases: list[Case] = []
+    for able, output, what in ((form.limits.own, "X", "X over X"), (form.limits.cross, "Y", "Y over X")):
+        if able:
+            tables = [Compensation((AxisTable("X", output, POSITION_MM, v, v),)) for v in (spike, 0.0 * spike)]
+            cases.append((what, output, (place, 0.0, 0.0), 1, tables[0], tables[1]))
+    if form.limits.own and form.limits.directional:
+        zero = 0.0 * spike
+        pair = [Compensation((AxisTable("X", "X", POSITION_MM, zero, v),)) for v in (spike, zero)]
+        cases.append(("X over X, only while moving in −", "X", (place, 0.0, 0.0), -1, pair[0], pair[1]))
+    if form.limits.products:
+        lever = Curve("Z", POSITION_MM, POSITION_MM)
+        both = [Compensation(products=(ProductTable("X", Curve("Y", POSITION_MM, v / 200.0), lever),)) for v in (spike, 0.0 * spike)]
+        cases.append(("X over Y times Z", "X", (0.0, place, 200.0), 1, both[0], both[1]))
+    if form.limits.lattice:
+        nodes = (POSITION_MM[[0, AT, 4]],) * 3
+        value = np.zeros((3, 3, 3, 3))
+        value[1, 1, 1, 0] = -STEP_MM
+        grids = [Compensation(lattice=Lattice(nodes, v)) for v in (value, 0.0 * value)]
+        cases.append(("3-D grid, X", "X", (place, place, place), 1, grids[0], grids[1]))
+    return cases

@@ -1,0 +1,128 @@
+"""All formats by their key: what each can hold, how its word is proved, who writes and reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from service.errors import FormatRefused
+from service.formats import (
+    centroid,
+    fanuc_lattice,
+    fanuc_pitch,
+    heidenhain,
+    isg,
+    linuxcnc_comp,
+    linuxcnc_hal,
+    mach4,
+    siemens_cec,
+    siemens_eec,
+)
+from service.formats.limits import Limits
+from service.formats.model import Compensation
+from service.formats.settings import Settings
+from service.formats.signs import SIGNS, SignRule
+from service.formats.text import TextFile
+
+Write = Callable[[Compensation, Settings], tuple[TextFile, ...]]
+Read = Callable[[tuple[TextFile, ...], Settings], Compensation]
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format: ``key`` for the command line, ``name`` for people, ``live``: what makes a loaded file act."""
+
+    key: str
+    name: str
+    limits: Limits
+    write: Write
+    read: Read
+    live: str
+
+    @property
+    def sign(self) -> SignRule:
+        """Its sign rule."""
+        return SIGNS[self.key]
+
+
+FORMATS: dict[str, Format] = {
+    f.key: f
+    for f in (
+        Format("isg", "Beckhoff/ISG volumetric CSV (neutral)", isg.LIMITS, isg.write, isg.read, "#VOLCOMP in the NC program"),
+        Format(
+            "linuxcnc-1",
+            "LinuxCNC COMP_FILE type 1",
+            linuxcnc_comp.LIMITS,
+            partial(linuxcnc_comp.write, kind=1),
+            partial(linuxcnc_comp.read, kind=1),
+            "restart of LinuxCNC, home",
+        ),
+        Format(
+            "linuxcnc-0",
+            "LinuxCNC COMP_FILE type 0",
+            linuxcnc_comp.LIMITS,
+            partial(linuxcnc_comp.write, kind=0),
+            partial(linuxcnc_comp.read, kind=0),
+            "restart of LinuxCNC, home",
+        ),
+        Format(
+            "linuxcnc-hal",
+            "LinuxCNC HAL network",
+            linuxcnc_hal.LIMITS,
+            linuxcnc_hal.write,
+            linuxcnc_hal.read,
+            "at once (halcmd), with the machine at rest",
+        ),
+        Format(
+            "siemens-eec",
+            "Siemens ENC_COMP",
+            siemens_eec.LIMITS,
+            siemens_eec.write,
+            siemens_eec.read,
+            "load with MD32700 = 0, then 1, reset, reference",
+        ),
+        Format(
+            "siemens-cec",
+            "Siemens CEC",
+            siemens_cec.LIMITS,
+            siemens_cec.write,
+            siemens_cec.read,
+            "load with MD32710 = 0, then 1; SD41300 switches tables",
+        ),
+        Format(
+            "fanuc-pitch",
+            "Fanuc stored pitch error compensation",
+            fanuc_pitch.LIMITS,
+            fanuc_pitch.write,
+            fanuc_pitch.read,
+            "power off and on, G28",
+        ),
+        Format(
+            "fanuc-lattice",
+            "Fanuc 3-D error compensation (sheet)",
+            fanuc_lattice.LIMITS,
+            fanuc_lattice.write,
+            fanuc_lattice.read,
+            "entered by hand; power off and on, G28",
+        ),
+        Format(
+            "heidenhain", "Heidenhain .COM and .CMA", heidenhain.LIMITS, heidenhain.write, heidenhain.read, "active line (*) of the .CMA"
+        ),
+        Format("mach4", "Mach4 screw map (sheet)", mach4.LIMITS, mach4.write, mach4.read, "entered by hand"),
+        Format("centroid", "Centroid ballscrew table, version 1", centroid.LIMITS, centroid.write, centroid.read, "restart of the control"),
+    )
+}
+
+
+def format_of(key: str) -> Format:
+    """The format of a key.
+
+    Raises
+    ------
+    FormatRefused
+        There is none; the message names those there are.
+    """
+    if key not in FORMATS:
+        raise FormatRefused(f"there is no format {key!r}", f"known are {', '.join(FORMATS)}")
+    return FORMATS[key]

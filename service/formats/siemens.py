@@ -1,0 +1,116 @@
+"""What both Siemens table files have in common: lines ``$VARIABLE[indices]=value ; comment`` between a head and ``M17``."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from models.arrays import F1
+from service.errors import FormatRefused
+from service.formats.limits import NOTHING
+from service.formats.text import TextFile
+
+_LINE = re.compile(r"\$(\w+)\s*\[([^\]]*)\]\s*=\s*\(?([^;)]*?)\)?\s*(;.*)?")
+HEAD = "CHANDATA(1)"
+END = "M17"
+POSITION_DECIMALS = 6
+
+
+@dataclass
+class Assignments:
+    """Every assignment of a file: (variable, indices as text) -> value as text, and its line."""
+
+    file: TextFile
+    value: dict[tuple[str, tuple[str, ...]], str] = field(default_factory=dict)
+    line: dict[tuple[str, tuple[str, ...]], int] = field(default_factory=dict)
+
+    def number(self, name: str, *index: str) -> float:
+        """One number; TableFileError where it is missing or none."""
+        key = (name, index)
+        if key not in self.value:
+            raise self.file.wrong(1, f"${name}[{','.join(index)}] is missing: the control would keep what it had")
+        return self.file.number(self.line[key], self.value[key], f"${name}[{','.join(index)}]")
+
+    def values(self, name: str, *index: str, places: int = 1) -> F1:
+        """All numbered points 0, 1, ... of a table; index ``place`` of the variable is the point's number.
+
+        Raises
+        ------
+        TableFileError
+            A point between the first and the last is missing.
+        """
+        found: dict[int, float] = {}
+        for (variable, indices), text in self.value.items():
+            rest = tuple(v for k, v in enumerate(indices) if k != places)
+            if variable == name and rest == index and indices[places].isdigit():
+                found[int(indices[places])] = self.file.number(self.line[(variable, indices)], text, f"${name}")
+        missing = sorted(set(range(max(found, default=-1) + 1)) - set(found))
+        if missing or not found:
+            raise self.file.wrong(
+                1, f"${name}[{','.join(index)}]: point {missing[0] if missing else 0} is missing: the control keeps its old value"
+            )
+        return np.array([found[k] for k in range(len(found))])
+
+
+def parse(file: TextFile, name: str) -> Assignments:
+    """Assignments of a file ``%_N_name_INI``.
+
+    Raises
+    ------
+    TableFileError
+        A line that is neither head, assignment, comment nor M17; no M17 (half a file); two values for one variable.
+    """
+    out, ended = Assignments(file), False
+    for line, text in file.lines():
+        bare = text.partition(";")[0].strip()
+        if not bare or bare == HEAD or bare.startswith("%_N_"):
+            if bare.startswith("%_N_") and bare != f"%_N_{name}_INI":
+                raise file.wrong(line, f"the file is {bare}, expected %_N_{name}_INI")
+            continue
+        if bare == END:
+            ended = True
+            continue
+        match = _LINE.fullmatch(text.strip())
+        if match is None or ended:
+            raise file.wrong(line, f"{text.strip()!r} is no assignment" if not ended else "there is something behind M17")
+        key = (match.group(1), tuple(w.strip() for w in match.group(2).split(",")))
+        if key in out.value:
+            raise file.wrong(line, f"${key[0]}[{','.join(key[1])}] has a second value (first in line {out.line[key]})")
+        out.value[key], out.line[key] = match.group(3).strip(), line
+    if not ended:
+        raise file.wrong(len(file.text.splitlines()), "M17 is missing: the file is cut off")
+    return out
+
+
+def grid(found: Assignments, count: int, step: float, first: float, last: float, where: tuple[str, str]) -> F1:
+    """Positions of equidistant points, checked against the stated end; ``where``: variable and index of the end, for the message.
+
+    Raises
+    ------
+    TableFileError
+        Step not positive, or first + (count − 1) step is not the stated end.
+    """
+    line = found.line.get((where[0], tuple(where[1].split(","))), 1)
+    if not step > 0 or abs(first + (count - 1) * step - last) > 1e-6 * max(1.0, abs(last), count):
+        raise found.file.wrong(
+            line, f"{count} points from {first:g} in steps of {step:g} mm do not end at {last:g}: positions are not those"
+        )
+    return np.asarray(first + step * np.arange(count, dtype=np.float64))
+
+
+def step_of(position_mm: F1, name: str) -> float:
+    """Step that reproduces a grid when it is written with few decimals.
+
+    Raises
+    ------
+    FormatRefused
+        The step needs more decimals than are written: the last point would not be where it is.
+    """
+    step = round(float(np.ptp(position_mm)) / (position_mm.size - 1), POSITION_DECIMALS)
+    if abs(position_mm[0] + step * (position_mm.size - 1) - position_mm[-1]) > 1e-6:
+        raise FormatRefused(
+            f"{name}: the step {np.ptp(position_mm) / (position_mm.size - 1)!r} mm is no whole number of nanometres", NOTHING
+        )
+    return step

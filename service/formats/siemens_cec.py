@@ -1,0 +1,146 @@
+"""Siemens sag and angularity compensation, $AN_CEC (controllers.md 5.1): any axis from any axis, pairs for the two directions, products.
+
+Directions: two tables with $AN_CEC_DIRECTION 1 and -1. Products: $AN_CEC_MULT_BY_TABLE[t] = n multiplies table t by table n (index n - 1).
+The manual's grid example (6FC5397-1BP40-3BA1 p. 259) counts the product alone, and so does this module; the factor table must not act by
+itself: its evaluation is switched off ($SN_CEC_TABLE_ENABLE = 0). Nobody has tried that on a control here: see the step first.
+Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables are looked up at the command.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.machine import AXES
+from service.formats.limits import Limits, check_kinds, check_positions, check_size, check_table
+from service.formats.model import AxisTable, Compensation, Curve, ProductTable
+from service.formats.settings import Settings
+from service.formats.siemens import END, HEAD, POSITION_DECIMALS, Assignments, grid, parse, step_of
+from service.formats.signs import from_file, to_file
+from service.formats.text import TextFile, short
+
+LIMITS = Limits(points=2000, equidistant=True, own=True, cross=True, products=True)
+LEVERS = Limits(points=2000, equidistant=True, size_mm=1e5)
+WHAT = "Siemens CEC"
+NAME = "NC_CEC.INI"
+ANGLE_DECIMALS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """One $AN_CEC table: its curve (numbers as in the file), output, direction, the table it is multiplied by (0: none), a mere factor?"""
+
+    curve: Curve
+    output: str
+    direction: int
+    times: int
+    factor: bool
+    decimals: int
+
+
+def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+    """All tables in one file, numbered from 0, in the order of the manual's example.
+
+    Raises
+    ------
+    FormatRefused
+        A grid or error motions; a limit; more points than MD18342 (``settings.points``).
+    """
+    limits = LIMITS if settings.points is None else Limits(points=settings.points, equidistant=True, cross=True, products=True)
+    check_kinds(comp, limits, WHAT)
+    found: list[_Table] = []
+    for table in comp.tables:
+        check_table(table, limits, WHAT, settings.reference_mm, settings.step_mm)
+        for way, values in ((1, table.forward_mm), (-1, table.backward_mm)) if table.directional else ((0, table.forward_mm),):
+            curve = Curve(table.axis, table.position_mm, to_file("siemens-cec", values, table.position_mm))
+            found.append(_Table(curve, table.output, way, 0, False, settings.decimals))
+    for p in comp.products:
+        for part, limit in ((p.angle, limits), (p.lever, LEVERS)):
+            check_positions(part.position_mm, limit, f"{WHAT}, {p.name}")
+            check_size(part.position_mm, part.value, limit, f"{WHAT}, {p.name}")
+        angle = Curve(p.angle.axis, p.angle.position_mm, to_file("siemens-cec", p.angle.value, p.angle.position_mm))
+        found.append(_Table(angle, p.output, 0, len(found) + 2, False, settings.decimals + ANGLE_DECIMALS))
+        found.append(_Table(p.lever, p.output, 0, 0, True, settings.decimals))
+    lines = ["%_N_NC_CEC_INI", HEAD]
+    for t, table_ in enumerate(found):
+        lines += _lines(t, table_, switches=bool(comp.products))
+    return (TextFile(NAME, "\n".join([*lines, END]) + "\n"),)
+
+
+def _lines(t: int, table: _Table, *, switches: bool) -> list[str]:
+    c = table.curve
+    lines = [f"$AN_CEC[{t},{k}]={short(v, table.decimals)}" for k, v in enumerate(c.value)]
+    lines += [
+        f"$AN_CEC_INPUT_AXIS[{t}]=(AX{AXES.index(c.axis) + 1})",
+        f"$AN_CEC_OUTPUT_AXIS[{t}]=(AX{AXES.index(table.output) + 1})",
+        f"$AN_CEC_STEP[{t}]={short(step_of(c.position_mm, f'{WHAT}, table {t}'), POSITION_DECIMALS)}",
+        f"$AN_CEC_MIN[{t}]={short(c.position_mm[0], POSITION_DECIMALS)}",
+        f"$AN_CEC_MAX[{t}]={short(c.position_mm[-1], POSITION_DECIMALS)}",
+        f"$AN_CEC_DIRECTION[{t}]={table.direction}",
+        f"$AN_CEC_MULT_BY_TABLE[{t}]={table.times}",
+        f"$AN_CEC_IS_MODULO[{t}]=0",
+    ]
+    return [*lines, f"$SN_CEC_TABLE_ENABLE[{t}]={0 if table.factor else 1}"] if switches else lines
+
+
+def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+    """What the control would make of the file; a table for one direction alone is nothing in the other.
+
+    Raises
+    ------
+    TableFileError
+        A line that is none of its own, a missing point, an end that does not fit step and count, an axis other than AX1 to AX3, a product
+        with a table that is not there.
+    """
+    found = parse(files[0], "NC_CEC")
+    numbers = sorted({int(i[0]) for v, i in found.value if v == "AN_CEC" and i[0].isdigit()})
+    if not numbers:
+        raise found.file.wrong(1, "there is no table")
+    tables = {t: _table(found, t) for t in numbers}
+    plain: dict[tuple[str, str, bytes], list[tuple[int, Curve]]] = {}
+    products = []
+    for t, table in tables.items():
+        if table.times:
+            other = tables.get(table.times - 1)
+            if other is None:
+                line = found.line[("AN_CEC_MULT_BY_TABLE", (str(t),))]
+                raise found.file.wrong(line, f"table {t} is multiplied by table number {table.times}, which is not there")
+            angle = Curve(table.curve.axis, table.curve.position_mm, from_file("siemens-cec", table.curve.value, table.curve.position_mm))
+            products.append(ProductTable(table.output, angle, other.curve))
+        elif not table.factor:
+            key = (table.curve.axis, table.output, table.curve.position_mm.tobytes())
+            plain.setdefault(key, []).append((table.direction, table.curve))
+    return Compensation(tuple(_both(k[0], k[1], parts) for k, parts in plain.items()), tuple(products))
+
+
+def _both(axis: str, output: str, parts: list[tuple[int, Curve]]) -> AxisTable:
+    """All tables of one pair of axes on one grid: what they add in + and in −."""
+    position = parts[0][1].position_mm
+    there, back = np.zeros(position.size), np.zeros(position.size)
+    for way, curve in parts:
+        value = from_file("siemens-cec", curve.value, position)
+        there = there + (value if way >= 0 else 0.0)
+        back = back + (value if way <= 0 else 0.0)
+    return AxisTable(axis, output, position, there, back)
+
+
+def _table(found: Assignments, t: int) -> _Table:
+    n = str(t)
+    values = found.values("AN_CEC", n)
+    step, first, last = (found.number(f"AN_CEC_{w}", n) for w in ("STEP", "MIN", "MAX"))
+    position = grid(found, values.size, step, first, last, ("AN_CEC_MAX", n))
+    way, times = (int(found.number(f"AN_CEC_{w}", n)) for w in ("DIRECTION", "MULT_BY_TABLE"))
+    if way not in (-1, 0, 1):
+        raise found.file.wrong(found.line[("AN_CEC_DIRECTION", (n,))], f"direction {way}, expected -1, 0 or 1")
+    enabled = found.value.get(("SN_CEC_TABLE_ENABLE", (n,)), "1") not in ("0", "FALSE")
+    return _Table(
+        Curve(_axis(found, "AN_CEC_INPUT_AXIS", n), position, values), _axis(found, "AN_CEC_OUTPUT_AXIS", n), way, times, not enabled, 0
+    )
+
+
+def _axis(found: Assignments, variable: str, n: str) -> str:
+    name = found.value.get((variable, (n,)), "")
+    if name not in ("AX1", "AX2", "AX3"):
+        raise found.file.wrong(found.line.get((variable, (n,)), 1), f"${variable}[{n}] is {name!r}, expected (AX1), (AX2) or (AX3)")
+    return AXES[int(name[2]) - 1]

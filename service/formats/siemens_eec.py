@@ -1,0 +1,69 @@
+"""Siemens encoder (leadscrew) error compensation, $AA_ENC_COMP (controllers.md 5.1): one equidistant table per axis, no directions.
+
+Load with MD32700 = 0, then set it to 1 and reference the axis; inactive until then. The control neither limits nor monitors the size.
+The table must be zero at the reference point. Lost motion that does not depend on place goes into MD32450 (backlash), by hand.
+"""
+
+from __future__ import annotations
+
+from models.machine import AXES
+from service.formats.limits import Limits, check_kinds, check_table
+from service.formats.model import AxisTable, Compensation
+from service.formats.settings import Settings
+from service.formats.siemens import END, HEAD, POSITION_DECIMALS, grid, parse, step_of
+from service.formats.signs import from_file, to_file
+from service.formats.text import TextFile, short
+
+LIMITS = Limits(points=5000, equidistant=True, directional=False)
+WHAT = "Siemens ENC_COMP"
+NAME = "AX_EEC.INI"
+
+
+def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+    """All own-axis tables in one file, in the order of the manual's example.
+
+    Raises
+    ------
+    FormatRefused
+        Another kind of table, a direction-dependent one, more points than MD38000 (``settings.points``), not zero at the reference.
+    """
+    limits = LIMITS if settings.points is None else Limits(points=settings.points, equidistant=True, directional=False)
+    check_kinds(comp, limits, WHAT)
+    lines = ["%_N_AX_EEC_INI", HEAD]
+    for table in comp.tables:
+        check_table(table, limits, WHAT, settings.reference_mm, settings.step_mm)
+        axis = settings.axis_names[AXES.index(table.axis)]
+        numbers = to_file("siemens-eec", table.forward_mm, table.position_mm)
+        lines += [f"$AA_ENC_COMP[0,{k},{axis}]={short(v, settings.decimals)}" for k, v in enumerate(numbers)]
+        lines += [
+            f"$AA_ENC_COMP_STEP[0,{axis}]={short(step_of(table.position_mm, f'{WHAT}, {table.name}'), POSITION_DECIMALS)}",
+            f"$AA_ENC_COMP_MIN[0,{axis}]={short(table.position_mm[0], POSITION_DECIMALS)}",
+            f"$AA_ENC_COMP_MAX[0,{axis}]={short(table.position_mm[-1], POSITION_DECIMALS)}",
+            f"$AA_ENC_COMP_IS_MODULO[0,{axis}]=0",
+        ]
+    return (TextFile(NAME, "\n".join([*lines, END]) + "\n"),)
+
+
+def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+    """What the control would take from the file.
+
+    Raises
+    ------
+    TableFileError
+        A line that is none of its own, a missing point, an end that does not fit step and count, a table for a rotary axis.
+    """
+    found = parse(files[0], "AX_EEC")
+    tables = []
+    for axis, name in zip(AXES, settings.axis_names, strict=True):
+        if not any(v == "AA_ENC_COMP" and i[-1] == name for v, i in found.value):
+            continue
+        numbers = found.values("AA_ENC_COMP", "0", name)
+        if found.number("AA_ENC_COMP_IS_MODULO", "0", name) != 0:
+            raise found.file.wrong(found.line[("AA_ENC_COMP_IS_MODULO", ("0", name))], "modulo is for rotary axes")
+        step, first, last = (found.number(f"AA_ENC_COMP_{w}", "0", name) for w in ("STEP", "MIN", "MAX"))
+        position = grid(found, numbers.size, step, first, last, ("AA_ENC_COMP_MAX", f"0,{name}"))
+        value = from_file("siemens-eec", numbers, position)
+        tables.append(AxisTable(axis, axis, position, value, value))
+    if not tables:
+        raise found.file.wrong(1, f"no table for {', '.join(settings.axis_names)}", "give the control's axis names")
+    return Compensation(tuple(tables))

@@ -1,0 +1,59 @@
+"""The sign rule of every format, in one place (controllers.md 5.7). e = actual − nominal; nobody else in the code knows a sign.
+
+A number in a file is ``per_error`` times e, plus the nominal position where the control wants the position that was reached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from models.arrays import F1
+
+Evidence = Literal["verified by execution", "by manual"]
+
+
+@dataclass(frozen=True, slots=True)
+class SignRule:
+    """How an error becomes a number in a file.
+
+    ``per_error``: +1 or −1. ``adds_position``: the number is a position reached. ``sure``: False where no manual says it in so many words;
+    then nothing may be loaded before the 10 µm step has been seen on the machine.
+    """
+
+    per_error: Literal[1, -1]
+    adds_position: bool
+    evidence: Evidence
+    sure: bool
+    words: str
+
+
+SIGNS: dict[str, SignRule] = {
+    "isg": SignRule(1, False, "by manual", False, "the error itself; the kernel can turn it over (parameter negate)"),
+    "linuxcnc-1": SignRule(-1, False, "verified by execution", True, "what is added to the motor's command: −e"),
+    "linuxcnc-0": SignRule(1, True, "verified by execution", True, "the position that was reached: nominal + e"),
+    "linuxcnc-hal": SignRule(-1, False, "verified by execution", True, "what is added to the drive's command: −e"),
+    "siemens-eec": SignRule(1, False, "by manual", True, "corrects the ACTUAL value; a positive number moves the axis in −: +e"),
+    "siemens-cec": SignRule(-1, False, "by manual", False, "added to the setpoint of the compensated axis: −e; not said in a manual"),
+    "fanuc-pitch": SignRule(-1, False, "by manual", False, "pulses that are added from point to point: −Δe; not said in a manual"),
+    "fanuc-lattice": SignRule(-1, False, "by manual", False, "pulses that are added: −e; not said in a manual"),
+    "heidenhain": SignRule(-1, False, "by manual", False, "compensation value: −e; manuals differ (error or correction)"),
+    "mach4": SignRule(-1, False, "by manual", True, "expected − actual: −e"),
+    "centroid": SignRule(-1, False, "by manual", False, "amount of correction to apply: −e; not said in a manual"),
+}
+
+
+def to_file(rule: str, correction: F1, position_mm: F1) -> F1:
+    """Numbers of a file for corrections at positions of its axis."""
+    sign = SIGNS[rule]
+    value = -sign.per_error * np.asarray(correction, dtype=np.float64)
+    return value + position_mm if sign.adds_position else value
+
+
+def from_file(rule: str, number: F1, position_mm: F1) -> F1:
+    """Corrections that numbers of a file mean."""
+    sign = SIGNS[rule]
+    value = np.asarray(number, dtype=np.float64)
+    return -sign.per_error * (value - position_mm if sign.adds_position else value) + 0.0

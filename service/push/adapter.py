@@ -1,0 +1,174 @@
+"""The port of the push machine to a real controller: one operation becomes one call of the driver, and its errors become outcomes.
+
+What a driver says decides nothing here: Refused means that nothing changed, Doubt that nobody knows. The machine decides.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from drivers.api import Controller
+from drivers.errors import DriverError, Rebooted, Refused
+from service.clock import Clock
+from service.push import operations as o
+from service.push.entries import Journal, facts
+from service.push.meaning import meaning_of_bytes
+from service.push.operations import Kind, Op, Outcome, Truth
+from service.sequences.interlocks import MOVING, tripped
+
+LEASE_MS, BEAT_S = 60_000, 20.0
+"""How long a lease is taken for, and how often it is renewed while the machine is measured."""
+_IN_POSITION = 7
+
+
+@dataclass(frozen=True, slots=True)
+class People:
+    """Who answers the machine's questions: the check of the table, the approval, the probe and the verification."""
+
+    validate: Callable[[Journal], Awaitable[list[str]]]
+    approve: Callable[[Journal], Awaitable[o.Approval | None]]
+    probe: Callable[[Journal], Awaitable[o.Verdict]]
+    verify: Callable[[Journal], Awaitable[o.Verdict]]
+
+
+def nobody() -> People:
+    """For recoveries: they ask nothing, and what they were asked would be no."""
+
+    async def no_reason(journal: Journal) -> list[str]:
+        return ["nobody is there to check it"]
+
+    async def no_approval(journal: Journal) -> o.Approval | None:
+        return None
+
+    async def no_verdict(journal: Journal) -> o.Verdict:
+        return o.Verdict(False, "nobody is there to measure it")
+
+    return People(no_reason, no_approval, no_verdict, no_verdict)
+
+
+class ControllerPort:
+    """Does operations on a real controller.
+
+    Parameters
+    ----------
+    controller : Controller
+        Identified.
+    people : People
+        Whom to ask.
+    clock : Clock
+        Monotonic time of the approval.
+    """
+
+    def __init__(self, controller: Controller, people: People, clock: Clock) -> None:
+        self._c, self._people, self._clock = controller, people, clock
+        self._map = ""
+
+    async def execute(self, op: Op, journal: Journal) -> Outcome:
+        """Do one operation; never raises for what the controller or the link does."""
+        try:
+            return await self._execute(op, journal)
+        except Refused as error:
+            return o.Refused(str(error))
+        except (DriverError, TimeoutError) as error:
+            return o.Doubt(str(error) or type(error).__name__)
+
+    async def _execute(self, op: Op, journal: Journal) -> Outcome:
+        match op.kind:
+            case Kind.LOOK:
+                return o.Done(await self._look())
+            case Kind.READ:
+                return o.Done(await self._c.read_bank(op.bank, 2 * op.count or None))
+            case Kind.READ_AGAIN:
+                return o.Done(meaning_of_bytes(await self._c.read_bank(op.bank, 2 * op.count or None)))
+            case Kind.READ_CHUNK:
+                return o.Done(await self._c.read_part(op.bank, op.first, 2 * op.count))
+            case Kind.VALIDATE | Kind.APPROVE | Kind.PROBE | Kind.VERIFY:
+                return await self._ask(op.kind, journal)
+            case _:
+                await self._change(op)
+                return o.Done()
+
+    async def _change(self, op: Op) -> None:
+        match op.kind:
+            case Kind.LEASE:
+                await self._c.lease(op.owner, LEASE_MS)
+            case Kind.RELEASE:
+                await self._c.release(op.owner)
+            case Kind.WRITE:
+                await self._c.write_part(op.bank, op.first, op.data)
+            case Kind.SEAL:
+                await self._c.seal(op.bank, op.owner)
+            case Kind.ACTIVATE:
+                await self._c.activate(op.bank, expect_crc=op.crc, expect_gen=op.gen, owner=op.owner)
+            case _:
+                raise AssertionError(f"{op.kind} is no operation on a controller")
+
+    async def _ask(self, kind: Kind, journal: Journal) -> Outcome:
+        if kind is Kind.VALIDATE:
+            return o.Done(await self._people.validate(journal))
+        if kind is Kind.APPROVE:
+            approval = await self._people.approve(journal)
+            return o.Refused("nobody approved it") if approval is None else o.Done(approval)
+        return o.Done(await self._while_leased(self._people.probe if kind is Kind.PROBE else self._people.verify, journal))
+
+    async def _while_leased(self, question: Callable[[Journal], Awaitable[o.Verdict]], journal: Journal) -> o.Verdict:
+        """Measuring takes longer than a lease: it is renewed meanwhile. Where another has it, nothing of the measurement counts."""
+        over, lost = asyncio.Event(), asyncio.Event()
+        asked = asyncio.ensure_future(question(journal))
+        beat = asyncio.ensure_future(self._beat(int(facts(journal)["owner"]), over, lost))
+        try:
+            await asyncio.wait([asked, beat], return_when=asyncio.FIRST_COMPLETED)
+            if lost.is_set() and not asked.done():
+                asked.cancel()
+            await asyncio.wait([asked])
+        finally:
+            over.set()  # not cancelled: a command on its way would leave the link in doubt
+            await asyncio.wait([beat])
+        if lost.is_set() and asked.cancelled():
+            return o.Verdict(False, "another owner took the lease meanwhile")
+        if not beat.cancelled():
+            beat.exception()  # a defect of the renewal is seen where the lease is looked at; what was measured counts
+        return asked.result()
+
+    async def _beat(self, owner: int, over: asyncio.Event, lost: asyncio.Event) -> None:
+        """Renew the lease until it is over; `lost` when another has it."""
+        ended = asyncio.ensure_future(over.wait())
+        try:
+            while True:
+                pause = asyncio.ensure_future(self._clock.sleep(BEAT_S))
+                await asyncio.wait([ended, pause], return_when=asyncio.FIRST_COMPLETED)
+                pause.cancel()
+                if ended.done():
+                    return
+                try:
+                    await self._c.lease(owner, LEASE_MS)
+                except Refused:
+                    lost.set()
+                    return
+                except (DriverError, TimeoutError):
+                    continue  # whoever measures meets the same trouble, and decides
+        finally:
+            ended.cancel()
+
+    async def _look(self) -> Truth:
+        """One look. A restart is accepted here, and nowhere else: the new boot id is what tells the machine."""
+        if not self._map:
+            self._map = (await self._c.identify()).firmware
+        try:
+            return await self._truth()
+        except Rebooted:
+            self._map = (await self._c.identify()).firmware
+            return await self._truth()
+
+    async def _truth(self) -> Truth:
+        status = await self._c.status()
+        comp = await self._c.comp_status()
+        trouble = tripped(status)
+        unsafe = trouble.detail if trouble else ("the axes move" if status.bits >> MOVING & 1 else "")
+        still_s = (status.ctrl_us - status.in_position_us) * 1e-6 if status.bits >> _IN_POSITION & 1 else 0.0
+        return Truth(
+            comp.boot_id, comp.gen, comp.active_bank, comp.bank_crc, comp.bank_state, comp.lease_owner, comp.lease_left_ms,
+            unsafe, still_s, self._clock.monotonic_s(), self._map,
+        )  # fmt: skip

@@ -1,0 +1,88 @@
+"""The durable journal of a push, in the database. An entry is on disk before what it permits; a second writer is shut out by the chain."""
+
+from __future__ import annotations
+
+import asyncio
+
+from service.clock import Clock
+from service.errors import UnsafeToMove
+from service.push.entries import GENESIS, Doc, Entry, Journal, follow
+from service.push.states import TERMINAL, State
+from service.storage.base import utc_text
+from service.storage.records import PushEntryRecord
+from service.storage.store import Store
+
+
+class StoreBook:
+    """Journal of the last push of one machine, or of its next one. Open it with `last` or `new`.
+
+    Parameters
+    ----------
+    store : Store
+        The database.
+    machine : str
+        Name of the machine: all its pushes share one chain.
+    clock : Clock
+        For the time of an entry.
+    push : int
+        Number of the push.
+    head : str
+        Digest of the last entry of the machine.
+    journal : tuple of Entry
+        The push so far.
+    """
+
+    def __init__(self, store: Store, machine: str, clock: Clock, push: int, head: str, journal: Journal) -> None:
+        self._store, self._machine, self._clock = store, machine, clock
+        self._push, self._head, self._journal = push, head, journal
+
+    @classmethod
+    async def last(cls, store: Store, machine: str, clock: Clock) -> StoreBook | None:
+        """Journal of the last push of a machine; None if there was none."""
+        entries = await asyncio.to_thread(read_entries, store, machine)
+        if not entries:
+            return None
+        push = entries[-1].push
+        return cls(store, machine, clock, push, entries[-1].digest, tuple(entry for entry in entries if entry.push == push))
+
+    @classmethod
+    async def new(cls, store: Store, machine: str, clock: Clock) -> StoreBook:
+        """An empty journal for the next push of a machine.
+
+        Raises
+        ------
+        UnsafeToMove
+            The last push has not come to an end: it is finished first.
+        """
+        book = await cls.last(store, machine, clock)
+        if book is None:
+            return cls(store, machine, clock, 1, GENESIS, ())
+        last = (await book.entries())[-1]
+        if last.state not in TERMINAL or last.state is State.OPERATOR:
+            raise UnsafeToMove(f"push {last.push} of {machine} stands at {last.state}", "finish it first")
+        return cls(store, machine, clock, last.push + 1, last.digest, ())
+
+    async def entries(self) -> Journal:
+        """The push so far."""
+        return self._journal
+
+    async def append(self, journal: Journal, state: State, doc: Doc) -> Entry:
+        """Write the next entry; on return it is on disk.
+
+        Raises
+        ------
+        JournalBroken
+            This state cannot follow.
+        StoreError
+            Somebody else has written meanwhile, or the database does not take it.
+        """
+        entry = follow(journal, self._push, state, doc, utc_text(self._clock.utc()), self._head)
+        row = PushEntryRecord(0, self._machine, entry.push, entry.seq, str(entry.state), entry.doc, entry.utc, entry.prev, entry.digest)
+        await self._store.write(self._store.add_push_entry, row)
+        self._head, self._journal = entry.digest, (*journal, entry)
+        return entry
+
+
+def read_entries(store: Store, machine: str) -> list[Entry]:
+    """All entries of a machine, of all its pushes."""
+    return [Entry(r.push, r.seq, State(r.state), r.doc, r.utc, r.prev, r.digest) for r in store.push_entries(machine)]

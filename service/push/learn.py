@@ -1,0 +1,100 @@
+"""What an outcome adds to what a process knows. Pure."""
+
+from __future__ import annotations
+
+from service.push.operations import Approval, Done, Doubt, Kind, Known, Op, Outcome, Refused, Truth
+from service.push.states import State
+
+_QUESTIONS = frozenset({Kind.VALIDATE, Kind.APPROVE, Kind.PROBE, Kind.VERIFY})
+
+
+def after_record(known: Known, state: State) -> Known:
+    """After a journal entry everything about the controller is asked anew; what belongs to the process stays."""
+    return Known(
+        mine=known.mine,
+        lease=known.lease,
+        backs=known.backs,
+        approved_until_s=known.approved_until_s,
+        stop=known.stop,
+        wrote_last=True,
+        rested=state is State.ROLLBACK_PENDING,
+    )
+
+
+def learn(known: Known, op: Op, outcome: Outcome) -> Known:
+    """Take an outcome into account.
+
+    Parameters
+    ----------
+    known : Known
+        Before.
+    op : Op
+        What was asked; neither RECORD nor END.
+    outcome : Done, Refused or Doubt
+        What came of it.
+    """
+    known = known._replace(doubts=known.doubts + 1 if isinstance(outcome, Doubt) else 0)
+    if op.kind is Kind.LOOK:
+        return _looked(known, op, outcome)
+    if op.kind in (Kind.READ, Kind.READ_AGAIN):
+        return _read(known, op, outcome)
+    if op.kind in (Kind.WRITE, Kind.READ_CHUNK):
+        return _chunk(known, op, outcome)
+    if op.kind in _QUESTIONS:
+        until = outcome.value.until_s if isinstance(outcome, Done) and isinstance(outcome.value, Approval) else known.approved_until_s
+        return known._replace(verdict=outcome, approved_until_s=until, truth=None)
+    return _commanded(known, op, outcome)
+
+
+def _looked(known: Known, op: Op, outcome: Outcome) -> Known:
+    if not isinstance(outcome, Done) or not isinstance(outcome.value, Truth):
+        return known
+    if op.mark:
+        return known._replace(start=outcome.value, truth=None, image=None, meaning=None, brackets=known.brackets + 1)
+    return known._replace(truth=outcome.value)
+
+
+def _read(known: Known, op: Op, outcome: Outcome) -> Known:
+    if isinstance(outcome, Doubt):
+        return known
+    done = isinstance(outcome, Done)
+    if op.kind is Kind.READ:
+        return known._replace(image=outcome.value if isinstance(outcome, Done) else b"", truth=None)
+    return known._replace(meaning=str(outcome.value) if done and isinstance(outcome, Done) else "unreadable", truth=None)
+
+
+def _chunk(known: Known, op: Op, outcome: Outcome) -> Known:
+    if op.kind is Kind.WRITE and op.text == FORGET:
+        return known._replace(forgets=known.forgets + 1, wrote=True, truth=None)
+    if op.kind is Kind.WRITE:
+        if isinstance(outcome, Refused):
+            return known._replace(verdict=outcome, wrote=True, truth=None)
+        again = int(known.differs)
+        unsure = isinstance(outcome, Doubt)
+        known = known._replace(rewrites=known.rewrites + again, rewrites_here=known.rewrites_here + again, truth=None)
+        return known._replace(wrote=True, differs=False, unsure=unsure, written=known.written + (not unsure))
+    if isinstance(outcome, Doubt):
+        return known
+    if isinstance(outcome, Done) and outcome.value == op.data:
+        written = known.written + int(known.unsure)
+        return known._replace(chunk=known.chunk + 1, wrote=False, differs=False, unsure=False, written=written, rewrites_here=0)
+    return known._replace(differs=True, unsure=False, truth=None)
+
+
+def _commanded(known: Known, op: Op, outcome: Outcome) -> Known:
+    known = known._replace(truth=None, start=None, image=None, meaning=None)
+    if op.kind is Kind.LEASE:
+        lease = known.lease if isinstance(outcome, Refused) else op.owner
+        return known._replace(verdict=outcome, lease=lease, leases=known.leases + 1)
+    if op.kind is Kind.RELEASE:  # refused: somebody else has it, and the old owner is shut out all the same
+        known = known._replace(releases=known.releases + 1)
+        return known if isinstance(outcome, Doubt) else known._replace(fenced=True, lease=0)
+    if op.kind is Kind.SEAL:
+        return known._replace(sealed=known.sealed + 1, verdict=outcome if isinstance(outcome, Refused) else None)
+    return known._replace(asked=True, verdict=outcome, backs=known.backs + int(op.text == BACK))
+
+
+FORGET = "forget"
+"""Text of a write that is to make a control forget what it laid aside."""
+BACK = "back"
+"""Text of an activation that leads back to the old table."""

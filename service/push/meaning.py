@@ -1,0 +1,43 @@
+"""What a table means, as a digest, on two ways that share no code: from the tables that were computed, and from what a bank holds.
+
+A sign, an axis or a unit that the encoder gets wrong makes the two differ. What both get wrong only the physical probe shows.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+from drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
+from models.compensation.tables import NineTables
+from service.push.entries import canonical
+
+_POSITIONS_PER_MM = 1e5
+_VALUES_PER_MM = 1e6
+
+Rows = list[tuple[str, str, list[tuple[int, int]]]]
+
+
+def meaning_of_tables(tables: NineTables) -> str:
+    """Digest of corrections that are added to the command, (position in 10 nm, correction in nm) for each input and each corrected axis."""
+    rows: Rows = []
+    for a, moved in enumerate("XYZ"):
+        for i, corrected in enumerate("XYZ"):
+            pairs = zip(tables.position_mm[a].tolist(), tables.correction_mm[a][:, i].tolist(), strict=True)
+            rows.append((moved, corrected, [(round(p * _POSITIONS_PER_MM), round(c * _VALUES_PER_MM)) for p, c in pairs]))
+    return _digest(rows)
+
+
+def meaning_of_bytes(image: bytes) -> str:
+    """Digest of what the independent decoder makes of a bank; ``"unreadable"`` where it makes nothing of it."""
+    try:
+        curves = read_axis_tables(image)
+    except UnreadableImage:
+        return "unreadable"
+    rows: Rows = []
+    for (moved, corrected), pairs in curves.items():
+        rows.append((moved, corrected, [(round(p * _POSITIONS_PER_MM), round(c * _VALUES_PER_MM)) for p, c in pairs]))
+    return _digest(rows)
+
+
+def _digest(rows: Rows) -> str:
+    return hashlib.sha256(canonical(sorted(rows))).hexdigest()

@@ -1,0 +1,207 @@
+"""What the push machine can ask for, what can come back, and what it knows of the controller. Plain values, no I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, NamedTuple
+
+from service.push.entries import Doc
+from service.push.states import State
+
+
+class Kind(Enum):
+    """Operations of the protocol. Only WRITE, SEAL, ACTIVATE, LEASE and RELEASE change anything in the controller."""
+
+    LOOK = "look"
+    """Read the coherent status: boot id, generation, active bank, CRCs, lease, interlocks. Value: `Truth`."""
+    READ = "read"
+    """Read a bank in full. Value: its bytes."""
+    READ_AGAIN = "read again"
+    """Read a bank in full once more and let the independent decoder say what it means. Value: digest of the meaning."""
+    VALIDATE = "validate"
+    """Check the table without touching the controller. Value: list of reasons against it."""
+    APPROVE = "approve"
+    """Ask for the approval. Value: `Approval`."""
+    LEASE = "lease"
+    RELEASE = "release"
+    WRITE = "write"
+    """Write one chunk of a bank."""
+    READ_CHUNK = "read chunk"
+    """Read one chunk back. Value: its bytes."""
+    SEAL = "seal"
+    ACTIVATE = "activate"
+    """Make a bank the active one by compare-and-swap on its CRC and the generation. Sent at most once per journal entry."""
+    PROBE = "probe"
+    """Move to a few points and prove sign, axis and unit physically. Value: `Verdict`."""
+    VERIFY = "verify"
+    """Measure again and compare with before. Value: `Verdict`."""
+    RECORD = "record"
+    """Write a journal entry; it is on disk before anything else happens."""
+    END = "end"
+    """Nothing more to do now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Op:
+    """One operation. Fields that a kind does not need are left as they are.
+
+    ``first`` and ``count`` are registers; ``data`` is what is written or expected; ``mark`` begins a bracket of reads between two looks.
+    """
+
+    kind: Kind
+    bank: int = -1
+    first: int = 0
+    count: int = 0
+    data: bytes = b""
+    crc: int = 0
+    gen: int = 0
+    owner: int = 0
+    mark: bool = False
+    state: State | None = None
+    doc: Doc | None = None
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What the controller says of itself in one coherent look.
+
+    ``crc`` is 0 for a bank that is not sealed; ``states``: 0 empty, 1 being written, 2 sealed, 3 sealed and laid
+    aside for the control's next start. ``unsafe``: why nothing may be activated
+    now, empty when interlocks hold and nothing moves. ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
+    """
+
+    boot: int
+    gen: int
+    active: int
+    crc: tuple[int, int]
+    states: tuple[int, int]
+    owner: int
+    lease_ms: int
+    unsafe: str
+    still_s: float
+    now_s: float
+    map: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Approval:
+    """A person's (or the policy's) yes to exactly one table on exactly one base.
+
+    ``digest``: what was agreed to (`service.push.approval`). ``expiry``: when it ends, as text, part of the digest. ``until_s``: the same
+    end as monotonic host time, because somebody may set the wall clock.
+    """
+
+    digest: str
+    by: str
+    expiry: str
+    until_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Outcome of a probe or of a verification."""
+
+    passed: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """The controller (or whoever was asked) did it and said so."""
+
+    value: Any = None
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """It was understood and refused: nothing changed."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """No valid answer: it may have happened, not have happened, or still happen."""
+
+    text: str
+
+
+Outcome = Done | Refused | Doubt
+
+
+class Known(NamedTuple):
+    """What a process has learned since its start or since the last journal entry; a crash loses all of it.
+
+    A plain tuple: a sweep over all faults makes millions. A process that did not begin the push (``mine`` false) knows nothing: from that
+    alone the machine follows the rules of recovery.
+
+    Parameters
+    ----------
+    mine : bool
+        This process began the push and has not lost it.
+    truth : Truth, optional
+        The last look, if nothing has happened since that could have changed it.
+    start : Truth, optional
+        The look that opened the present bracket of reads.
+    image, meaning : bytes, str, optional
+        What was read within the bracket.
+    brackets : int
+        Brackets opened since the last entry.
+    chunk, wrote, differs, unsure : int, bool, bool, bool
+        Chunks that were written and read back; whether the present one was written, came back different, got no valid answer.
+    written, rewrites, rewrites_here : int
+        Writes that certainly happened since the entry that permitted them; repeats in all, and of the present chunk.
+    sealed : int
+        How often sealing was asked for.
+    asked : bool
+        The one activation that the last entry permits was sent.
+    lease, leases, releases, fenced : int, int, int, bool
+        Owner id under which the lease was asked for (0: not at all), how often, and how often it was given back since the last entry;
+        whether the old owner was shut out since then.
+    forgets : int
+        Writes that were to make a control forget a table that it laid aside, since the last entry.
+    verdict : Done, Refused or Doubt, optional
+        Answer to the last question (validate, approve, probe, verify).
+    doubts : int
+        Operations without a valid answer in a row.
+    backs : int
+        Activations of the old table that were sent by this process.
+    approved_until_s : float
+        Monotonic time at which the approval ends.
+    wrote_last : bool
+        This process wrote the last journal entry: what it permits was not done yet by anybody.
+    rested : bool
+        This process has just written that the way back is not open: it does not try again by itself.
+    stop : str
+        Why a person or the service wants the push to end; empty if nobody does.
+    """
+
+    mine: bool = False
+    truth: Truth | None = None
+    start: Truth | None = None
+    image: bytes | None = None
+    meaning: str | None = None
+    brackets: int = 0
+    chunk: int = 0
+    wrote: bool = False
+    differs: bool = False
+    unsure: bool = False
+    written: int = 0
+    rewrites: int = 0
+    rewrites_here: int = 0
+    sealed: int = 0
+    asked: bool = False
+    lease: int = 0
+    leases: int = 0
+    releases: int = 0
+    forgets: int = 0
+    fenced: bool = False
+    verdict: Outcome | None = None
+    doubts: int = 0
+    backs: int = 0
+    approved_until_s: float = 0.0
+    wrote_last: bool = False
+    rested: bool = False
+    stop: str = ""

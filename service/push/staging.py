@@ -1,0 +1,131 @@
+"""Writing an image into the inactive bank so that it can be believed: chunk by chunk, then sealed, then read back twice in full. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.push.operations import Kind, Known, Op, Refused, Truth
+
+BRACKETS = 4
+REWRITES_PER_CHUNK = 2
+REWRITES = 5
+SEALS = 2
+EMPTY, SEALED, LAID_ASIDE = 0, 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """An image on its way into a bank. ``gen``: generation when writing was permitted. ``in_force``: CRC of the table that stays active."""
+
+    bank: int
+    data: bytes
+    crc: int
+    meaning: str
+    owner: int
+    gen: int
+    boot: int
+    in_force: int
+    chunk_words: int
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """It cannot be staged, and why. ``foreign``: somebody else has written into the bank."""
+
+    why: str
+    foreign: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Coherent:
+    """A bracket of reads is closed: nothing changed from its first look to its last, which is this."""
+
+    truth: Truth
+
+
+def bracket(known: Known, bank: int, count: int, *, again: bool) -> Op | Coherent | None:
+    """Next operation of a full read between two looks.
+
+    Parameters
+    ----------
+    bank, count : int
+        What to read; ``count`` 0: as long as the image's header says.
+    again : bool
+        Read a second time and decode independently.
+
+    Returns
+    -------
+    Op, Coherent or None
+        None: the two looks differ, somebody changed something meanwhile.
+    """
+    if known.start is None:
+        return Op(Kind.LOOK, mark=True)
+    if known.image is None:
+        return Op(Kind.READ, bank=bank, count=count)
+    if again and known.meaning is None:
+        return Op(Kind.READ_AGAIN, bank=bank, count=len(known.image) // 2)
+    if known.truth is None:
+        return Op(Kind.LOOK)
+    same = (known.start.boot, known.start.gen, known.start.active) == (known.truth.boot, known.truth.gen, known.truth.active)
+    return Coherent(known.truth) if same else None
+
+
+def stage(image: Image, known: Known) -> Op | Failed | Coherent:
+    """Next operation of staging, or its end.
+
+    Returns
+    -------
+    Op, Failed or Coherent
+        Coherent: the bank is sealed, both read-backs within one generation agree in bytes and in meaning.
+    """
+    if isinstance(known.verdict, Refused):
+        return Failed(f"the controller refused: {known.verdict.text}")
+    words = len(image.data) // 2
+    if known.chunk * image.chunk_words < words:
+        return _chunk(image, known)
+    if not known.sealed:
+        return Op(Kind.SEAL, bank=image.bank, owner=image.owner)
+    return _read_back(image, known, words)
+
+
+def _chunk(image: Image, known: Known) -> Op | Failed:
+    first = known.chunk * image.chunk_words
+    data = image.data[2 * first : 2 * (first + image.chunk_words)]
+    write = Op(Kind.WRITE, bank=image.bank, first=first, count=len(data) // 2, data=data)
+    if not known.wrote:
+        return write
+    if not known.differs:
+        return Op(Kind.READ_CHUNK, bank=image.bank, first=first, count=len(data) // 2, data=data)
+    if known.truth is None:
+        return Op(Kind.LOOK)
+    # Another content than ours is overwritten only while the generation says that nobody but us has written.
+    if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):
+        return Failed("somebody else wrote into the bank, or the controller restarted; what it holds now was left alone", foreign=True)
+    if known.rewrites_here >= REWRITES_PER_CHUNK or known.rewrites >= REWRITES:
+        return Failed(f"registers {first}.. do not hold what was written, also after {known.rewrites_here} repeats")
+    return write
+
+
+def _read_back(image: Image, known: Known, words: int) -> Op | Failed | Coherent:
+    step = bracket(known, image.bank, words, again=True)
+    if isinstance(step, Op):
+        return step
+    if step is None:
+        return _again(known, "the generation changed while the bank was read back")
+    truth = step.truth
+    if truth.boot != image.boot:
+        return Failed("the controller restarted during staging")
+    if truth.crc[1 - image.bank] != image.in_force or truth.active == image.bank:
+        return Failed("the table in force changed during staging")
+    if truth.states[image.bank] != SEALED and known.sealed < SEALS:
+        return Op(Kind.SEAL, bank=image.bank, owner=image.owner)
+    if known.image != image.data or known.meaning != image.meaning:
+        what = "bytes" if known.image != image.data else "meaning (independent decoder)"
+        return _again(known, f"the bank does not hold what was sent: {what}")
+    if truth.states[image.bank] != SEALED or truth.crc[image.bank] != image.crc:
+        return Failed(f"sealed with CRC {truth.crc[image.bank]:08X}, sent {image.crc:08X}")
+    return step
+
+
+def _again(known: Known, why: str) -> Op | Failed:
+    return Op(Kind.LOOK, mark=True) if known.brackets < BRACKETS else Failed(why)

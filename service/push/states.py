@@ -1,0 +1,75 @@
+"""States of a push and which may follow which (reliability.md 3.2). A state is an entry of the journal, on disk before what it permits."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class State(StrEnum):
+    """Where a push stands. The value is what stands in the journal."""
+
+    SNAPSHOT = "SNAPSHOT"
+    """The table in force was read twice and is kept here in full."""
+    REJECTED = "REJECTED"
+    """Validation or approval said no; nothing was written."""
+    VALIDATED = "VALIDATED"
+    APPROVED = "APPROVED"
+    LEASED = "LEASED"
+    STAGING = "STAGING"
+    """Permits writing the inactive bank."""
+    STAGED = "STAGED"
+    """The inactive bank was read back twice and is sealed with the expected CRC."""
+    ACTIVATING = "ACTIVATING"
+    """Permits exactly one activation of the new table."""
+    PROBATION = "PROBATION"
+    """The new table is active and was read back again; permits the sign probe."""
+    PROBED = "PROBED"
+    """Sign, axis and unit were proved physically; permits the verification."""
+    VERIFIED = "VERIFIED"
+    KEEP = "KEEP"
+    ROLLBACK = "ROLLBACK"
+    """The new table goes; permits finding the way back."""
+    RESTAGING = "RESTAGING"
+    """Permits writing the old table into the inactive bank."""
+    ACTIVATING_BACK = "ACTIVATING_BACK"
+    """Permits exactly one activation of the old table."""
+    ROLLBACK_PENDING = "ROLLBACK_PENDING"
+    """The way back is not open now (interlock, link, lease): it is gone when it is, before anything else."""
+    ROLLED_BACK = "ROLLED_BACK"
+    ABORTED = "ABORTED"
+    """The new table was never in force."""
+    OPERATOR = "OPERATOR"
+    """The controller holds what the journal does not know: everything is frozen until a person has looked."""
+    ACCEPTED = "ACCEPTED"
+    """A person has looked and vouches for what is in force."""
+
+
+S = State
+
+TERMINAL = frozenset({S.REJECTED, S.ABORTED, S.KEEP, S.ROLLED_BACK, S.OPERATOR, S.ACCEPTED})
+BEFORE_ACTIVATION = frozenset({S.SNAPSHOT, S.VALIDATED, S.APPROVED, S.LEASED, S.STAGING, S.STAGED})
+GOING_BACK = frozenset({S.ROLLBACK, S.RESTAGING, S.ACTIVATING_BACK, S.ROLLBACK_PENDING})
+
+FOLLOWS: dict[State | None, frozenset[State]] = {
+    None: frozenset({S.SNAPSHOT}),
+    S.SNAPSHOT: frozenset({S.VALIDATED, S.REJECTED, S.ABORTED}),
+    S.VALIDATED: frozenset({S.APPROVED, S.REJECTED, S.ABORTED}),
+    S.APPROVED: frozenset({S.LEASED, S.ABORTED}),
+    S.LEASED: frozenset({S.STAGING, S.ABORTED}),
+    S.STAGING: frozenset({S.STAGED, S.ABORTED}),
+    S.STAGED: frozenset({S.ACTIVATING, S.ABORTED}),
+    S.ACTIVATING: frozenset({S.PROBATION, S.ROLLBACK, S.ABORTED, S.OPERATOR}),
+    S.PROBATION: frozenset({S.PROBED, S.ROLLBACK, S.OPERATOR}),
+    S.PROBED: frozenset({S.VERIFIED, S.ROLLBACK, S.OPERATOR}),
+    S.VERIFIED: frozenset({S.KEEP, S.ROLLBACK, S.OPERATOR}),
+    S.ROLLBACK: frozenset({S.RESTAGING, S.ACTIVATING_BACK, S.ROLLED_BACK, S.ROLLBACK_PENDING, S.OPERATOR}),
+    S.RESTAGING: frozenset({S.ACTIVATING_BACK, S.ROLLBACK, S.ROLLED_BACK, S.ROLLBACK_PENDING, S.OPERATOR}),
+    S.ACTIVATING_BACK: frozenset({S.ROLLED_BACK, S.ROLLBACK, S.ROLLBACK_PENDING, S.OPERATOR}),
+    S.ROLLBACK_PENDING: frozenset({S.ROLLBACK, S.ROLLED_BACK, S.OPERATOR}),
+    S.OPERATOR: frozenset({S.ACCEPTED}),
+    S.REJECTED: frozenset({S.ACCEPTED}),
+    S.ABORTED: frozenset({S.ACCEPTED}),
+    S.KEEP: frozenset({S.ACCEPTED}),
+    S.ROLLED_BACK: frozenset({S.ACCEPTED}),
+    S.ACCEPTED: frozenset({S.ACCEPTED}),
+}

@@ -1,0 +1,113 @@
+"""The clocks of a ball-bar run: how fast the box's clock runs against the controller's, and whether the sync line and the arrivals agree.
+
+Where the box has a sync line, its two edges tie its clock to the controller's; the stamps and arrivals of both streams, which know nothing
+of that line, say the same by way of this computer's clock, or they do not, and that is said. Arrival times are used for nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from models.alignment.breaks import breaks
+from models.alignment.clock import LEAST_PAIRS, ClockFit, across, fit_clock, relative_rate
+from models.arrays import F1
+from service.storage.records import ChunkRecord, Doc
+
+U_DELAY_S = 2e-3
+"""Standard uncertainty of the least delay of a link, which no arrival tells: 0 to 7 ms, an adapter's and the operating system's."""
+COLLECTS_MS = 16
+"""A serial adapter collects bytes for so long, and may keep step with the samples while it does."""
+SURE = 3.0
+"""A drift or a disagreement counts from so many times its standard uncertainty."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunClock:
+    """Seconds of the controller per second of the box, its standard uncertainty, where it is from, and what is to be said about it."""
+
+    rate: float
+    u_rate: float
+    doc: Doc
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """The run as the sync line saw it: box time of the first and last sample with the level set, and their period.
+
+    ``whole``: the samples beside both edges are there; else an edge was in a gap of the stream, and says nothing.
+    """
+
+    first_us: int
+    last_us: int
+    period_s: float
+    whole: bool = True
+
+
+def run_clock(chunks: Sequence[ChunkRecord], end: Doc | None, edges: Edges) -> RunClock:
+    """Rate of the box's clock against the controller's: from the sync line or from the arrivals, whichever knows it better.
+
+    A drift that neither shows (three standard uncertainties) is taken for none and stays in ``u_rate``.
+    """
+    found = _fits(chunks, end, edges.period_s)
+    doc: Doc = {}
+    tries: list[tuple[float, float, str]] = []
+    if edges.whole and end is not None and end.get("path_end_us") and edges.last_us > edges.first_us:
+        seen_s = (edges.last_us - edges.first_us) * 1e-6 + edges.period_s
+        run_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6
+        tries.append((run_s / seen_s, float(np.sqrt(1.0 / 6.0)) * edges.period_s / seen_s, "sync line"))
+    if isinstance(found, tuple):
+        tries.append((*relative_rate(*found), "arrivals"))
+        doc |= _compared(found, end, edges)
+    elif found:
+        doc["trouble"] = found
+    if not tries:
+        return RunClock(1.0, 0.0, doc | {"rate_from": "nothing: taken to be equal"})
+    rate, u, source = min(tries, key=lambda one: one[1])
+    doc |= {"box_slower_ppm": (rate - 1.0) * 1e6, "u_box_slower_ppm": u * 1e6, "rate_from": source}
+    used = rate if abs(rate - 1.0) > SURE * u else 1.0
+    return RunClock(used, u, doc | {"corrected_ppm": (used - 1.0) * 1e6})
+
+
+def _fits(chunks: Sequence[ChunkRecord], end: Doc | None, period_s: float) -> tuple[ClockFit, ClockFit] | str:
+    """Both clocks over this computer's; or what is wrong, in words; or nothing where there is too little to say."""
+    box = np.array([(c.last_device_us * 1e-6, c.last_host_s) for c in chunks], dtype=np.float64).reshape(-1, 2)
+    cnc = np.array((end or {}).get("clock_pairs", []), dtype=np.float64).reshape(-1, 2) * [1e-6, 1.0]
+    for name, pairs in (("ball-bar's box", box), ("controller", cnc)):
+        if len(pairs) < LEAST_PAIRS:
+            return ""
+        for one in breaks(pairs[:, 0], pairs[:, 1]):
+            what = "started anew" if one.kind == "restart" else f"was set by {one.step_s * 1e3:.0f} ms"
+            return f"the clock of the {name} {what} during the run"
+    return _fit(box, 1e-3 * math.gcd(round(period_s * 1e3), COLLECTS_MS)), _fit(cnc, 0.0)
+
+
+def _fit(pairs: Any, grid_s: float) -> ClockFit:
+    return fit_clock(pairs[:, 0], pairs[:, 1], u_delay_s=U_DELAY_S, grid_s=grid_s)
+
+
+def _compared(fits: tuple[ClockFit, ClockFit], end: Doc | None, edges: Edges) -> Doc:
+    """Both edges of the sync line against where the arrivals put them, ms of controller time.
+
+    Positive: they date the line's edge later than the controller says, so the path began (or ended) earlier than by the line.
+    """
+    doc: Doc = {"box_drift_ppm": fits[0].drift_ppm, "controller_drift_ppm": fits[1].drift_ppm}
+    if not end or not end.get("path_end_us") or not edges.whole:
+        return doc
+    half = 0.5 * edges.period_s
+    at: F1 = np.array([edges.first_us * 1e-6 - half, edges.last_us * 1e-6 + half])
+    there, u = across(*fits, at)
+    off = there - np.array([end["path_start_us"], end["path_end_us"]]) * 1e-6
+    u = np.hypot(u, edges.period_s / np.sqrt(12.0))
+    doc |= {"sync_start_ms": float(off[0]) * 1e3, "sync_end_ms": float(off[1]) * 1e3, "u_sync_ms": float(u.max()) * 1e3}
+    if (np.abs(off) > SURE * u).any():
+        worst = int(np.argmax(np.abs(off) / u))
+        edge = ("begins", "ends")[worst]
+        later = "earlier" if off[worst] > 0.0 else "later"
+        by, u_ms = abs(off[worst]) * 1e3, u[worst] * 1e3
+        doc["trouble"] = f"by stamps and arrivals the path {edge} {by:.0f} ms {later} than by the sync line (u = {u_ms:.0f} ms)"
+    return doc

@@ -1,0 +1,99 @@
+"""What becomes of a slot that is not simply run, in words: state (at most 30 characters), code of the alarm, and the sentence to both.
+
+``done: <verdict>`` is written by the job, ``interrupted`` also when the service was stopped. All others are made here:
+``missed: <how> late`` (moving a machine hours after the planned time would surprise whoever stands there), ``skipped: busy``,
+``missed: maintenance``, ``missed: not ready``, ``skipped: newer slot``, ``missed: see <slot>`` (one run stands for several slots),
+``missed: whole span`` (too many to be listed).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from typing import NamedTuple
+
+from service.scheduler.slots import Schedule
+from service.scheduler.waiting import Hindrance, Waiting
+
+
+class Outcome(NamedTuple):
+    """State for the ledger, code of the alarm, sentence for both."""
+
+    state: str
+    code: str
+    text: str
+
+
+def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> Outcome:
+    """Nobody was there to start it in time."""
+    allowed = span(timedelta(seconds=schedule.grace_s))
+    how = span(late)
+    return Outcome(f"missed: {how} late", "SCH-001", f"{_slot(schedule.name, slot)} was missed: found {how} late, allowed are {allowed}")
+
+
+def overrun(name: str, slot: datetime) -> Outcome:
+    """The schedule's own check before it takes longer than the timetable has it."""
+    return Outcome("skipped: busy", "SCH-002", f"{_slot(name, slot)} was skipped: {name!r} was still running")
+
+
+def kept_from_starting(waiting: Waiting, hindrance: Hindrance) -> Outcome:
+    """It waited as long as it may."""
+    verb = hindrance.state.partition(":")[0]
+    code = "SCH-002" if verb == "skipped" else "SCH-001"
+    return Outcome(hindrance.state, code, f"{_slot(waiting.schedule.name, waiting.slot)} was {verb}: {hindrance.text}")
+
+
+def superseded(waiting: Waiting, newer: datetime) -> Outcome:
+    """It still waited when the next slot of its schedule came due."""
+    text = f"{_slot(waiting.schedule.name, waiting.slot)} was skipped: slot {newer:%F %R} UTC is due as well"
+    why = f"; it had to wait because {waiting.hindrance.text}" if waiting.hindrance is not None else ""
+    return Outcome("skipped: newer slot", "SCH-002", text + why)
+
+
+def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindrance | None = None) -> Outcome:
+    """A later slot's run stands for it."""
+    why = f"; it had to wait because {hindrance.text}" if hindrance is not None else ""
+    return Outcome(
+        f"missed: see {by:%FT%RZ}", "SCH-005", f"{_slot(waiting_name, slot)} was missed: the run of slot {by:%F %R} UTC stands for it{why}"
+    )
+
+
+def broken_off(name: str, slot: datetime) -> Outcome:
+    """The service ended, by a power cut say, while the check ran. It is not run again: nobody knows how far it got."""
+    return Outcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service ended while it ran")
+
+
+def whole_span(name: str, first: datetime, last: datetime) -> Outcome:
+    """Too many slots to write each of them down."""
+    return Outcome(
+        "missed: whole span", "SCH-004", f"{name}: every slot from {first:%F %R} to {last:%F %R} UTC was missed; they are too many to list"
+    )
+
+
+def caught_up(name: str, instead: Sequence[datetime], by: datetime) -> tuple[str, str]:
+    """Code and sentence of the one alarm for all slots that one run stands for."""
+    slots = (
+        f"{len(instead)} slots from {instead[0]:%F %R} to {instead[-1]:%F %R} UTC were"
+        if len(instead) > 1
+        else f"slot {instead[0]:%F %R} UTC was"
+    )
+    return "SCH-005", f"{name}: {slots} missed; the run of slot {by:%F %R} UTC stands for them"
+
+
+def still_waits(waiting: Waiting, hindrance: Hindrance) -> tuple[str, str]:
+    """Code and sentence for a slot that is to be caught up and cannot be yet."""
+    return "SCH-006", f"{_slot(waiting.schedule.name, waiting.slot)} is late and waits: {hindrance.text}"
+
+
+def _slot(name: str, slot: datetime) -> str:
+    return f"{name}: slot {slot:%F %R} UTC"
+
+
+def span(length: timedelta) -> str:
+    """Return a length of time in words, coarsely."""
+    seconds = length.total_seconds()
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    if seconds < 7200:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.0f} h" if seconds < 172800 else f"{seconds / 86400:.0f} days"

@@ -1,0 +1,145 @@
+"""Preconditions of a scheduled check, as far as devices and machine file can tell. Nothing here moves the machine or writes to it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+
+from drivers.api import ControllerStatus
+from drivers.errors import DriverError
+from service.clock import Clock
+from service.devices.alone import alone
+from service.devices.session import DeviceUrls, open_session
+from service.errors import AbbeError
+from service.scheduler.slots import Needs, Schedule
+from service.scheduler.windows import Window, covering
+from service.sequences.interlocks import MOVING, PATH, PROGRAM, SPINDLE, somebody_at_work, tripped
+
+LOOK_S = 60.0
+"""How often the controller is looked at where a schedule needs a warm machine."""
+HOUR_S = 3600.0
+MOVED_MM = 1e-4
+"""An axis that stands elsewhere than at the last look has moved in between."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One look at the devices: the controller's status, and the air's temperature where there is a laser."""
+
+    status: ControllerStatus
+    air_c: float | None = None
+
+
+Look = Callable[[bool], Awaitable[Seen]]
+"""``await look(with_air)``: opens the devices, reads, closes them."""
+
+
+def look_at(urls: DeviceUrls) -> Look:
+    """Return how to look at the devices behind ``urls``. It is refused while a job has the machine."""
+
+    async def look(with_air: bool) -> Seen:
+        with alone(urls.cnc):
+            pass  # not held: who comes to measure meanwhile must not be turned away by somebody who only looks
+        async with open_session(DeviceUrls(cnc=urls.cnc, laser=urls.laser if with_air else None)) as session:
+            air = (await session.laser.peek()).air_temp_c if session.laser is not None else None
+            return Seen(await session.controller.status(), air)
+
+    return look
+
+
+class Ready:
+    """Says what a schedule lacks.
+
+    Parameters
+    ----------
+    look : Look
+        At the devices.
+    schedules : sequence of Schedule
+        Those that may be asked for: the machine is only watched if one of them needs it warm.
+    air_c : tuple of float
+        Window of the air's temperature, degree C.
+    staffed : sequence of Window
+        When an operator is there.
+    clock : Clock
+        Now.
+    """
+
+    def __init__(
+        self, look: Look, schedules: Sequence[Schedule], air_c: tuple[float, float], staffed: Sequence[Window], clock: Clock
+    ) -> None:
+        self._look = look
+        self._watches = any(schedule.needs.warm_min for schedule in schedules)
+        self._air_c = air_c
+        self._staffed = tuple(staffed)
+        self._clock = clock
+        self._active: deque[float] = deque()
+        self._position: tuple[float, ...] | None = None
+
+    async def lack(self, schedule: Schedule) -> str:
+        """Return what is lacking as one sentence, or nothing. The devices are asked only for what needs them."""
+        needs = schedule.needs
+        if needs == Needs():
+            return ""
+        there = covering(self._staffed, self._clock.utc()) is not None
+        if needs.operator == "present" and not there:
+            return "no operator is there at this hour"
+        if needs.operator == "absent" and there:
+            return "an operator is there at this hour"
+        if needs.warm_min and (minutes := self.active_min()) < needs.warm_min:
+            return f"the machine is not warm: it was seen at work for {minutes:.0f} of the last 60 min, needed are {needs.warm_min:g}"
+        if not (needs.idle or needs.air or needs.operator == "absent"):
+            return ""
+        try:
+            return self._of_devices(needs, await self._look(needs.air))
+        except (DriverError, AbbeError, OSError) as trouble:
+            return f"the devices cannot be asked: {trouble}"
+
+    def _of_devices(self, needs: Needs, seen: Seen) -> str:
+        if needs.operator == "absent" and somebody_at_work(seen.status):
+            return "somebody is at the machine: the door is open, or the mode is not remote"
+        if needs.idle:
+            trouble = tripped(seen.status)
+            if trouble is not None:
+                return f"the machine is not idle: {trouble.detail}"
+            if seen.status.bits >> MOVING & 1 or seen.status.bits >> PATH & 1:
+                return "the machine is not idle: an axis moves"
+        if needs.air:
+            low, high = self._air_c
+            if seen.air_c is None:
+                return "nobody measures the air's temperature: there is no laser in the machine file"
+            if not low <= seen.air_c <= high:
+                return f"the air has {seen.air_c:.1f} C, allowed are {low:g}..{high:g} C"
+        return ""
+
+    def active_min(self) -> float:
+        """Return in how many of the last 60 minutes the machine was seen at work."""
+        while self._active and self._active[0] <= self._clock.monotonic_s() - HOUR_S:
+            self._active.popleft()
+        return len(self._active) * LOOK_S / 60.0
+
+    async def watch(self) -> None:
+        """Look at the controller each minute, for ever, if a schedule needs a warm machine. What is not seen does not count as work."""
+        while self._watches:
+            try:
+                self._note((await self._look(False)).status)
+            except (DriverError, AbbeError, OSError):
+                self._position = None
+            await self._clock.sleep(LOOK_S)
+
+    def _note(self, status: ControllerStatus) -> None:
+        before, self._position = self._position, tuple(status.position_mm)
+        moved = before is not None and max(abs(a - b) for a, b in zip(before, self._position, strict=True)) > MOVED_MM
+        if moved or any(status.bits >> bit & 1 for bit in (MOVING, PATH, PROGRAM, SPINDLE)):
+            self._active.append(self._clock.monotonic_s())
+
+
+class AlwaysReady:
+    """For timetables without preconditions."""
+
+    async def lack(self, schedule: Schedule) -> str:
+        """Return nothing: nothing is lacking."""
+        return ""
+
+    async def watch(self) -> None:
+        """Return at once."""

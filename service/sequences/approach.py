@@ -1,0 +1,143 @@
+"""What all recipes share: the controller's grid, where a path is approached from, and how a ball-bar gets to where its path begins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.machine import AXES, Machine
+from models.paths.circles import way_on_sphere
+from service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Point, Step, TakeBarOut
+
+Array = NDArray[np.float64]
+RAPID_MM_MIN = 6000.0
+BAR_APPROACH_MM = 0.5
+"""With the bar hung in: far more than any lost motion, and the bar stays within its stroke of 1 mm either way."""
+LINK_CHORD_MM = 2.0
+"""Of the way on the sphere between two paths: at a radius of 50 mm its chords run 10 um inside the sphere."""
+SAME_PLACE_MM = 0.01
+NEAR_POLE_MM = 2.0
+"""A path that begins so near the pole is approached from the centre straight: the way up is the same."""
+LOW_SHARE = 0.4
+"""Lower below the cup's centre than this share of the bar the spindle meets whatever carries the cup (ISO 230-4's partial arc of 220
+degrees with its feed-in stays above)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cup:
+    """A ball-bar's sphere: centre, radius, and the unit vector to its pole, where the spindle is."""
+
+    centre: Array
+    radius_mm: float
+    up: Array
+
+    @property
+    def pole(self) -> Array:
+        """Its pole."""
+        return np.asarray(self.centre + self.radius_mm * self.up)
+
+    def lowest(self, points: Iterable[Point]) -> float:
+        """How far the lowest of the points lies above the equator, as a share of the radius; negative: below."""
+        return float(((np.array(list(points)) - self.centre) @ self.up).min()) / self.radius_mm
+
+
+class OnCup(Protocol):
+    """A ball-bar test: where its cup stands, what bar hangs in it, and what is mounted before and cleared away after it."""
+
+    @property
+    def centre_mm(self) -> Point: ...  # noqa: D102
+    @property
+    def radius_mm(self) -> float: ...  # noqa: D102
+    @property
+    def axis(self) -> int: ...  # noqa: D102
+    @property
+    def opens(self) -> int: ...  # noqa: D102
+    @property
+    def feed_mm_min(self) -> float: ...  # noqa: D102
+    @property
+    def mount(self) -> bool: ...  # noqa: D102
+    @property
+    def change_bar(self) -> bool: ...  # noqa: D102
+    @property
+    def link_mm(self) -> Point | None: ...  # noqa: D102
+
+
+def as_point(v: Array) -> Point:
+    """Three floats on the controller's 10 nm grid."""
+    x, y, z = (round(float(c), 5) for c in v)
+    return (x, y, z)
+
+
+def before(path: tuple[Point, ...], machine: Machine) -> Point:
+    """Where to come from: beside the path's start, against the first motion of each axis, inside the strokes."""
+    points = np.array(path)
+    steps = np.diff(points, axis=0)
+    first = np.array([next((np.sign(s) for s in steps[:, a] if s), 0.0) for a in range(3)])
+    return as_point(np.clip(points[0] - BAR_APPROACH_MM * first, machine.stroke_mm[:, 0], machine.stroke_mm[:, 1]))
+
+
+def pole_of(recipe: OnCup) -> tuple[Point, Array]:
+    """The pole of a test's hemisphere, where the spindle is, and the unit vector that points to it."""
+    up = np.zeros(3)
+    up[recipe.axis] = float(recipe.opens)
+    return as_point(np.array(recipe.centre_mm) + recipe.radius_mm * up), up
+
+
+def over_pole(cup: Cup, target_mm: Point, feed_mm_min: float) -> list[Step]:
+    """Steps from the centre, or from anywhere on the axis above it, to a point of the sphere: up to the pole, down along the sphere.
+
+    A straight way from the centre to a point below the equator would lead through the cup.
+    """
+    pole = as_point(cup.pole)
+    if math.dist(pole, target_mm) < NEAR_POLE_MM:
+        return [MoveTo(pole, RAPID_MM_MIN)]
+    return [MoveTo(pole, RAPID_MM_MIN), *along_sphere(cup, pole, target_mm, feed_mm_min)]
+
+
+def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -> list[Step]:
+    """The way on a sphere from one of its points to another; none where they are the same."""
+    if math.dist(start_mm, end_mm) <= SAME_PLACE_MM:
+        return []
+    way = way_on_sphere(cup.centre, np.array(start_mm), np.array(end_mm), cup.up, LINK_CHORD_MM)
+    return [FollowPath(tuple(as_point(p) for p in way), feed_mm_min)]
+
+
+def cup_of(setup: dict[str, Any]) -> Cup:
+    """The sphere of a ball-bar test by its set-up (run-format.md 3)."""
+    up = np.zeros(3)
+    up[AXES.index(setup["axis"])] = float(setup["opens"])
+    return Cup(np.array(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"]), up)
+
+
+def to_path(recipe: OnCup, path: tuple[Point, ...], machine: Machine) -> list[Step]:
+    """Steps up to the first point of a ball-bar path: mount, change the bar or come along the sphere, and approach.
+
+    Nothing goes straight past the cup: from the centre, and with another bar, the machine goes by way of the pole and along the sphere.
+    ``link_mm``: where the test before has left the machine, on this sphere or (``change_bar``) on that of the bar before; a straight way
+    from there would lead through the sphere.
+    """
+    up = pole_of(recipe)[1]
+    centre, feed = np.array(recipe.centre_mm), recipe.feed_mm_min
+    cup = Cup(centre, recipe.radius_mm, up)
+    start = before(path, machine)
+    steps: list[Step] = []
+    if recipe.mount:
+        steps += [MoveTo(recipe.centre_mm, RAPID_MM_MIN), MountBar(recipe.radius_mm), *over_pole(cup, path[0], feed)]
+    elif recipe.change_bar:
+        steps.append(TakeBarOut())
+        if recipe.link_mm is not None:
+            old = Cup(centre, math.dist(recipe.link_mm, recipe.centre_mm), up)
+            steps += along_sphere(old, recipe.link_mm, as_point(old.pole), RAPID_MM_MIN)  # nothing hangs in
+        steps += over_pole(cup, path[0], RAPID_MM_MIN)
+        steps += [MoveTo(start, feed), ChangeBar(recipe.radius_mm)]
+    elif recipe.link_mm is not None:
+        steps += along_sphere(cup, recipe.link_mm, path[0], feed)
+    if not recipe.change_bar or recipe.mount:
+        steps.append(MoveTo(start, feed))
+    steps.append(MoveTo(path[0], feed))
+    return steps

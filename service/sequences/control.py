@@ -1,0 +1,206 @@
+"""Control of a measurement from outside: pause, resume, stop, abort, and a state that can be watched.
+
+All calls belong into the event loop of the measurement; from a signal handler or another thread use ``loop.call_soon_threadsafe``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TypeVar
+
+from service.errors import Aborted, Stopped
+
+T = TypeVar("T")
+STOPPED = Stopped("stopped as asked", "`abbe measure MACHINE.toml --resume CAMPAIGN` goes on from here")
+ABORTED = Aborted("aborted as asked: the axes were stopped where they were", "look at the machine, then `abbe measure --resume`")
+
+
+class State(StrEnum):
+    """What a measurement is doing."""
+
+    READY = "ready"
+    RUNNING = "running"
+    PAUSING = "pausing"
+    PAUSED = "paused"
+    SUSPENDED = "suspended"
+    STOPPING = "stopping"
+    ABORTING = "aborting"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """State and, where it waits, why; step of the test in hand (from 1) and points read in it."""
+
+    state: State
+    why: str = ""
+    step: int = 0
+    steps: int = 0
+    points: int = 0
+
+
+class Control:
+    """Pauses, resumes, stops and aborts one measurement."""
+
+    def __init__(self) -> None:
+        self._now = Situation(State.READY)
+        self._pause = self._stop = self._abort = False
+        self._asked = asyncio.Event()
+        self._changed: asyncio.Event = asyncio.Event()
+
+    # ---- what a person asks for -----------------------------------------------------------------------------------
+
+    def pause(self) -> None:
+        """Hold at the next safe place: between points at once; a path that is being recorded is held and measured again later."""
+        if not (self._stop or self._abort or self._pause):
+            self._pause = True
+            self._to(State.PAUSING)
+
+    def resume(self) -> None:
+        """Go on after a pause, once the preconditions were looked at again."""
+        if self._pause:
+            self._pause = False
+            if self._now.state == State.PAUSING:  # taken back before it took effect
+                self._set(replace(self._now, state=State.RUNNING, why=""))
+            self._ask()
+
+    def stop(self) -> None:
+        """Finish the point in hand, or hold the path, then end: the run in hand is closed as stopped."""
+        if not (self._stop or self._abort):
+            self._stop, self._pause = True, False
+            self._to(State.STOPPING)
+
+    def abort(self) -> None:
+        """Stop the axes at once and end: the run in hand is closed as aborted."""
+        if not self._abort:
+            self._abort, self._pause = True, False
+            self._to(State.ABORTING)
+
+    # ---- what can be watched --------------------------------------------------------------------------------------
+
+    @property
+    def situation(self) -> Situation:
+        """State now, and why it waits."""
+        return self._now
+
+    @property
+    def state(self) -> State:
+        """State now."""
+        return self._now.state
+
+    async def watch(self) -> AsyncIterator[Situation]:
+        """Every state from now on, the present one first; ends with the measurement. A slow watcher sees the newest, not all."""
+        seen: Situation | None = None
+        while True:
+            changed = self._changed
+            if seen is None or (self._now.state, self._now.why) != (seen.state, seen.why):
+                seen = self._now
+                yield seen
+                if seen.state == State.ENDED:
+                    return
+                continue
+            await changed.wait()
+
+    # ---- what the sequencer asks ----------------------------------------------------------------------------------
+
+    @property
+    def pausing(self) -> bool:
+        """A pause was asked for."""
+        return self._pause
+
+    @property
+    def stopping(self) -> bool:
+        """A stop was asked for."""
+        return self._stop
+
+    @property
+    def aborting(self) -> bool:
+        """An abort was asked for."""
+        return self._abort
+
+    def now(self, state: State, why: str = "") -> None:
+        """Tell watchers what the sequencer does; what was asked for meanwhile stays visible."""
+        asked = (State.ABORTING, self._abort), (State.STOPPING, self._stop), (State.PAUSING, self._pause and state == State.RUNNING)
+        wanted = next((one for one, is_asked in asked if is_asked), state)
+        self._set(replace(self._now, state=state if state == State.ENDED else wanted, why=why))
+
+    def place(self, step: int, steps: int, points: int) -> None:
+        """Tell how far the test in hand is. Nobody is woken for it: whoever draws progress looks when it changes."""
+        self._now = replace(self._now, step=step, steps=steps, points=points)
+
+    def check(self) -> None:
+        """End here if that was asked for.
+
+        Raises
+        ------
+        Stopped, Aborted
+            It was.
+        """
+        if self._abort:
+            raise Aborted(ABORTED.detail, ABORTED.remedy)
+        if self._stop:
+            raise Stopped(STOPPED.detail, STOPPED.remedy)
+
+    async def asked(self) -> None:
+        """Wait until a person asks for something."""
+        event = self._asked
+        await event.wait()
+
+    async def resumed(self) -> None:
+        """Wait until a pause is taken back.
+
+        Raises
+        ------
+        Stopped, Aborted
+            That was asked for instead.
+        """
+        while self._pause:
+            await self.asked()
+        self.check()
+
+    async def aborted(self) -> None:
+        """Wait for an abort, and raise it."""
+        while not self._abort:
+            await self.asked()
+        self.check()
+
+    async def unless_stopped(self, work: Awaitable[T]) -> T:
+        """Wait for something that a person does, or until stopped: then the work is cancelled.
+
+        Raises
+        ------
+        Stopped, Aborted
+            That was asked for.
+        """
+        task = asyncio.ensure_future(work)
+        try:
+            while not task.done():
+                event = self._asked  # before looking: what is asked for from here on sets this one
+                self.check()
+                asked = asyncio.ensure_future(event.wait())
+                try:
+                    await asyncio.wait({task, asked}, return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    asked.cancel()
+            return task.result()
+        finally:
+            if not task.done():
+                task.cancel()
+                await asyncio.wait({task})
+
+    def _to(self, state: State) -> None:
+        if self._now.state not in (State.READY, State.ENDED):
+            self._set(replace(self._now, state=state, why=""))
+        self._ask()
+
+    def _ask(self) -> None:
+        event, self._asked = self._asked, asyncio.Event()
+        event.set()
+
+    def _set(self, situation: Situation) -> None:
+        self._now = situation
+        event, self._changed = self._changed, asyncio.Event()
+        event.set()

@@ -1,0 +1,204 @@
+"""A path that was broken off goes on where it was, and how that is proved. Pure.
+
+While the ball-bar records, the controller's statuses tell how far the axes had come at constant feed (`Way`). When the path is broken
+off there, with bar and cup as they are, it need not be driven again from its beginning: the machine drives back along it, a lead and a
+stretch farther than what counts, and comes forward once more. On the lead every axis takes up its lost motion as it did before; on the
+stretch the bar must read what it has read there (`SameStretch`). What the runs have read up to their stretches, and the last one, are
+one path: what a broken run has read just before the break counts for nothing, and is only compared with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.api import BarSample, ControllerStatus
+from models.arrays import F1
+from service.errors import RunInterrupted, StretchDiffers
+from service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, Piece, SoFar, arc_of
+from service.sequences.steps import Point, RecordPath
+
+LEAD_S, LEAD_MM = 0.5, 5.0
+"""So long, and at least so far, the axes drive before readings count: they have speeded up, and their lost motion is taken up."""
+SAME_MM = 0.0015
+"""So much the mean of the stretch may differ: minutes of drift, not a cup that was knocked."""
+STEADY_MM = 0.1
+"""So far the position may fall back behind (or run ahead of) where it was at constant feed."""
+BEHIND_S, BEHIND_MM = 0.15, 0.5
+"""So far a machine at constant feed is behind its command: what speeding up and its position control take."""
+AROUND_MM = 100.0
+INVALID_BITS, SYNC = 0b10101, 0b1000
+
+
+class Way:
+    """How far a path has come at constant feed, by the controller's statuses; `doc` goes into the run that was broken off."""
+
+    def __init__(self, step: RecordPath) -> None:
+        self._points, self._arc = np.asarray(step.points_mm, dtype=np.float64), arc_of(step.points_mm)
+        self._feed_mm_s = step.feed_mm_min / 60.0
+        self._lag_mm: float | None = None
+        self._lost = False
+        self.start_us: int | None = None
+        self.good_us: int | None = None
+        self.boot_id: int | None = None
+
+    @property
+    def good_mm(self) -> float:
+        """Length that was driven at constant feed."""
+        if self.good_us is None or self.start_us is None:
+            return 0.0
+        return (self.good_us - self.start_us) * 1e-6 * self._feed_mm_s
+
+    def see(self, status: ControllerStatus) -> None:
+        """Take a status at which the path ran and nothing spoke against it."""
+        if self._lost or status.path_start_us <= 0:
+            return
+        gone_s = (status.ctrl_us - status.path_start_us) * 1e-6
+        if gone_s < LEAD_S:
+            return
+        lag_mm = self._lag(gone_s * self._feed_mm_s, status.position_mm)
+        if lag_mm is None:
+            return
+        self._lag_mm = lag_mm if self._lag_mm is None else self._lag_mm
+        if abs(lag_mm - self._lag_mm) > STEADY_MM or abs(self._lag_mm) > BEHIND_S * self._feed_mm_s + BEHIND_MM:
+            self._lost = True  # feed changed, or the axes stand: from here on nobody knows where which sample was taken
+            return
+        self.start_us, self.good_us = status.path_start_us, status.ctrl_us
+
+    def _lag(self, gone_mm: float, position_mm: Point) -> float | None:
+        """How far the position is behind where constant feed would have it; None if it is not on the path near there."""
+        first, last = np.searchsorted(self._arc, (gone_mm - AROUND_MM, gone_mm + AROUND_MM))
+        points, arc = self._points[max(first - 1, 0) : last + 1], self._arc[max(first - 1, 0) : last + 1]
+        if len(points) < 2:
+            return None
+        begin, along, length = points[:-1], np.diff(points, axis=0), np.diff(arc)
+        share = np.clip(((position_mm - begin) * along).sum(axis=1) / np.maximum(length**2, 1e-18), 0.0, 1.0)
+        off = np.linalg.norm(begin + share[:, None] * along - position_mm, axis=1)
+        at = arc[:-1] + share * length
+        near = off <= off.min() + 1e-3
+        return float(gone_mm - at[near][np.argmin(np.abs(at[near] - gone_mm))]) if off.min() < STEADY_MM else None
+
+    def doc(self) -> dict[str, Any]:
+        """What the end document of a run that was broken off needs; empty when nothing can be gone on with."""
+        if self.good_us is None or self.boot_id is None:
+            return {}
+        return {"path_start_us": self.start_us, "good_us": self.good_us, "box_boot_id": self.boot_id}
+
+
+@dataclass(frozen=True, slots=True)
+class Onward:
+    """Where a path goes on: ``pieces`` as they count now, ``offset_mm`` of the whole path at which the rest begins, what is read twice.
+
+    ``arc_mm`` and ``deviation_mm``, shape (n,): what the bar has read on the stretch, along the rest of the path; ``boot_id`` of the box
+    that has.
+    """
+
+    pieces: tuple[Piece, ...]
+    offset_mm: float
+    whole_mm: float
+    feed_mm_s: float
+    arc_mm: F1
+    deviation_mm: F1
+    boot_id: int
+
+    def doc(self) -> dict[str, Any]:
+        """What the start document's ``path`` says of it."""
+        return {"offset_mm": self.offset_mm, "pieces": [{"run": p.run, "to_mm": p.to_mm} for p in self.pieces]}
+
+
+def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, Onward] | None:
+    """What is left of a path, the number of the point at which it begins, and what is known of the rest.
+
+    None: going on saves nothing, or there is not enough to compare with.
+    """
+    arc, feed_mm_s = arc_of(step.points_mm), step.feed_mm_min / 60.0
+    last = len(arc) - 1 if step.measured is None else step.measured[1]
+    good_mm = so_far.pieces[-1].to_mm
+    counts = min(_before(arc, good_mm), last - 1)
+    twice = _before(arc, arc[counts] - max(STRETCH_MM, STRETCH_S * feed_mm_s))
+    begin = _before(arc, arc[max(twice, 0)] - max(LEAD_MM, LEAD_S * feed_mm_s))
+    on = (so_far.arc_mm >= arc[max(twice, 0)]) & (so_far.arc_mm <= arc[counts])
+    if begin <= 0 or arc[twice] < so_far.counted_from_mm or int(on.sum()) < 2 * LEAST_READINGS:
+        return None
+    ends = last if step.measured else len(arc) - 1
+    rest = RecordPath(step.points_mm[begin:], step.feed_mm_min, step.rate_hz, step.direction, (twice - begin, ends - begin))
+    pieces = (*so_far.pieces[:-1], Piece(so_far.pieces[-1].run, float(arc[twice])))
+    offset = float(arc[begin])
+    known = (so_far.arc_mm[on] - offset, so_far.deviation_mm[on])
+    return rest, begin, Onward(pieces, offset, float(arc[-1]), feed_mm_s, *known, so_far.boot_id)
+
+
+def _before(arc: F1, at_mm: float) -> int:
+    """The last point at or before a length; -1 if there is none."""
+    return int(np.searchsorted(arc, at_mm + 1e-9, side="right")) - 1
+
+
+class SameStretch:
+    """Compares what the bar reads on the stretch with what it has read there."""
+
+    def __init__(self, onward: Onward, rate_hz: int) -> None:
+        self._on, self._half_s = onward, 0.5 / rate_hz
+        self._first_us: int | None = None
+        self._last: BarSample | None = None
+        self._off: list[float] = []
+        slope, _ = np.polyfit(onward.arc_mm, onward.deviation_mm, 1)
+        # The instant at which either path began is known to half a period of the samples.
+        self._allowed_mm = SAME_MM + abs(float(slope)) * onward.feed_mm_s / rate_hz
+        self.off_mm: float | None = None
+        """By how much the stretch reads otherwise, once it is read."""
+
+    def from_box(self, boot_id: int) -> None:
+        """Hear which box reads.
+
+        Raises
+        ------
+        RunInterrupted
+            It was restarted since: nothing is joined to what it read before.
+        """
+        if boot_id != self._on.boot_id:
+            raise RunInterrupted("the ball-bar's box was restarted since the path was broken off", "the path begins again")
+
+    def see(self, sample: BarSample) -> None:
+        """Take a sample in order.
+
+        Raises
+        ------
+        StretchDiffers
+            The stretch was read otherwise, or could not be read.
+        """
+        before, self._last = self._last, sample
+        if self.off_mm is not None or not sample.status & SYNC:
+            return
+        if self._first_us is None:
+            if before is None or (before.seq + 1) % 2**32 != sample.seq:
+                raise StretchDiffers("the samples at which the path began were lost", "look at the ball-bar's cable; the path begins again")
+            self._first_us = sample.device_us
+        at_mm = ((sample.device_us - self._first_us) * 1e-6 + self._half_s) * self._on.feed_mm_s
+        if at_mm > self._on.arc_mm[-1]:
+            self.judge()
+        elif at_mm >= self._on.arc_mm[0] and not sample.status & INVALID_BITS:
+            self._off.append(sample.reading_nm * 1e-6 - float(np.interp(at_mm, self._on.arc_mm, self._on.deviation_mm)))
+
+    def judge(self) -> None:
+        """Say whether it is the same; called by itself when the stretch is behind, and when the path has ended.
+
+        Raises
+        ------
+        StretchDiffers
+            It is not, or there are too few readings to tell.
+        """
+        if self.off_mm is not None:
+            return
+        if len(self._off) < LEAST_READINGS:
+            raise StretchDiffers("the stretch that is read twice gave too few readings", "look at bar and box; the path begins again")
+        off = np.array(self._off)
+        noise_mm = 1.4826 * float(np.median(np.abs(off - np.median(off)))) / np.sqrt(off.size)
+        self.off_mm = float(np.median(off))
+        if abs(self.off_mm) > self._allowed_mm + 3.0 * noise_mm:
+            raise StretchDiffers(
+                f"the path's last stretch reads {1e3 * abs(self.off_mm):.1f} um otherwise than before the break "
+                f"(allowed: {1e3 * self._allowed_mm:.1f})",
+                "cup or bar were knocked, or the machine has drifted: the path begins again, or is mounted anew",
+            )

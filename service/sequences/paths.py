@@ -1,0 +1,159 @@
+"""Paths: the ball-bar streams while the axes run a polyline, and whatever goes wrong on the way ends both."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+
+from drivers.api import BarBatch, Controller, ControllerStatus
+from service.devices.session import Session
+from service.errors import BarOutOfRange, MeasurementFault, RunInterrupted
+from service.runs.recorder import Recorder
+from service.sequences.control import Control
+from service.sequences.guard import motion_guard
+from service.sequences.interlocks import HOLD, MOVING, PATH, check_interlocks
+from service.sequences.onward import Onward, SameStretch, Way
+from service.sequences.steps import FollowPath, RecordPath
+from service.sequences.watch import first_of
+
+POLL_S = 0.01
+STALL_S = 10.0
+STAND_S = 5.0
+BAD_IN_A_ROW = 25
+OUT_S = 0.03
+"""So long the bar may be out of range: long enough for a disturbed sample or two, short enough to stop in time."""
+SYNC, BAD_BITS, OUT_BITS = 0b1000, 0b10101, 0b10001
+
+
+def bar_trouble(status: int) -> BarOutOfRange:
+    """The ball-bar says that it does not read."""
+    return BarOutOfRange(
+        f"the ball-bar is out of range or not mounted (status {status:#06x})",
+        "check centre, radius and that the bar sits in both cups, then start the test again",
+    )
+
+
+async def record_path(
+    session: Session, step: RecordPath, recorder: Recorder, control: Control, way: Way, onward: Onward | None = None
+) -> dict[str, int]:
+    """Run a path while the ball-bar streams; returns its start and end in controller time.
+
+    ``way`` learns how far it came; of the rest of a path that was broken off, ``onward`` says what must read as before.
+
+    Raises
+    ------
+    BarOutOfRange, MeasurementFault, RunInterrupted, StretchDiffers, DriverError
+        The axes are stopped before the error leaves.
+    """
+    controller = session.controller
+    await controller.load_path(step.points_mm)
+    stretch = None if onward is None else SameStretch(onward, step.rate_hz)
+    pump = Pump(recorder, step.rate_hz, way, stretch)
+    # The guard stands inside the stream: closing the stream of a mute box takes seconds, and the axes must not run on so long.
+    async with session.need_ballbar().stream(step.rate_hz, recorder.tap()) as batches, motion_guard(controller):
+        try:
+            async with asyncio.TaskGroup() as group:
+                pumping = group.create_task(pump.run(batches))
+                await pump.reads.wait()  # a bar that does not read is seen before anything moves
+                await controller.start_path(feed_mm_min=step.feed_mm_min)
+                status = await follow(controller, control, way)
+                pump.finished.set()
+                await asyncio.wait({pumping})  # here, not in the group's end: there a cancellation from outside could get lost
+        except BaseExceptionGroup as errors:
+            raise first_of(errors) from None  # one cause for one person; the others follow from it
+    found = {"path_start_us": status.path_start_us, "path_end_us": status.path_end_us}
+    return found if stretch is None or stretch.off_mm is None else found | {"stretch_off_nm": round(stretch.off_mm * 1e6)}
+
+
+async def follow_path(controller: Controller, step: FollowPath, control: Control) -> None:
+    """Run a path that nothing is recorded on."""
+    await controller.load_path(step.points_mm)
+    async with motion_guard(controller):
+        await controller.start_path(feed_mm_min=step.feed_mm_min)
+        await follow(controller, control)
+
+
+async def follow(controller: Controller, control: Control, way: Way | None = None) -> ControllerStatus:
+    """Poll until the path has ended; an interlock, a feed hold, a stall or a person ends the run."""
+    loop = asyncio.get_running_loop()
+    points, since = -1, loop.time()
+    while True:
+        status = await controller.status()
+        check_interlocks(status)
+        if status.bits >> HOLD & 1:
+            raise MeasurementFault(
+                "feed hold was pressed while the ball-bar recorded", "start the test again: readings must be at constant feed"
+            )
+        if not status.bits >> PATH & 1 and status.path_end_us > status.path_start_us:
+            return status
+        if way is not None and status.bits >> PATH & 1:
+            way.see(status)
+        if control.pausing or control.stopping:
+            await hold(controller)
+            control.check()
+            raise RunInterrupted("paused on the path: what was read is kept as evidence", "the path is measured again after the pause")
+        if status.path_points_done != points:
+            points, since = status.path_points_done, loop.time()
+        elif loop.time() - since > STALL_S:
+            raise MeasurementFault(f"the path has not advanced for {STALL_S:g} s", "look at the machine: is the feed override at zero?")
+        await asyncio.sleep(POLL_S)
+
+
+async def hold(controller: Controller) -> None:
+    """Feed hold, and wait until the axes stand: a real machine brakes along its path, which an abort need not do."""
+    await controller.hold()
+    until_s, last = asyncio.get_running_loop().time() + STAND_S, None
+    while asyncio.get_running_loop().time() < until_s:
+        status = await controller.status()
+        if status.position_mm == last or not status.bits >> MOVING & 1:
+            return
+        last = status.position_mm
+        await asyncio.sleep(POLL_S)
+
+
+class Pump:
+    """Hands samples to the recorder until the path has ended and one sample without the sync level has been seen."""
+
+    def __init__(self, recorder: Recorder, rate_hz: int, way: Way | None = None, stretch: SameStretch | None = None) -> None:
+        self._recorder = recorder
+        self._way, self._stretch = way, stretch
+        self._bad = self._out = 0
+        self._out_limit = max(2, round(OUT_S * rate_hz))
+        self.reads = asyncio.Event()
+        self.finished = asyncio.Event()
+
+    async def run(self, batches: AsyncIterator[BarBatch]) -> None:
+        """Record; `reads` is set as soon as the bar was seen to read.
+
+        Raises
+        ------
+        BarOutOfRange, MeasurementFault
+            It does not read.
+        StretchDiffers
+            It does not read what it has read.
+        """
+        async for batch in batches:
+            await self._recorder.add_bar(batch)
+            if self._way is not None:
+                self._way.boot_id = batch.boot_id
+            if self._stretch is not None:
+                self._stretch.from_box(batch.boot_id)
+            for sample in batch.samples:
+                self._look(sample.status)
+                if self._stretch is not None:
+                    self._stretch.see(sample)
+            if self.finished.is_set() and batch.samples and not batch.samples[-1].status & SYNC:
+                if self._stretch is not None:
+                    self._stretch.judge()
+                return
+
+    def _look(self, status: int) -> None:
+        counts = bool(status & SYNC) or not self.reads.is_set()
+        self._out = self._out + 1 if counts and status & OUT_BITS else 0
+        self._bad = self._bad + 1 if counts and status & BAD_BITS else 0
+        if self._out >= self._out_limit:
+            raise bar_trouble(status)
+        if self._bad >= BAD_IN_A_ROW:
+            raise MeasurementFault(f"the ball-bar's box loses samples (status {status:#06x})", "lower the rate, look at its cable")
+        if not status & OUT_BITS:
+            self.reads.set()

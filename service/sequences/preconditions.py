@@ -1,0 +1,66 @@
+"""What must be as it was before a measurement goes on after a break: the same controller run, the same table, and everything safe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.api import ControllerStatus
+from service.devices.session import Session
+from service.errors import WorldChanged
+from service.sequences.interlocks import Watching, air_trouble, beam_trouble, check_interlocks
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Boot id of the controller and CRC of the active table when the campaign began."""
+
+    boot_id: int
+    table_crc: int
+
+
+async def check_world(session: Session, expected: Expected | None, watching: Watching, *, beam: bool) -> ControllerStatus:
+    """Look at everything again; gives the controller's status.
+
+    Parameters
+    ----------
+    beam : bool
+        A laser run is under way: its beam must not have been lost.
+
+    Raises
+    ------
+    WorldChanged
+        Another boot id or another table. Nothing can be gone on with.
+    Interlock
+        A condition that has to be cleared first.
+    """
+    status = await session.controller.status()
+    if expected is not None:
+        comp = await session.controller.comp_status()
+        check_expected(expected, comp.boot_id, comp.bank_crc[comp.active_bank])
+    check_interlocks(status)
+    if session.laser is not None and (beam or watching.air_c is not None):
+        reading = await session.laser.peek()
+        trouble = (beam_trouble(reading) if beam else None) or air_trouble(reading, watching.air_c)
+        if trouble is not None:
+            raise trouble
+    return status
+
+
+def check_expected(expected: Expected, boot_id: int, table_crc: int) -> None:
+    """Refuse another run of the controller, or another table.
+
+    Raises
+    ------
+    WorldChanged
+        Which.
+    """
+    if boot_id != expected.boot_id:
+        raise WorldChanged(
+            f"the controller was restarted since this campaign began (boot id {boot_id:#x} instead of {expected.boot_id:#x})",
+            "its clock began anew: measure a new campaign; the complete runs of this one stay",
+        )
+    if table_crc != expected.table_crc:
+        raise WorldChanged(
+            f"another compensation table is active (CRC {table_crc:08X} instead of {expected.table_crc:08X})",
+            "make the old one active again, or measure a new campaign",
+        )

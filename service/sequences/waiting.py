@@ -1,0 +1,146 @@
+"""Waiting for a person (pause) or for a condition to clear (suspension), and looking at everything again before it goes on."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable
+
+from drivers.errors import DriverError
+from service.devices.session import Session
+from service.errors import BeamLost, DoorOpen, Interlock
+from service.sequences.control import Control, State
+from service.sequences.interlocks import CAN_CLEAR, Suspending, Watching, somebody_at_work
+from service.sequences.journal import GOES_ON, WAITS, Journal
+from service.sequences.preconditions import Expected, check_world
+
+LOOK_S = 0.1
+NO_SIGNAL_BITS = 0b10010
+"""Signal low now, no reflector: unlike a lost count these clear by themselves."""
+
+
+async def paused(
+    session: Session, control: Control, watching: Watching, expected: Expected | None, journal: Journal, *, beam: bool = False
+) -> bool:
+    """Wait until a pause is taken back and everything is as it has to be; what is not is said, and the pause goes on.
+
+    Returns
+    -------
+    bool
+        Whether somebody may have touched what is mounted: the door was open, the mode another, or the controller did not say.
+
+    Raises
+    ------
+    Stopped, Aborted
+        That was asked for instead.
+    WorldChanged, BeamLost
+        Not to be cleared by waiting.
+    """
+    why = "paused as asked"
+    await journal.add(WAITS, why=why)
+    visits = Visits(session)
+    while True:
+        control.now(State.PAUSED, why)
+        await visits.during(control.resumed())
+        try:
+            await check_world(session, expected, watching, beam=beam)
+        except Interlock as trouble:
+            if isinstance(trouble, BeamLost):
+                raise
+            why = f"cannot go on: {trouble.detail}"
+            control.pause()
+            continue
+        break
+    await journal.add(GOES_ON, touched=visits.seen)
+    control.now(State.RUNNING)
+    return visits.seen
+
+
+class Visits:
+    """Looks whether somebody is at work in the machine, while nothing moves."""
+
+    def __init__(self, session: Session) -> None:
+        self._controller = session.controller
+        self.seen = False
+
+    async def look(self) -> None:
+        """Look once."""
+        try:
+            self.seen = self.seen or somebody_at_work(await self._controller.status())
+        except DriverError:
+            self.seen = True  # nobody knows
+
+    async def during(self, work: Awaitable[None]) -> None:
+        """Wait for something, and look again and again meanwhile."""
+        task = asyncio.ensure_future(work)
+        try:
+            while not task.done():
+                await self.look()
+                await asyncio.wait({task}, timeout=LOOK_S)
+            task.result()
+            await self.look()
+        finally:
+            if not task.done():
+                task.cancel()
+                await asyncio.wait({task})
+
+
+def may_suspend(trouble: Interlock, suspending: Suspending) -> bool:
+    """Whether a condition only suspends: it can clear by itself, and somebody has said that it may."""
+    return trouble.condition in CAN_CLEAR & suspending.conditions
+
+
+async def suspended(
+    session: Session, control: Control, watching: Watching, expected: Expected | None, journal: Journal, trouble: Interlock
+) -> bool:
+    """Wait until a condition has cleared and all has been well for the settle time.
+
+    Returns
+    -------
+    bool
+        Whether somebody may have touched what is mounted meanwhile.
+
+    Raises
+    ------
+    Interlock
+        It did not clear in time, or a condition came up that never goes on by itself.
+    Stopped, Aborted
+        A person asked for that.
+    WorldChanged
+        The controller or its table is not what it was.
+    """
+    clock, how = asyncio.get_running_loop().time, watching.suspending
+    until_s, well_s = clock() + how.longest_s, clock()
+    control.now(State.SUSPENDED, trouble.detail)
+    await journal.add(WAITS, why=trouble.detail, condition=trouble.condition)
+    beam, visits = isinstance(trouble, BeamLost), Visits(session)
+    visits.seen = isinstance(trouble, DoorOpen)
+    while True:
+        control.check()
+        await visits.look()
+        try:
+            await check_world(session, expected, watching, beam=False)
+            if beam:
+                await _signal(session)
+        except Interlock as now:
+            if not may_suspend(now, how):
+                raise
+            well_s = clock()
+            control.now(State.SUSPENDED, now.detail)
+        if clock() - well_s >= how.settle_s:
+            break
+        if clock() > until_s:
+            raise type(trouble)(f"{trouble.detail}, and it did not clear within {how.longest_s:g} s", trouble.remedy)
+        try:
+            async with asyncio.timeout(LOOK_S):
+                await control.asked()
+        except TimeoutError:
+            continue
+    await journal.add(GOES_ON, touched=visits.seen)
+    control.now(State.RUNNING)
+    return visits.seen
+
+
+async def _signal(session: Session) -> None:
+    reading = await session.need_laser().peek()
+    if reading.status & NO_SIGNAL_BITS:
+        raise BeamLost("the laser's beam is still interrupted", "free the beam")

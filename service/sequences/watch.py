@@ -1,0 +1,234 @@
+"""The watcher beside a running test: asks controller and laser how they are, and ends the test when one of them says no, or nothing.
+
+From an event to the end of the motion command stream: one period, one exchange, and the stop. The controller's link carries one request
+at a time, so the watcher waits its turn like everybody else and never has more than one request under way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from contextlib import asynccontextmanager
+from typing import Any
+
+from drivers.api import ControllerStatus, DisplacementMeter
+from drivers.errors import DriverError, Rebooted
+from service.devices.session import Session
+from service.errors import Interlock, MeasurementFault, StatusUnknown
+from service.sequences.control import Control
+from service.sequences.interlocks import Watching, air_trouble, beam_trouble, tripped
+
+AIR_PERIOD_S = 1.0
+LASER_UNKNOWN_S = 2.5
+"""A laser on a serial line is silent for a second after one lost reply; nothing but a reading hangs on it."""
+RETRY_S = 0.02
+LATE_S = 0.1
+"""If we wake up later than this, it was this computer that stood still: it asks once more before it calls the status unknown."""
+NOTHING: frozenset[str] = frozenset()
+END_S = 5.0
+"""So long the watchers may take for the look that they are at when the test has ended."""
+
+
+class Watch:
+    """What is being watched. The sequencer says which conditions are a person's right just now (``tolerated``) and whether the laser counts
+    (``beam``)."""
+
+    def __init__(self, session: Session, watching: Watching) -> None:
+        self._s, self._w = session, watching
+        self._ended = asyncio.Event()
+        self.tolerated = NOTHING
+        self.beam = False
+
+    def end(self) -> None:
+        """Let the watchers end after the look that they are at."""
+        self._ended.set()
+
+    async def controller(self) -> None:
+        """Ask the controller again and again.
+
+        Raises
+        ------
+        Interlock
+            A condition forbids motion, or the controller said nothing for too long.
+        Rebooted
+            It restarted.
+        """
+        while not self._ended.is_set():
+            status = await known_status(self._s.controller.status, self._w.unknown_s)
+            self._raise(tripped(status, self.tolerated))
+            await self._rest(self._w.period_s)
+
+    async def laser(self, laser: DisplacementMeter) -> None:
+        """Ask the laser again and again: for its beam while it counts, for the air always.
+
+        Raises
+        ------
+        Interlock
+            Beam lost, air outside the window, or the laser said nothing for too long.
+        """
+        clock = asyncio.get_running_loop().time
+        heard_s = clock()
+        while not self._ended.is_set():
+            if not self.beam and self._w.air_c is None:
+                heard_s = clock()
+                await self._rest(self._w.period_s)
+                continue
+            try:
+                reading = await laser.peek()
+            except Rebooted:
+                raise
+            except DriverError as error:
+                longest_s = LASER_UNKNOWN_S if self.beam else self._w.air_unknown_s
+                if clock() - heard_s > longest_s:
+                    raise StatusUnknown(f"the laser has not answered for {longest_s:g} s: {error}", "look at its cable") from error
+                await self._rest(RETRY_S)
+                continue
+            heard_s = clock()
+            if self.beam:
+                self._raise(beam_trouble(reading))
+            self._raise(air_trouble(reading, self._w.air_c))
+            await self._rest(self._w.period_s if self.beam else AIR_PERIOD_S)
+
+    async def named(self, error: BaseException) -> BaseException:
+        """What stands behind an error of a device: the interlock, if one holds; else the error itself."""
+        if not isinstance(error, DriverError | MeasurementFault) or isinstance(error, Rebooted):
+            return error
+        try:
+            async with asyncio.timeout(self._w.unknown_s):
+                found = tripped(await self._s.controller.status(), self.tolerated)
+                laser = self._s.laser
+                if found is None and laser is not None and isinstance(error, DriverError) and error.device == getattr(laser, "name", None):
+                    found = beam_trouble(await laser.peek())
+        except (DriverError, TimeoutError):
+            return error
+        return error if found is None else found
+
+    def _raise(self, trouble: Interlock | None) -> None:
+        if trouble is not None and trouble.condition not in self.tolerated:
+            raise trouble
+
+    async def _rest(self, seconds: float) -> None:
+        try:
+            async with asyncio.timeout(seconds):
+                await self._ended.wait()
+        except TimeoutError:
+            return
+
+
+@asynccontextmanager
+async def watched(session: Session, control: Control, watching: Watching) -> AsyncIterator[Watch]:
+    """A block that ends as soon as a watcher objects or a person aborts. Whoever moves axes inside stops them when cancelled.
+
+    Raises
+    ------
+    Interlock, Aborted, DriverError
+        What ended the block, by its own name.
+    """
+    watch, me = Watch(session, watching), asyncio.current_task()
+    assert me is not None
+    before = me.cancelling()
+    beside = Beside(me)
+    aborting = beside.start(control.aborted())
+    beside.start(watch.controller())
+    if session.laser is not None:
+        beside.start(watch.laser(session.laser))
+    body: BaseException | None = None
+    try:
+        yield watch
+    except BaseException as error:  # noqa: BLE001 - raised again below, by the name of its cause
+        body = error
+    watch.end()
+    aborting.cancel()
+    await beside.ended()
+    if me.cancelling() > before:  # whoever wants this process to end is heard, whatever came together with it
+        raise body if isinstance(body, asyncio.CancelledError) else asyncio.CancelledError
+    if body is not None and not isinstance(body, asyncio.CancelledError):
+        raise await watch.named(body) from body
+    if beside.errors:
+        raise beside.errors[0] from None  # one cause for one person; the others follow from it
+    if body is not None:
+        raise body
+
+
+class Beside:
+    """Tasks beside a block, the first failure of which cancels the block. Unlike a TaskGroup it never takes a cancellation from outside
+    for its own: while the axes are being stopped both may come."""
+
+    def __init__(self, block: asyncio.Task[Any]) -> None:
+        self._block, self._open, self._cancelled = block, True, False
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.errors: list[BaseException] = []
+
+    def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Begin a task."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        return task
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        if task.cancelled() or (error := task.exception()) is None:
+            return
+        self.errors.append(error)
+        if self._open and not self._cancelled:
+            self._cancelled = True
+            self._block.cancel()
+
+    async def ended(self) -> None:
+        """The block has ended: take back our own cancellation and wait for the tasks."""
+        self._open = False
+        if self._cancelled:
+            self._block.uncancel()
+        until_s = asyncio.get_running_loop().time() + END_S
+        while pending := {task for task in self._tasks if not task.done()}:
+            try:
+                await asyncio.wait(pending, timeout=END_S)
+            except asyncio.CancelledError:
+                until_s = 0.0  # noted by the task itself; who cancels twice does not wait for a look
+            if asyncio.get_running_loop().time() >= until_s:
+                for task in pending:
+                    task.cancel()
+                until_s = math.inf
+        await asyncio.sleep(0)  # their callbacks
+
+
+async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s: float) -> ControllerStatus:
+    """One status, asked again after a lost reply until it has been unknown for too long.
+
+    Raises
+    ------
+    StatusUnknown
+        Nothing was heard for ``unknown_s``. Time in which this computer itself stood still is not counted against the controller.
+    Rebooted
+        The controller restarted.
+    """
+    clock = asyncio.get_running_loop().time
+    until_s = clock() + unknown_s
+    why, again = "no answer", True
+    while True:
+        try:
+            async with asyncio.timeout_at(until_s):
+                return await ask()
+        except Rebooted:
+            raise
+        except (DriverError, TimeoutError) as error:
+            if isinstance(error, DriverError):
+                why = str(error)
+        late_s = clock() - until_s
+        if late_s > LATE_S and again:
+            until_s, again = clock() + unknown_s, False
+        elif late_s >= 0.0:
+            raise StatusUnknown(
+                f"the controller's status is unknown for {1e3 * unknown_s:.0f} ms: {why}",
+                "look at its link; nothing moves until it is known",
+            )
+        else:
+            await asyncio.sleep(min(RETRY_S, -late_s))
+
+
+def first_of(error: BaseException) -> BaseException:
+    """The first cause in a group of errors."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error

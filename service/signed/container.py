@@ -1,0 +1,158 @@
+"""FILE.sig: the claims about compensation files in canonical JSON, with an Ed25519 signature over exactly these bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from service.errors import SignatureRefused
+from service.push.entries import canonical
+from service.signed.keys import public_of
+from service.storage.base import utc_text
+
+FORM = "abbe-signed/1"
+PURPOSE = b"abbe compensation files\x00"
+"""Stands before the signed bytes: a signature made for something else is none here."""
+LARGEST = 1_000_000
+NO_BASE = "none"
+FILE_REMEDY = "get the files and their .sig again from who signed them; nothing was taken in"
+
+
+@dataclass(frozen=True, slots=True)
+class Claims:
+    """What is signed.
+
+    Parameters
+    ----------
+    machine : str
+        Name of the machine.
+    form : str
+        Format or control that the files are for.
+    files : dict of str to str
+        SHA-256 of each file's bytes, by name.
+    base : str
+        Fingerprint of the table that was active while measuring; `NO_BASE` for none.
+    limits : str
+        SHA-256 of the limits of the machine under which the tables were found good.
+    signed_utc, expiry_utc : str
+        When; until when they may be taken in.
+    """
+
+    machine: str
+    form: str
+    files: dict[str, str]
+    base: str
+    limits: str
+    signed_utc: str
+    expiry_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What the machine at hand is: the claims have to be about it. ``base`` None: not known here, then it is only told."""
+
+    machine: str
+    limits: str
+    form: str
+    trusted: Sequence[str]
+    base: str | None = None
+
+
+def claims_of(machine: str, form: str, files: Mapping[str, bytes], base: str, limits: str, span: tuple[datetime, datetime]) -> Claims:
+    """The claims about files; ``span``: now, and when they expire."""
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    return Claims(machine, form, digests, base, limits, utc_text(span[0]), utc_text(span[1]))
+
+
+def sign(claims: Claims, key: Ed25519PrivateKey) -> bytes:
+    """Bytes of FILE.sig."""
+    said = asdict(claims)
+    return (
+        canonical({"format": FORM, "key": public_of(key), "claims": said, "signature": key.sign(PURPOSE + canonical(said)).hex()}) + b"\n"
+    )
+
+
+def check(sealed: bytes, files: Mapping[str, bytes], expected: Expected, now: datetime) -> Claims:
+    """The claims, if all of them hold here and now.
+
+    Parameters
+    ----------
+    sealed : bytes
+        Content of FILE.sig.
+    files : mapping of str to bytes
+        Names and bytes of the files as they lie there.
+    expected : Expected
+        This machine.
+    now : datetime
+        With time zone.
+
+    Raises
+    ------
+    SignatureRefused
+        Not as signed, by a key that nobody trusts, for another machine, base, limits or format, or expired.
+    """
+    key, claims, signature = _parts(sealed)
+    if key not in expected.trusted:
+        raise SignatureRefused(
+            f"signed by {key[:16]}…, whom nobody here trusts", "put the public key under [signatures] trusted, or do not take it in"
+        )
+    try:
+        Ed25519PublicKey.from_public_bytes(bytes.fromhex(key)).verify(signature, PURPOSE + canonical(asdict(claims)))
+    except (InvalidSignature, ValueError):
+        raise SignatureRefused("the signature does not belong to what it stands under", FILE_REMEDY) from None
+    _check_files(claims, files)
+    for what, said, here in (
+        ("machine", claims.machine, expected.machine),
+        ("format", claims.form, expected.form),
+        ("limits", claims.limits, expected.limits),
+        ("base", claims.base, claims.base if expected.base is None else expected.base),
+    ):
+        if said != here:
+            raise SignatureRefused(
+                f"signed for {what} {said[:64]!r}, and here it is {here[:64]!r}", "have it signed for this machine as it is now"
+            )
+    if not _moment(claims.signed_utc) <= now < _moment(claims.expiry_utc):
+        raise SignatureRefused(
+            f"signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)", "have it signed anew, or set the clock"
+        )
+    return claims
+
+
+def _check_files(claims: Claims, files: Mapping[str, bytes]) -> None:
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    if digests != claims.files:
+        wrong = sorted(name for name in digests.keys() | claims.files.keys() if digests.get(name) != claims.files.get(name))
+        raise SignatureRefused(f"{', '.join(wrong)}: not the file that was signed", FILE_REMEDY)
+
+
+def _parts(sealed: bytes) -> tuple[str, Claims, bytes]:
+    """Key, claims and signature. Only the one way of writing them is taken: no second file says the same."""
+    try:
+        if len(sealed) > LARGEST:
+            raise ValueError
+        doc: dict[str, Any] = json.loads(sealed.decode("utf-8"))
+        if canonical(doc) + b"\n" != sealed or set(doc) != {"format", "key", "claims", "signature"} or doc["format"] != FORM:
+            raise ValueError
+        claims = Claims(**doc["claims"])
+        texts = [v for k, v in asdict(claims).items() if k != "files"] + [doc["key"], *claims.files.values()]
+        signature = bytes.fromhex(doc["signature"])
+        if not all(isinstance(text, str) for text in texts) or signature.hex() != doc["signature"]:
+            raise ValueError
+        _moment(claims.signed_utc), _moment(claims.expiry_utc)
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        raise SignatureRefused(f"no signature of the form {FORM}, or it was changed", FILE_REMEDY) from None
+    return doc["key"], claims, signature
+
+
+def _moment(text: str) -> datetime:
+    found = datetime.fromisoformat(text)
+    if found.tzinfo is None:
+        raise ValueError
+    return found.astimezone(UTC)

@@ -1,0 +1,62 @@
+"""Ed25519 keys in files: the private one for its owner only (0600), the public one to be shown."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
+
+from service.errors import KeyRefused
+
+
+def new_key(path: Path) -> str:
+    """Write a new private key; return its public key, 64 hex digits.
+
+    Raises
+    ------
+    KeyRefused
+        There is a file of this name, or none can be written.
+    """
+    key = Ed25519PrivateKey.generate()
+    text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    try:
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            os.write(file, text)
+            os.fsync(file)
+        finally:
+            os.close(file)
+    except FileExistsError:
+        raise KeyRefused(f"{path} is there already, and a key is never overwritten", "give another name") from None
+    except OSError as error:
+        raise KeyRefused(f"{path}: cannot be written: {error.strerror}", "give a folder that may be written") from None
+    return public_of(key)
+
+
+def read_key(path: Path) -> Ed25519PrivateKey:
+    """Read a private key.
+
+    Raises
+    ------
+    KeyRefused
+        It cannot be read, is no Ed25519 key, or others may read it as well.
+    """
+    try:
+        if os.name == "posix" and path.stat().st_mode & 0o077:
+            raise KeyRefused(f"{path}: others may read this key", f"chmod 600 {path}, or make a new one if others have")
+        found = load_pem_private_key(path.read_bytes(), None)
+    except OSError as error:
+        raise KeyRefused(f"{path}: cannot be read: {error.strerror}", "make a key: abbe key new FILE") from None
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise KeyRefused(f"{path} holds no private key without a password", "make a key: abbe key new FILE") from None
+    if not isinstance(found, Ed25519PrivateKey):
+        raise KeyRefused(f"{path} holds no Ed25519 key", "make a key: abbe key new FILE")
+    return found
+
+
+def public_of(key: Ed25519PrivateKey) -> str:
+    """The public key, 64 hex digits."""
+    return key.public_key().public_bytes_raw().hex()

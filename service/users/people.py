@@ -1,0 +1,245 @@
+"""What is done with users: added, changed, disabled, logged in and out, and who a secret belongs to."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from service.clock import Clock
+from service.errors import UserRefused
+from service.storage.base import utc_text
+from service.storage.store import Store
+from service.storage.store_people import TokenRecord, UserRecord
+from service.users.passwords import Passwords, check_new
+from service.users.roles import ALLOWED, Permission, Role
+
+IDLE = timedelta(minutes=15)
+LONGEST = timedelta(hours=12)
+TOUCH = timedelta(seconds=30)
+"""A session's last use is written down no more often than this: a page that refreshes itself is not a write each time."""
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+
+
+@dataclass(frozen=True, slots=True)
+class Principal:
+    """Who asks, and what he may do.
+
+    Parameters
+    ----------
+    name : str
+        ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``; so it stands in the audit.
+    role : Role or None
+        None: nobody.
+    permissions : frozenset of Permission
+        What is allowed.
+    by : str
+        ``session``, ``token`` or ``nobody``.
+    digest : str
+        SHA-256 of the session's secret.
+    """
+
+    name: str = "anonymous"
+    role: Role | None = None
+    permissions: frozenset[Permission] = frozenset()
+    by: str = "nobody"
+    digest: str = ""
+
+
+NOBODY = Principal()
+ONLOOKER = Principal("anonymous", Role.VIEWER, ALLOWED[Role.VIEWER])
+"""Who asks a service without users: it listens on this computer only, and shows."""
+
+
+class People:
+    """Users of one database.
+
+    Parameters
+    ----------
+    store : Store
+        Its clock is that of all times here.
+    clock : Clock
+        Now.
+    passwords : Passwords, optional
+        Cost of the hashes.
+    """
+
+    def __init__(self, store: Store, clock: Clock, passwords: Passwords | None = None) -> None:
+        self._store, self._clock = store, clock
+        self.passwords = passwords or Passwords()
+
+    def add(self, name: str, role: str, password: str) -> None:
+        """Add a user.
+
+        Raises
+        ------
+        UserRefused, PasswordRefused, StoreError
+            The name or role is none, the password is weak, or the name is taken.
+        """
+        if not NAME.fullmatch(name):
+            raise UserRefused(f"{name!r} is no name of a user", "1 to 64 letters, digits and . _ @ -, beginning with a letter or digit")
+        check_new(name, password)
+        self._store.add_user(name, role_of(role), self.passwords.hash(password))
+
+    def get(self, name: str) -> UserRecord:
+        """A user by name.
+
+        Raises
+        ------
+        UserRefused
+            There is none.
+        """
+        user = self._store.user(name)
+        if user is None:
+            raise UserRefused(f"there is no user {name!r}", "`abbe user list` lists them")
+        return user
+
+    def set_role(self, name: str, role: str) -> None:
+        """Give a user another role; his sessions end, so that none goes on with the old rights."""
+        user, new = self.get(name), role_of(role)
+        if new is not Role.ADMIN:
+            self._keep_an_admin(user)
+        self._store.change_user(user.id, role=new)
+
+    def set_password(self, name: str, password: str) -> None:
+        """Give a user another password; his sessions end."""
+        user = self.get(name)
+        check_new(name, password)
+        self._store.change_user(user.id, password=self.passwords.hash(password))
+
+    def disable(self, name: str, *, enable: bool = False) -> None:
+        """Shut a user out, sessions and tokens with him, or let him in again. He is never deleted: the audit names him."""
+        user = self.get(name)
+        if not enable:
+            self._keep_an_admin(user)
+        self._store.change_user(user.id, disabled_utc=None if enable else utc_text(self._clock.utc()))
+
+    def _keep_an_admin(self, user: UserRecord) -> None:
+        others = [u for u in self._store.users() if u.id != user.id and u.role == Role.ADMIN and u.disabled_utc is None]
+        if user.role == Role.ADMIN and user.disabled_utc is None and not others:
+            raise UserRefused(f"{user.name!r} is the only admin", "make somebody else admin first: abbe user role")
+
+    def check(self, name: str, password: str) -> UserRecord | None:
+        """The user, if the password is his and he is not disabled. Takes as long for one that does not exist."""
+        user = self._store.user(name) if NAME.fullmatch(name) else None
+        right = self.passwords.verify(None if user is None else user.password, password)
+        if not right or user is None or user.disabled_utc is not None:
+            return None
+        if self.passwords.outdated(user.password):
+            self._store.change_user(user.id, keep_session=True, password=self.passwords.hash(password))
+        return user
+
+    def known(self, name: str) -> bool:
+        """Tell whether there is such a user: what else is typed where a name belongs is not repeated anywhere, it may be a password."""
+        return bool(NAME.fullmatch(name)) and self._store.user(name) is not None
+
+    def begin(self, user: UserRecord, instead_of: str = "") -> str:
+        """Begin a session, always with a new secret; the session whose secret came with the login ends. Returns the secret."""
+        secret = secrets.token_urlsafe(32)
+        self._store.add_session(user.id, digest_of(secret), digest_of(instead_of) if instead_of else "")
+        return secret
+
+    def end(self, secret: str) -> None:
+        """End a session."""
+        self._store.end_session(digest_of(secret))
+
+    def by_session(self, secret: str) -> Principal:
+        """Who has this secret; `NOBODY` if the session has ended, was idle or is too old, or its user is disabled."""
+        digest = digest_of(secret)
+        found = self._store.session(digest)
+        if found is None:
+            return NOBODY
+        session, user = found
+        now = self._clock.utc()
+        seen, begun = moment(session.seen_utc), moment(session.created_utc)
+        if session.ended_utc is not None or user.disabled_utc is not None or now - seen > IDLE or now - begun > LONGEST:
+            return NOBODY
+        if now - seen > TOUCH:
+            self._store.touch_session(session.id)
+        role = Role(user.role)
+        return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)
+
+    def add_token(self, name: str, title: str, scopes: list[str], days: float) -> str:
+        """Make a token of a user; return its text, which is kept nowhere.
+
+        Raises
+        ------
+        UserRefused, StoreError
+            No such user or scope, a scope beyond the user's role, no sensible life time, or the title is taken.
+        """
+        user = self.get(name)
+        if not NAME.fullmatch(title):
+            raise UserRefused(f"{title!r} is no name of a token", "1 to 64 letters, digits and . _ @ -")
+        if not 0 < days <= 3660:
+            raise UserRefused(f"{days:g} days is no life of a token", "more than 0, at most 3660")
+        beyond = [s for s in scopes if s not in ALLOWED[Role(user.role)]]
+        if beyond or not scopes:
+            known = ", ".join(sorted(ALLOWED[Role(user.role)]))
+            raise UserRefused(
+                f"a token of {name!r} cannot have the scope {', '.join(beyond) or 'nothing'}", f"scopes of {user.role}: {known}"
+            )
+        prefix, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
+        text = f"abbe_{prefix}_{secret}"
+        expires = utc_text(self._clock.utc() + timedelta(days=days))
+        self._store.add_token(TokenRecord(0, user.id, title, prefix, digest_of(text), sorted(set(scopes)), "", expires, None))
+        return text
+
+    def revoke_token(self, name: str, title: str) -> None:
+        """Revoke a token.
+
+        Raises
+        ------
+        UserRefused
+            There is none of this name.
+        """
+        found = [token for token, owner in self._store.tokens() if (owner, token.name) == (name, title)]
+        if not found:
+            raise UserRefused(f"{name!r} has no token {title!r}", "`abbe user token list` lists them")
+        self._store.revoke_token(found[0].id)
+
+    def by_token(self, text: str) -> Principal:
+        """Who has this token: the rights of its user today, at most those of its scopes; `NOBODY` if it does not hold."""
+        match = TOKEN.fullmatch(text)
+        found = self._store.token(match[1]) if match else None
+        if found is None:
+            return NOBODY
+        token, user = found
+        right = hmac.compare_digest(token.digest, digest_of(text))
+        over = moment(token.expires_utc) <= self._clock.utc()
+        if not right or over or token.revoked_utc is not None or user.disabled_utc is not None:
+            return NOBODY
+        role = Role(user.role)
+        scopes = frozenset(Permission(s) for s in token.scopes)
+        return Principal(f"token:{user.name}/{token.name}", role, ALLOWED[role] & scopes, "token")
+
+    def anybody(self) -> bool:
+        """Tell whether there is a user, also a disabled one: then nobody looks on without a name."""
+        return bool(self._store.users())
+
+
+def role_of(text: str) -> Role:
+    """A role by name.
+
+    Raises
+    ------
+    UserRefused
+        There is none.
+    """
+    try:
+        return Role(text)
+    except ValueError:
+        raise UserRefused(f"there is no role {text!r}", f"one of: {', '.join(Role)}") from None
+
+
+def digest_of(secret: str) -> str:
+    """SHA-256 of a secret of 256 random bits: nothing slower is needed, there is nothing to guess."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def moment(text: str) -> datetime:
+    """A time of the database."""
+    return datetime.fromisoformat(text).astimezone(UTC)

@@ -1,0 +1,42 @@
+"""Roles and what each may do: the one table that decides. What is not in it is not allowed."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Role(StrEnum):
+    """What a person is in this service. One role for each person."""
+
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    METROLOGIST = "metrologist"
+    APPROVER = "approver"
+    ADMIN = "admin"
+
+
+class Permission(StrEnum):
+    """One kind of thing that can be done. Also the scopes of tokens."""
+
+    READ = "read"
+    MEASURE = "measure"
+    ACKNOWLEDGE = "acknowledge"
+    SOLVE = "solve"
+    PROPOSE = "propose"
+    APPROVE = "approve"
+    CONFIGURE = "configure"
+    AUDIT = "audit"
+    USERS = "users"
+
+
+_OPERATOR = frozenset({Permission.READ, Permission.MEASURE, Permission.ACKNOWLEDGE})
+
+ALLOWED: dict[Role, frozenset[Permission]] = {
+    Role.VIEWER: frozenset({Permission.READ}),
+    Role.OPERATOR: _OPERATOR,
+    Role.METROLOGIST: _OPERATOR | {Permission.SOLVE, Permission.PROPOSE},
+    # He judges what others propose; who also measures and proposes would judge himself.
+    Role.APPROVER: frozenset({Permission.READ, Permission.ACKNOWLEDGE, Permission.APPROVE, Permission.AUDIT}),
+    # Gives rights and keeps the settings. Neither proposes nor approves a table.
+    Role.ADMIN: frozenset({Permission.READ, Permission.CONFIGURE, Permission.AUDIT, Permission.USERS}),
+}

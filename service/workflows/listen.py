@@ -1,0 +1,232 @@
+"""Listening to a program that the operator starts: the laser is read all the time, and its standstills become the readings of the recipe.
+
+For controllers that nobody moves by registers. Abbe writes nothing to the controller; of its status it uses the clock, the position and "NC
+program running". Times are those at which the laser took its samples, by its own clock, brought to the controller's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from drivers.api import ControllerStatus, LaserReading, Point
+from models.alignment.clock import ClockFit, fit_clock
+from models.alignment.dwell import DwellReading, Dwells, Planned, detect, merged, named
+from models.alignment.lag import Lag, fit_lag
+from models.arrays import F1, F2
+from models.machine import AXES
+from service.devices.session import Session
+from service.errors import MeasurementFault
+from service.runs.laser_columns import MM_PER_COUNT
+from service.runs.recorder import Recorder
+from service.sequences.interlocks import PROGRAM
+from service.sequences.nc.blocks import LASER_DWELL_S
+from service.sequences.runner import COMPENSATED
+from service.sequences.steps import MountLaser, MoveTo, ReadLaser, TestPlan
+
+Say = Callable[[str], None]
+STATUS_EVERY = 3
+"""One status for so many readings of the laser."""
+QUIET = 4.0
+"""Where no "program running" is seen, a test has ended when nothing has moved for so many of its longest dwells."""
+MOVED_MM = 0.05
+START_MM = 0.05
+POLL_S = 0.05
+U_DELAY_S = 2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """One reading of the recipe: where, in what direction."""
+
+    target_mm: Point
+    direction: int
+    along_mm: float
+    settle_s: float
+
+
+@dataclass
+class Heard:
+    """What was heard of one test."""
+
+    readings: list[LaserReading] = field(default_factory=list)
+    statuses: list[ControllerStatus] = field(default_factory=list)
+
+
+def wanted(test: TestPlan) -> list[Wanted]:
+    """The readings of a laser test, in order.
+
+    Raises
+    ------
+    MeasurementFault
+        Not a test of single laser readings.
+    """
+    here, out = None, list[Wanted]()
+    beam = np.array(next((s.beam for s in test.steps if isinstance(s, MountLaser)), test.setup.get("nominal_beam", (0.0, 0.0, 0.0))))
+    for step in test.steps:
+        if isinstance(step, MoveTo):
+            here = step.target_mm
+        elif isinstance(step, ReadLaser) and here is not None:
+            first = out[0].target_mm if out else here
+            out.append(Wanted(here, step.direction, float(beam @ np.subtract(here, first)), step.settle_s))
+    if len(out) < 2:
+        raise MeasurementFault(
+            f"test {test.label} has no single laser readings", "listening takes laser tests; measure the others by themselves"
+        )
+    return out
+
+
+async def listen_to(session: Session, recorder: Recorder, test: TestPlan, say: Say) -> dict[str, Any]:
+    """Mount, zero, listen until the program has ended, and store the readings that its standstills are; gives the end document.
+
+    Raises
+    ------
+    MeasurementFault
+        What was heard is not this test; or a beam that was lost.
+    """
+    plan = wanted(test)
+    await _at_start(session, test, plan[0].target_mm, say)
+    for step in test.steps:
+        if isinstance(step, MountLaser):
+            await session.need_fixture().mount_laser(step.beam)
+    mounted_us = (await session.controller.status()).ctrl_us
+    laser = session.need_laser()
+    await laser.clear_beam()
+    await laser.set_environment_compensation(True)
+    await laser.zero()
+    say(f"{test.label}: listening, start the program")
+    heard = await _hear(session, (QUIET * (LASER_DWELL_S + plan[0].settle_s)))
+    if not all(r.status >> COMPENSATED & 1 for r in heard.readings):
+        raise MeasurementFault(
+            f"test {test.label}: the laser's environmental compensation was switched off meanwhile", "switch it on, start the program again"
+        )
+    found, planned = _detected(test, heard, plan)
+    lines = named(found, planned)
+    times, lag = _controller_times(heard)
+    middles = row_times(found.readings, heard.readings[0].device_us * 1e-6, plan[0].settle_s + LASER_DWELL_S)
+    for one, reading, middle_s in zip(plan, found.readings, middles, strict=True):
+        await recorder.add_record(_record(one, reading, middle_s, heard, times))
+    for line in lines:
+        say(f"{test.label}: {line}")
+    doc = {"standstills": {"trouble": list(lines), "missing": list(found.missing), "noise_mm": found.noise}, "mounted_us": mounted_us}
+    if lag is not None and lag.told:
+        doc["lag"] = {"laser_behind_position_ms": lag.lag_s * 1e3, "u_ms": lag.u_s * 1e3}
+    return doc | {"heard": [[r.device_us, r.displacement_tenth_nm] for r in heard.readings]}
+
+
+async def _at_start(session: Session, test: TestPlan, start_mm: Point, say: Say) -> None:
+    """Wait until the machine stands where the test begins: whoever mounts has to find it there."""
+    before, told = None, False
+    while True:
+        status = await session.controller.status()
+        if math.dist(status.position_mm, start_mm) < START_MM and status.position_mm == before:
+            return
+        if not told:
+            told = True
+            at = " ".join(f"{a}{v:.3f}" for a, v in zip(AXES, start_mm, strict=True))
+            say(f"{test.label}: waiting until the program has taken the machine to {at}")
+        before = status.position_mm
+        await asyncio.sleep(POLL_S)
+
+
+async def _hear(session: Session, quiet_s: float) -> Heard:
+    """Read the laser from before the program moves until it has ended."""
+    heard, laser = Heard(), session.need_laser()
+    last, ran, moved_us, level = None, False, 0, None
+    while True:
+        reading = await laser.read(after_count=last)
+        last = reading.sample_count
+        heard.readings.append(reading)
+        if len(heard.readings) % STATUS_EVERY == 0:
+            status = await session.controller.status()
+            heard.statuses.append(status)
+            running = bool(status.bits >> PROGRAM & 1)
+            if ran and not running and moved_us:  # before that, somebody went on from one halt to the next
+                return heard
+            ran = running or (ran and bool(moved_us))
+        level = reading.displacement_tenth_nm if level is None else level
+        if abs(reading.displacement_tenth_nm - level) * MM_PER_COUNT > MOVED_MM:
+            moved_us, level = reading.device_us, reading.displacement_tenth_nm
+        if not ran and moved_us and (reading.device_us - moved_us) * 1e-6 > quiet_s:
+            return heard
+
+
+def _detected(test: TestPlan, heard: Heard, plan: list[Wanted]) -> tuple[Dwells, tuple[Planned, ...]]:
+    t, y = _stream(heard)
+    planned = merged([Planned(one.along_mm, one.settle_s + LASER_DWELL_S) for one in plan])
+    try:
+        return detect(t, y, planned, settle_s=plan[0].settle_s, zero=0.0), planned
+    except ValueError as error:
+        raise MeasurementFault(f"test {test.label}: {error}", "start the program of this recipe, then listen again") from None
+
+
+def _stream(heard: Heard) -> tuple[F1, F1]:
+    t = np.array([r.device_us for r in heard.readings]) * 1e-6
+    return t, np.array([r.displacement_tenth_nm for r in heard.readings]) * MM_PER_COUNT
+
+
+def _controller_times(heard: Heard) -> tuple[Callable[[F1], F1], Lag | None]:
+    """Laser time to controller time by both clocks' fits over this computer's, and the laser's lag behind the controller's positions."""
+    laser = _fit([(r.device_us, r.host_s) for r in heard.readings])
+    cnc = _fit([(s.ctrl_us, s.host_s) for s in heard.statuses])
+
+    def to_controller(laser_s: F1) -> F1:
+        return cnc.device_s(laser.host_s(laser_s))
+
+    t, y = _stream(heard)
+    at = np.array([s.ctrl_us for s in heard.statuses]) * 1e-6
+    keep = np.concatenate([[True], np.diff(at) > 0.0])
+    places: F2 = np.array([s.position_mm for s in heard.statuses])[keep]
+    line = places[int(np.argmax(np.linalg.norm(places - places[0], axis=1)))] - places[0]
+    if at[keep].size < 20 or not line.any():
+        return to_controller, None
+    along = (places - places[0]) @ (line / np.linalg.norm(line))
+    inside = (to_controller(t) > at[0]) & (to_controller(t) < at[-1])
+    return to_controller, fit_lag(to_controller(t)[inside], y[inside], at[keep], along)
+
+
+def _fit(pairs: list[tuple[int, float]]) -> ClockFit:
+    stamps, arrived = np.array(pairs, dtype=np.float64).T
+    keep = np.concatenate([[True], np.diff(stamps) > 0.0])
+    try:
+        return fit_clock(stamps[keep] * 1e-6, arrived[keep], u_delay_s=U_DELAY_S)
+    except ValueError as error:
+        raise MeasurementFault(f"too little was heard to compare the clocks ({error})", "listen from before the program starts") from None
+
+
+def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: float) -> list[float]:
+    """Laser time of every planned reading, (n,) s, rising: the middle of its window; of a missing one a time between its neighbours, before
+    the first one seen between that and the beginning of listening, after the last one seen ``apart_s`` each."""
+    seen = [(k, 0.5 * (one.start_s + one.end_s)) for k, one in enumerate(readings) if one is not None]
+    at, times = [float(k) for k, _ in seen], [t for _, t in seen]
+    last = len(readings) - 1
+    if seen[0][0] > 0:
+        at, times = [-1.0, *at], [min(start_s, times[0] - 1e-3), *times]
+    if seen[-1][0] < last:
+        at, times = [*at, float(last)], [*times, times[-1] + apart_s * (last - seen[-1][0])]
+    return [float(t) for t in np.interp(np.arange(last + 1.0), at, times)]
+
+
+def _record(one: Wanted, reading: DwellReading | None, middle_s: float, heard: Heard, times: Callable[[F1], F1]) -> dict[str, Any]:
+    """A record as the sequencer makes it, of one standstill; of one that nobody saw the nominal place, marked as missing."""
+    near = min(heard.readings, key=lambda r: abs(r.device_us * 1e-6 - middle_s))
+    told: dict[str, Any] = {"displacement_tenth_nm": round(one.along_mm / MM_PER_COUNT), "missing": True}
+    if reading is not None:
+        window = {"u_mm": reading.u, "window_s": [reading.start_s, reading.end_s], "samples": reading.samples}
+        told = {"displacement_tenth_nm": round(reading.value / MM_PER_COUNT)} | window
+    return told | {
+        "host_s": near.host_s,
+        "ctrl_us": int(times(np.array([middle_s]))[0] * 1e6),
+        "target_mm": list(one.target_mm),
+        "direction": one.direction,
+        "status": near.status,
+        "signal_permille": near.signal_permille,
+        "air_temp_c": near.air_temp_c,
+        "air_pressure_pa": near.air_pressure_pa,
+        "feed_mm_min": 0.0,
+    }

@@ -1,0 +1,88 @@
+"""With which compensation tables the runs of a solution were measured: files for a control hold only for a machine without any.
+
+A machine that is measured while a table is in force shows what that table has left. Files made of that alone, put in its place, take the
+old correction away and leave the machine worse. They are refused; where Abbe writes the tables itself, it adds them (`abbe correct`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from service.errors import FormatRefused
+from service.push.book import read_entries
+from service.storage.records import Doc
+from service.storage.store import Store
+
+KIND_AT, NO_CORRECTION = slice(4, 6), 0
+"""Bytes of an image that say its kind (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
+Images = Callable[[int], bytes | None]
+REMEDY = "measure again without a table in force; or, where the control has Abbe's register map, let abbe correct add the tables"
+SAY_SO = "if none was, say so: --without-table"
+
+
+def distinct(tables: Iterable[Doc]) -> list[Doc]:
+    """Tables by their CRC, with what the controller said about whether one acts (``acting``; missing in runs of older versions)."""
+    found: dict[int, Doc] = {}
+    for table in tables:
+        one = {"crc": int(table["crc"])} | ({} if table.get("acting") is None else {"acting": bool(table["acting"])})
+        found[one["crc"]] = found.get(one["crc"], {}) | one
+    return [found[crc] for crc in sorted(found)]
+
+
+def tables_of(doc: dict[str, Any]) -> list[Doc]:
+    """Tables that a solution's document names."""
+    return distinct(doc.get("inputs", {}).get("tables", []))
+
+
+def stored_tables(store: Store, solution_id: int) -> list[Doc]:
+    """Tables of a stored solution's runs, also where its document is older than that it names them."""
+    solution = store.solution(solution_id)
+    runs = [r.start_doc for r in store.runs(solution.campaign_id) if r.id in set(solution.run_ids)]
+    told = [start.get("imported", start).get("table", {}) for start in runs]
+    return distinct([t for t in told if "crc" in t] + tables_of(solution.doc))
+
+
+def images_of(store: Store) -> Images:
+    """Images by their CRC, as far as this database has met them: written by a push, or in force before one."""
+    found = {t.crc: t.image for t in store.tables()}
+    for name in {store.machine(t.machine_id).name for t in store.tables()}:
+        for entry in read_entries(store, name):
+            if "base_image" in entry.doc:
+                found[int(entry.doc["base_crc"])] = bytes.fromhex(entry.doc["base_image"])
+    return found.get
+
+
+def no_images(crc: int) -> bytes | None:
+    """For a solution that comes from no database."""
+    return None
+
+
+def check_fresh(tables: list[Doc], images: Images, *, said_so: bool = False) -> bool:
+    """Refuse a solution that was measured with a correction in force; gives whether it is known that there was none.
+
+    Parameters
+    ----------
+    tables : list of dict
+        From `distinct`.
+    images : callable
+        Image of a CRC, or None.
+    said_so : bool
+        A person says that no correction was in force: believed where nothing else is known, never against what is known.
+
+    Raises
+    ------
+    FormatRefused
+        A table corrected something, or nobody knows whether it did.
+    """
+    for table in tables:
+        image = images(table["crc"])
+        acts = table.get("acting")
+        if image is not None:
+            acts = int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
+        name = f"table {table['crc']:08X}"
+        if acts:
+            raise FormatRefused(f"this solution was measured while {name} corrected the machine: alone it would take that away", REMEDY)
+        if acts is None and not said_so:
+            raise FormatRefused(f"this solution was measured with {name}, and nothing says whether it corrected anything", SAY_SO)
+    return bool(tables) or said_so

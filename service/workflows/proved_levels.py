@@ -1,0 +1,81 @@
+"""What a machine's controller was proved to do for a safe push, as the store keeps it beside the proof of its sign.
+
+A proof belongs to one controller with one firmware: after another was put in, nothing is proved any more. What was never proved counts
+as far as the protocol's status block shows it, and that is never enough for a push that nobody attends.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import asdict, dataclass, fields
+
+from drivers.api import Controller, DeviceInfo
+from service.errors import TableRefused
+from service.push.levels import Capabilities, objection
+from service.site import Site
+from service.storage.records import Doc
+from service.storage.store import Store
+
+KIND = "levels"
+HINT = "what this controller does for a safe push was never proved{}: abbe comp commission does that, until then a person has to attend"
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What counts for a push now. ``hint``: what has to be said about it; empty when it was proved."""
+
+    capabilities: Capabilities
+    hint: str
+
+    @property
+    def level(self) -> int:
+        """Capability level (`service.push.levels`)."""
+        return self.capabilities.level
+
+
+def identity(info: DeviceInfo) -> Doc:
+    """What a proof is bound to beside the machine's name; the boot id is not in it, a restart changes nothing that was proved."""
+    return {"model": info.model, "serial": info.serial_no, "firmware": info.firmware}
+
+
+def flags_of(capabilities: Capabilities) -> dict[str, bool]:
+    """The flags by name."""
+    return asdict(capabilities)
+
+
+def last_proof(store: Store, site: Site) -> Doc | None:
+    """Document of the last commissioning of this machine's controller; None if there was none."""
+    ids = {c.id for c in store.campaigns() if store.machine(c.machine_id).name == site.name}
+    last = [s for s in store.solutions() if s.kind == KIND and s.campaign_id in ids][-1:]
+    return dict(last[0].doc) if last else None
+
+
+async def standing(controller: Controller, store: Store, site: Site) -> Standing:
+    """Find out what counts for a push into this controller, as it is now."""
+    info = await controller.identify()
+    doc = await asyncio.to_thread(last_proof, store, site)
+    if doc is not None and doc["identity"] == identity(info):
+        return Standing(Capabilities(**{f.name: doc["flags"].get(f.name) is True for f in fields(Capabilities)}), "")
+    return Standing(await _visible(controller), HINT.format("" if doc is None else " since it is another one, or has another firmware"))
+
+
+async def _visible(controller: Controller) -> Capabilities:
+    """What can be seen without a test: two banks, a generation and a boot id in the status block. Nothing of it is proved."""
+    now = await controller.comp_status()
+    banks = now.active_bank in (0, 1) and now.bank_state[now.active_bank] != 0
+    return Capabilities(two_banks=banks, generation=now.gen != 0, boot_id=now.boot_id != 0)
+
+
+async def check_level(controller: Controller, store: Store, site: Site, *, attended: bool = True) -> str:
+    """Refuse before anything is measured for a table that could not be pushed; gives the hint that has to be said.
+
+    Raises
+    ------
+    TableRefused
+        This controller allows no such push.
+    """
+    found = await standing(controller, store, site)
+    no = objection(found.level, attended=attended)
+    if no:
+        raise TableRefused(no, "nothing was written")
+    return found.hint

@@ -1,0 +1,187 @@
+"""A person orders the table back that was in force before: a push of its own, through the same machine, into the same journal.
+
+No probe and no verification is measured, because there is nothing to find out: the image is byte for byte one that the journal knows to
+have been in force, verified or put there by a person. Everything else is as for any push: interlocks, lease, read-back twice,
+compare-and-swap, and the way back if it breaks off.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+
+from drivers.api import Controller
+from drivers.cnc.tables import crc32
+from service.errors import StoreError, TableMismatch, TableRefused
+from service.push.book import read_entries
+from service.push.entries import Entry, Journal, JournalBroken, check_chain, facts
+from service.push.operations import Verdict
+from service.push.states import TERMINAL, State
+from service.site import Site
+from service.storage.store import Store
+from service.workflows.base_table import Base, read_base
+from service.workflows.commission import check_commissioned
+from service.workflows.proposals import by_whom
+from service.workflows.pushing import Pushed, Pushing, Questions, WantedAgain
+from service.workflows.recover import recover
+from service.workflows.unverified import unverified_crcs
+
+KIND = "rollback"
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A table that was in force, as the journal holds it in full, and how the journal knows it."""
+
+    image: bytes
+    meaning: str
+    how: str
+
+
+@dataclass(frozen=True, slots=True)
+class Back:
+    """The push that brought a table back, and which table that is."""
+
+    pushed: Pushed
+    how: str
+
+
+async def rollback(controller: Controller, store: Store, site: Site, to: int | None = None) -> Back | None:
+    """Make a table active again that was in force before.
+
+    Parameters
+    ----------
+    to : int, optional
+        The table that was in force when this push had ended; 0: before the first push. Default: before the last kept push, which must have
+        brought the table that is in force now.
+
+    Returns
+    -------
+    Back or None
+        None: that table is in force already, nothing was written.
+
+    Raises
+    ------
+    TableRefused
+        The journal knows no such table.
+    TableMismatch
+        The table in force is not one that the journal knows: a person must look first.
+    StoreError
+        The journal is not what was written.
+    PushNotBegun, StillActive
+        As of any push.
+    """
+    await recover(controller, store, site)
+    entries = await asyncio.to_thread(read_entries, store, site.name)
+    again = await asyncio.to_thread(_rollbacks, store)
+    if not entries:
+        raise TableRefused("no push of this machine is in the journal: there is nothing to take back", "nothing was written")
+    base = await read_base(controller)
+    check_known(entries, base)
+    wanted = table_after(entries, to) if to is not None else table_before_last_kept(entries, base, again)
+    if wanted.image == base.image:
+        return None
+    await check_commissioned(controller, store, site)  # "was in force" was true of a control: nobody knows what another one makes of it
+    why = f"not measured: byte for byte {wanted.how}; ordered back by a person"
+
+    def reasons() -> list[str]:
+        return [] if wanted.image in known_images(entries) else ["UNKNOWN: the journal does not know this table as one that was in force"]
+
+    async def in_force_before() -> Verdict:
+        return Verdict(not reasons(), why)
+
+    questions = Questions(reasons, f"{by_whom()}: rollback", in_force_before, in_force_before)
+    doc = {"kind": KIND, "to": to, "how": wanted.how}
+    pushed = await Pushing(controller, store, site).bring(WantedAgain(wanted.image, wanted.meaning, base, doc), questions)
+    if not pushed.kept:
+        raise TableRefused(
+            f"the table was not brought back: {pushed.why}", "the table of before is in force; look at the cause, then again"
+        )
+    return Back(pushed, wanted.how)
+
+
+def _rollbacks(store: Store) -> frozenset[int]:
+    return frozenset(t.id for t in store.tables() if t.doc.get("kind") == KIND)
+
+
+def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
+    """Journals of all pushes of a machine, by number.
+
+    Raises
+    ------
+    StoreError
+        The chain is broken: an entry was changed, removed or swapped.
+    """
+    try:
+        check_chain(entries)
+    except JournalBroken as error:
+        raise StoreError(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
+    numbers = sorted({e.push for e in entries})
+    return {n: tuple(e for e in entries if e.push == n) for n in numbers}
+
+
+def _base(journal: Journal, how: str) -> Known:
+    f = facts(journal)
+    return Known(bytes.fromhex(f["base_image"]), str(f["base_meaning"]), how)
+
+
+def _left(journal: Journal) -> Known:
+    """What was in force when a push had ended."""
+    last, f = journal[-1], facts(journal)
+    if last.state is State.KEEP:
+        return Known(bytes.fromhex(f["image"]), str(f["meaning"]), f"the table that push {last.push} brought and kept")
+    if last.state in TERMINAL - {State.OPERATOR, State.ACCEPTED}:
+        return _base(journal, f"the table that was in force before and after push {last.push}")
+    raise TableRefused(f"push {last.push} ended {last.state}: the journal does not hold the table that was in force then", "name another")
+
+
+def known_images(entries: list[Entry]) -> set[bytes]:
+    """All tables that were in force, verified or put there by a person: bases, and what was kept."""
+    found, refuted = set(), unverified_crcs(entries)
+    for journal in pushes_of(entries).values():
+        f = facts(journal)
+        if int(f["base_crc"]) not in refuted:
+            found.add(bytes.fromhex(f["base_image"]))
+        if journal[-1].state is State.KEEP:
+            found.add(bytes.fromhex(f["image"]))
+    return found
+
+
+def check_known(entries: list[Entry], base: Base) -> None:
+    """What a person or another program put there is never overwritten without a look at it.
+
+    Raises
+    ------
+    TableMismatch
+        The table in force is neither known as one that was in force nor as one that a person accepted.
+    """
+    accepted = {e.doc["accepted_crc"] for e in entries if e.state is State.ACCEPTED}
+    if base.image not in known_images(entries) and crc32(base.image) not in accepted:
+        raise TableMismatch(
+            f"the table in force ({base.crc:08X}) is not one that the push journal knows",
+            "look at the controller; nothing was written",
+        )
+
+
+def table_after(entries: list[Entry], push: int) -> Known:
+    """The table that was in force when a push had ended; 0: before the first."""
+    journals = pushes_of(entries)
+    if push == 0 and journals:
+        return _base(next(iter(journals.values())), "the table that was in force before the first push")
+    if push not in journals:
+        raise TableRefused(f"there is no push {push} of this machine", "abbe comp show lists what was pushed; nothing was written")
+    return _left(journals[push])
+
+
+def table_before_last_kept(entries: list[Entry], base: Base, rollbacks: frozenset[int]) -> Known:
+    """The table before the last kept push, if that one is in force and was no rollback itself."""
+    kept = [j for j in pushes_of(entries).values() if j[-1].state is State.KEEP]
+    if not kept:
+        raise TableRefused("no push of this machine was kept: there is nothing to take back", "nothing was written")
+    last = kept[-1]
+    f, number = facts(last), last[-1].push
+    if int(f["table"]) in rollbacks:
+        raise TableRefused(f"the last kept push ({number}) was a rollback itself", "say how far with --to PUSH; nothing was written")
+    if bytes.fromhex(f["image"]) != base.image:
+        raise TableRefused(f"the table in force is not the one of push {number}", "say which with --to PUSH; nothing was written")
+    return _base(last, f"the table that was in force before push {number}")
