@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.bench import discovery_report, trials_report
+from tests.bench import capture, discovery_report, parsers, trials_report
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS
 from tests.bench.facts import LIBRARIES
 
@@ -47,6 +47,10 @@ def text(found: dict) -> str:
         lines += trials_report.lines(found["trials"])
     if found["discovery"]:
         lines += discovery_report.lines(found["discovery"])
+    if found["capture"]:
+        lines += capture.lines(found["capture"])
+    if found["parsers"]:
+        lines += parsers.lines(found["parsers"])
     return "\n".join([*lines, "", "Times never fail this run, differing results do."])
 
 

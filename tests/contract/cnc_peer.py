@@ -11,7 +11,7 @@ import pytest
 from drivers.api import ControllerStatus
 from drivers.cnc.driver import ModbusController
 from drivers.cnc.registers import Bit
-from drivers.links.modbus import ModbusLink
+from drivers.links.modbus_link import ModbusLink
 from drivers.links.urls import parse_url
 
 READY = Bit.REMOTE | Bit.REFERENCED | Bit.DRIVES_ON | Bit.IN_POSITION
@@ -110,6 +110,10 @@ class Cnc:
             return
         self.log.append(("comp", command))
         self.peer.put(215, "HH", number, self.comp_result)
+        if command == 1 and not self.comp_result:
+            self.peer.put(213 + values[2], "H", 2)
+        if command in (3, 4) and not self.comp_result:
+            self.peer.put(217, "HH", *(values[7:9] if command == 3 else (0, 0)))
         if command == 2 and not self.comp_result:
             self.peer.words[208] = bank
 

@@ -16,6 +16,7 @@ import pytest
 
 from tests.contract.cnc_peer import cnc as cnc  # fixtures
 from tests.contract.cnc_peer import controller as controller
+from tests.contract.link_peer import link as link
 
 Trick = Callable[["Exchange"], Awaitable[None]]
 

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.ballbar import driver as module
 from drivers.ballbar.driver import SerialBallBar
-from drivers.errors import BadFrame, LinkDown, Rebooted, Refused, ReplyTimeout
+from drivers.errors import BadFrame, LinkDown, LossyLine, Rebooted, Refused, ReplyTimeout
 from drivers.links.serial_link import ByteLink
 from drivers.links.urls import SocketUrl, parse_url
 from drivers.registry import open_ballbar
@@ -71,8 +71,9 @@ async def test_gap_duplicates_and_garbage(bar_peer, bar):
         bar_peer.send(bar_peer.sample(0) + b"\xa5\x5a\x01\x12noise" + bar_peer.sample(1) * 2 + bar_peer.sample(5) + bar_peer.sample(6))
 
     bar_peer.on_start = misbehave
-    async with bar.stream(1000) as batches:
-        assert await collect(batches, 4) == ([0, 1, 5, 6], 3)
+    with pytest.raises(LossyLine, match="3 of 7"):
+        async with bar.stream(1000) as batches:
+            assert await collect(batches, 4) == ([0, 1, 5, 6], 3)
     assert bar.counters.duplicates == 1
     assert bar.counters.bad_bytes == 9
 
@@ -187,14 +188,15 @@ async def test_a_slow_consumer_hears_what_it_missed(bar_peer, bar, monkeypatch):
     bar_peer.on_start = send_many
     async with bar.stream(1000) as batches:
         async with asyncio.timeout(5):
-            while bar.counters.overflow < 720:  # noqa: ASYNC110 - nothing to wait for: this consumer is the slow one
+            while bar.counters.overflow < 800:  # noqa: ASYNC110 - nothing to wait for: this consumer is the slow one
                 await asyncio.sleep(0.01)
+        first = await anext(batches)  # makes room: cut into pieces, the samples may have filled the buffer to its brim
         bar_peer.send(bar_peer.sample(900))
-        delivered, missing, last = 0, 0, 0
+        delivered, missing, last = len(first.samples), first.missing, first.samples[-1].seq
         while last < 900:
             batch = await anext(batches)
             delivered, missing, last = delivered + len(batch.samples), missing + batch.missing, batch.samples[-1].seq
-    assert missing >= bar.counters.overflow >= 720
+    assert missing >= bar.counters.overflow >= 800
     assert delivered + missing == 901
 
 
@@ -221,19 +223,23 @@ async def test_cancel_at_every_loop_step_leaves_the_box_stopped(bar_peer, bar):
                 pass
 
     await bar.identify()
-    for turns in range(40):
+    started = 0
+    for turns in range(400):
+        if started >= 10:
+            break
         bar_peer.commands.clear()
         task = asyncio.create_task(consume())
         for _ in range(turns):
-            await asyncio.sleep(0)
+            await asyncio.sleep(0 if turns < 20 else 0.0002)  # answers come from a thread
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task
         await bar.identify()  # a full turn: everything sent before has arrived
         kinds = [kind for kind, _ in bar_peer.commands]
         if START in kinds:
+            started += 1
             assert STOP in kinds[kinds.index(START) :]
-    assert START in kinds
+    assert started == 10
 
 
 async def test_only_one_stream_at_a_time(bar):

@@ -188,6 +188,46 @@ async def test_acknowledged_but_not_active_is_a_fault(controller, cnc):
         await controller.activate(1, expect_crc=1, expect_gen=1, owner=7)
 
 
+class Another:
+    """Another program, whose command takes the number of the first of ours and has this result; the rest is executed as always."""
+
+    def __init__(self, cnc, result: int, holder: int) -> None:
+        self._cnc, self._honest, self._first = cnc, cnc.comp, (result, holder)
+        self.passed_over: list[int] = []
+
+    def __call__(self, values) -> None:
+        if self.passed_over:
+            self._honest(values)
+            return
+        self.passed_over.append(values[1])
+        result, holder = self._first
+        self._cnc.peer.put(215, "HH", values[0], result)
+        self._cnc.peer.put(217, "I", holder)
+
+
+async def test_a_lease_whose_number_another_program_took_is_not_believed(controller, cnc):
+    cnc.comp = Another(cnc, 0, 9)
+    with pytest.raises(Refused, match="another owner"):
+        await controller.lease(7, 60_000)
+    assert (cnc.comp.passed_over, cnc.log) == ([3], [])  # and whoever has it is not disturbed by a second try
+
+
+@pytest.mark.parametrize("command", ["lease", "release", "seal"])
+async def test_a_command_that_was_passed_over_is_sent_again_under_the_next_number(controller, cnc, command):
+    cnc.peer.put(217, "I", 7)
+    another = cnc.comp = Another(cnc, 7, 7)
+    number, words = {"seal": (1, (1, 7)), "lease": (3, (7, 1000)), "release": (4, (7,))}[command]
+    await getattr(controller, command)(*words)
+    assert (another.passed_over, cnc.log) == ([number], [("comp", number)])
+
+
+async def test_an_activation_that_was_passed_over_is_told_and_never_sent_again(controller, cnc):
+    cnc.comp = Another(cnc, 7, 7)
+    with pytest.raises(DeviceFault, match="took its number: it was not executed"):
+        await controller.activate(1, expect_crc=1, expect_gen=1, owner=7)
+    assert (cnc.comp.passed_over, cnc.log) == ([2], [])
+
+
 async def test_impossible_commands_never_reach_the_controller(controller, cnc):
     with pytest.raises(Refused):
         await controller.seal(2, 7)

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import DeviceFault, LinkDown, Rebooted, Refused, ReplyTimeout, WrongDevice
 from drivers.laser.driver import ModbusLaser
-from drivers.links.modbus import ModbusLink
+from drivers.links.modbus_link import ModbusLink
 from drivers.links.urls import parse_url
 from drivers.registry import open_laser
 

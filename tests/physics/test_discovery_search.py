@@ -16,7 +16,7 @@ from models.discovery.case import Case, CaseRun, Role
 from models.discovery.discover import discover, fairly
 from models.discovery.noise import Colour, unscaled
 from models.discovery.scene import scene_of
-from models.discovery.selection import Contest, weighed
+from models.discovery.selection import Contest, joined, weighed
 from models.discovery.space import Space
 from models.effects.catalogue import CATALOGUE
 from models.effects.path import Path, driven, standing
@@ -61,8 +61,8 @@ def memory_noise(rng: np.random.Generator, sd_mm: float) -> F1:
     return np.asarray(sd_mm * (np.sqrt(0.9) * rng.normal(size=N) + np.sqrt(0.1) * slow))
 
 
-def campaign(backlash_um: float = 0.0, step_um: float = 0.0, seed: int = 1) -> Case:
-    """Two cups, three planes, both directions, two feeds; lost motion of X; or X steps at 900 s."""
+def campaign(backlash_um: float = 0.0, step_um: float = 0.0, seed: int = 1, late_ms: float = 0.0) -> Case:
+    """Two cups, three planes, both directions, two feeds; lost motion of X; X steps at 900 s; or Y trails the others."""
     rng, t0 = np.random.default_rng(seed), 60.0
     runs: list[CaseRun] = []
     for setup, cup in CUPS.items():
@@ -79,6 +79,7 @@ def campaign(backlash_um: float = 0.0, step_um: float = 0.0, seed: int = 1) -> C
                     u = around / R
                     moved = SCALES * (q - cup) - OFFSETS[setup]
                     moved[:, 0] += behind
+                    moved[:, 1] -= 1e-3 * late_ms * np.gradient(q[:, 1], t)
                     moved[:, 0] += 1e-3 * step_um * ((t > 900.0).astype(float) - float(t_set > 900.0))
                     reading = np.linalg.norm(around + moved, axis=1) - R + 0.002 + memory_noise(rng, 2e-4)
                     runs.append(run(f"r{len(runs):02d}", setup, cup, q, t, feed, direction, t_set, u, np.round(reading, 4)))
@@ -136,6 +137,17 @@ def test_the_better_of_two_names_stands_once_both_may_bend() -> None:
     assert [f.pick.label for f in found] == ["backlash:X"]
     assert len(rivals) == 1
     assert "servo_mismatch:X" not in [r.pick.label for r in rivals[0]]  # far behind it
+
+
+def test_two_axes_that_lead_give_way_to_the_one_that_trails() -> None:
+    case = campaign(late_ms=0.2)
+    scene = scene_of(case, baseline_of(case))
+    contest = Contest.of(scene, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(scene, []), [], 40)}
+    lead = [by["servo_mismatch:X"], by["servo_mismatch:Z"]]
+    assert [p.label for p in joined(contest, lead)] == ["servo_mismatch:Y"]
+    other = [by["servo_mismatch:Y"], by["backlash:X"]]
+    assert joined(contest, other) == other  # of two kinds: nothing to join
 
 
 def test_where_nobody_judges_nothing_is_needed_or_not() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from models.arrays import F1
 from models.discovery.variance import VarianceFinding, candidates, extra_variance
 from models.discovery.variance_mixture import contaminated
 from models.effects.path import Path
-from tests.physics.discovery_paths import campaign, noise
+from tests.physics.discovery_paths import bar, campaign, circle, noise
 
 PATHS = campaign()
 SIGMA = tuple(4e-4 if p.kind == "bar" else 3e-4 for p in PATHS)
@@ -85,6 +86,16 @@ def test_mean_that_is_left_is_no_vibration() -> None:
     assert not [f for f in found(only_bars(smooth)) if f.name == "vibration"]
 
 
+@pytest.mark.parametrize("feeds", [(1500.0,), (1500.0, 2600.0)])
+def test_what_comes_back_at_every_turn_of_the_bar_is_no_vibration(feeds: tuple[float, ...]) -> None:
+    """Nine lobes of a ball: a frequency in time as well, where all runs have one feed; only a run that meets them otherwise could tell."""
+    paths = tuple(bar(f"{f:.0f}{k}", circle((0, 1)), 620.0 + 90.0 * k, feed=f) for f in feeds for k in range(4))
+    sigma = (4e-4,) * len(paths)
+    angles = [np.arctan2(p.look[:, 1], p.look[:, 0]) for p in paths]
+    rest = tuple(e + 1e-3 * np.sin(9.0 * a) * p.look[:, 0] / s for e, a, p, s in zip(noise(paths, 5), angles, paths, sigma, strict=True))
+    assert "vibration" not in [f.name for f in extra_variance(paths, rest, sigma)]
+
+
 def test_mixture_needs_more_than_one_reading() -> None:
     rest = np.random.default_rng(8).standard_normal(300)
     rest[17] = 4.5
@@ -98,3 +109,17 @@ def test_leverage_is_taken_back() -> None:
     a = [f.evidence for f in candidates(PATHS, rest, SIGMA)]
     b = [f.evidence for f in candidates(PATHS, squeezed, SIGMA, leverage=leverage)]
     assert np.allclose(a, b, rtol=1e-6, atol=1e-6)
+
+
+def test_a_place_where_the_machine_is_off_is_no_lost_beam() -> None:
+    """Two runs of each diagonal pass the same corner; a lost beam is not lost again there."""
+    laser = [p for p in PATHS if p.kind == "laser"]
+    corner = laser[0].at.q_mm[12]
+
+    def bump(p: Path) -> F1:
+        return np.asarray(4e-3 * np.exp(-0.5 * np.sum((p.at.q_mm - corner) ** 2, axis=1) / 15.0**2) * (p.kind == "laser"))
+
+    first = found([bump(p) for p in PATHS])[0]
+    assert first.label == "unnamed_place"
+    assert first.where.position_mm is not None
+    assert np.linalg.norm(np.array(first.where.position_mm) - corner) < 30.0

@@ -41,14 +41,18 @@ def machine_toml(ready: dict[str, Any], extra: str = "") -> str:
     lines = ['name = "sim"', f'chain = "{m["chain"]}"', f"tool_mm = {json.dumps(m['tool_mm'])}", "[stroke_mm]"]
     lines += [f"{a} = {json.dumps(v)}" for a, v in m["stroke_mm"].items()]
     lines += ["[pivots_mm]"] + [f"{a} = {json.dumps(v)}" for a, v in m["pivots_mm"].items()]
+    lines += ["[calibration]", "ballbar = 2099-12-31", "laser = 2099-12-31"]
     lines += ["[devices]"] + [f'{k} = "{ready[k]}"' for k in ("cnc", "ballbar", "laser", "fixture")]
     return "\n".join(lines) + "\n" + extra + "\n"
 
 
+SIMULATORS = (sys.executable, "-m", "simulators")
+
+
 @contextmanager
-def simulated(folder: Path, *args: str, extra: str = "") -> Iterator[Sims]:
+def simulated(folder: Path, *args: str, extra: str = "", program: tuple[str, ...] = SIMULATORS) -> Iterator[Sims]:
     """Simulators with their machine file in a folder; they end with the block."""
-    words = [sys.executable, "-m", "simulators", "--watch-stdin", "--link-dir", str(folder), *args]
+    words = [*program, "--watch-stdin", "--link-dir", str(folder), *args]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
     assert process.stdout is not None

@@ -50,10 +50,10 @@ def test_laser_beam_lost(abbe, start_sims):
     # The first readings of a line of 42 are stored: the beam goes while it is being read, not while it is zeroed for the next one.
     wait_for(lambda: 2 <= laser_chunks(sims.machine_file.parent) <= 20, 60, "the first readings of a laser line")
     sims.ask("beam", blocked=True)
-    one_line(process, "DRV-006", "beam")
+    one_line(process, "ILK-007", "beam")
     run = runs_of(sims.machine_file.parent)[-1]
     assert (run.status, run.test) == ("failed", "laser_diagonal")
-    assert "DRV-006" in run.reason
+    assert "ILK-007" in run.reason
 
 
 @pytest.mark.parametrize(("fault", "word"), [("estop", "e-stop"), ("door", "door")])

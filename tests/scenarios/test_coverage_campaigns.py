@@ -7,6 +7,7 @@ outside once in 370 times, a coverage more than six standard errors outside the 
 or a scatter of wrong intervals would excuse itself.
 """
 
+import os
 from functools import cache
 
 import pytest
@@ -19,7 +20,10 @@ FIRST_SEED, MACHINES = 2001, 8
 LOW, HIGH, ERRORS = 0.93, 0.97, 3.0
 LARGEST_SE = 0.02
 
-pytestmark = pytest.mark.scenario
+pytestmark = [
+    pytest.mark.scenario,
+    pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="forty campaigns: ABBE_TEST_LONG=1 counts them"),
+]
 
 
 @cache

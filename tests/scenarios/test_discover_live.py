@@ -98,7 +98,7 @@ def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monk
         assert code == 0, err
         assert f": {int(again)} of 1 runs are measured" in out
         assert [list(seen) for seen in search.seen] == [["helix", "n1-feed-2"]]  # the first search was not done again
-        assert [state[:2] for state in added()] == [("n1-feed", "incomplete"), ("n1-feed-2", "complete")]
+        assert [state[:2] for state in added()] == [("n1-feed", "interrupted"), ("n1-feed-2", "complete")]
     _, first_s, set_s = search.seen[0]["n1-feed-2"]
     with Store.open(url) as store:
         again = load_run(store, "n1-feed-2")

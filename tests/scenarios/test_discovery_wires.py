@@ -2,8 +2,8 @@
 
 measure -> search -> model book -> measure anew -> the prediction holds. The simulator's truth is opened by the test only.
 
-Every scenario takes half a minute to a minute and a half. By default one family, one machine without a secret (by the command) and a stop
-are played; ``ABBE_TEST_LONG=1`` plays all of them.
+Every scenario takes half a minute to a minute and a half. By default one machine, by the command, and a stop are played;
+``ABBE_TEST_LONG=1`` plays all of them.
 """
 
 import asyncio
@@ -51,10 +51,10 @@ NAMED = {
     "instrument": "bar_thermal",
 }
 LONG = pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="a minute each: ABBE_TEST_LONG=1 plays all families")
-MARKS = {"structure": [LONG], "instrument": [LONG], "thermal": [LONG]}
 
 
-@pytest.mark.parametrize("family", [pytest.param(f, marks=MARKS.get(f, [])) for f in NAMED])
+@LONG
+@pytest.mark.parametrize("family", NAMED)
 def test_what_a_machine_hides_is_named_and_the_model_with_it_holds_on_a_new_measurement(family, tmp_path):
     found = played(family, tmp_path / "kept")
     said = "\n".join(story(found))

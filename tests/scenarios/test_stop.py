@@ -21,7 +21,58 @@ def measuring(abbe, sims):
     return process
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_ctrl_c_stops_at_a_safe_place_and_the_same_campaign_goes_on(abbe, start_sims):
+    """The path is held, the run closed as stopped; `--resume` drives back along the path and measures it again."""
+    sims = start_sims("--speed", "60")
+    process = abbe("measure", str(sims.machine_file), *HELIX, "--name", "june")
+    wait_for(lambda: bar_chunks(sims.machine_file.parent) > 1, 60, "samples of the helix")
+    _, err = interrupt(process, signal.SIGINT)
+    assert process.returncode == 130, err
+    assert axes_at_rest(sims)
+    assert err.splitlines()[-1] == "stopped: `abbe measure MACHINE.toml --resume CAMPAIGN` goes on from here"
+    (run,) = runs_of(sims.machine_file.parent)
+    assert (run.label, run.status) == ("helix", "stopped")
+    again = abbe("measure", str(sims.machine_file), "--resume", "june")
+    out, err = again.communicate(timeout=60)
+    assert again.returncode == 0, err
+    assert out == "measured: campaign 'june', 1 runs\n"
+    assert "set-up B1 is still mounted: helix begins again" in err
+    assert [(r.label, r.status) for r in runs_of(sims.machine_file.parent)] == [("helix", "stopped"), ("helix-2", "complete")]
+
+
+def test_sigusr1_pauses_and_lets_go_on(abbe, start_sims):
+    sims = start_sims("--speed", "60")
+    process = abbe("measure", str(sims.machine_file), *HELIX, "--name", "june")
+    wait_for(lambda: bar_chunks(sims.machine_file.parent) > 1, 60, "samples of the helix")
+    process.send_signal(signal.SIGUSR1)
+    wait_for(lambda: [r.status for r in runs_of(sims.machine_file.parent)] == ["aborted"], 20, "the run in hand is closed as evidence")
+    assert axes_at_rest(sims)
+    process.send_signal(signal.SIGUSR1)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert [(r.label, r.status) for r in runs_of(sims.machine_file.parent)] == [("helix", "aborted"), ("helix-2", "complete")]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("--helix", "300,250,100,140"), "error SEQ-007: campaign 'june' was begun with another recipe"),
+        (("--recipe", "quick-check"), "error SEQ-007: campaign 'june' was begun with another recipe"),
+    ],
+)
+def test_another_recipe_is_refused_in_one_line(abbe, start_sims, change, said):
+    sims = start_sims("--speed", "60")
+    process = abbe("measure", str(sims.machine_file), *HELIX, "--name", "june")
+    wait_for(lambda: bar_chunks(sims.machine_file.parent) > 1, 60, "samples of the helix")
+    interrupt(process, signal.SIGINT)
+    again = abbe("measure", str(sims.machine_file), "--resume", "june", *change)
+    _, err = again.communicate(timeout=60)
+    assert again.returncode == 2
+    (line,) = err.splitlines()
+    assert line.startswith(said)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_stops_the_axes(abbe, start_sims, number, code):
     sims = start_sims("--speed", "5")
     process = measuring(abbe, sims)
@@ -41,7 +92,7 @@ def test_a_second_ctrl_c_does_not_cut_the_stop_short(abbe, start_sims):
     _, err = interrupt(process, signal.SIGTERM)
     assert axes_at_rest(sims)
     assert process.returncode in (130, 143, -signal.SIGTERM), err  # the second may come after the stop was done
-    assert runs_of(sims.machine_file.parent)[-1].status == "aborted"
+    assert runs_of(sims.machine_file.parent)[-1].status in ("stopped", "aborted")  # whichever of the two was first
 
 
 def test_a_closed_terminal_stops_the_axes(start_sims):

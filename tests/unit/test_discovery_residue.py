@@ -50,6 +50,9 @@ def effect(label: str, evidence: float) -> NamedEffect:
         ("axis_thermal_growth:X", "positioning_nonlinear:X", 0.022, True),
         ("axis_thermal_growth:X", "positioning_nonlinear:Y", 0.022, False),
         ("straightness:EYX", "spindle_thermal_drift:Z", 0.022, False),
+        ("contour_lag", "servo_mismatch:X", 0.029, True),
+        ("contour_lag", "servo_mismatch:X", 0.031, False),
+        ("servo_mismatch:Y", "servo_mismatch:X", 0.02, False),  # two axes may be off, each by its own delay
         ("vibration:Z", "stick_slip:X", 0.007, False),  # the rule compares with effects of the mean
     ],
 )

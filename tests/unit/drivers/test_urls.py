@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import BadUrl
-from drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
+from drivers.links.urls import PARITIES, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
 
 paths = (
     st.text(st.characters(codec="utf-8", exclude_categories=["C"]), min_size=1)
@@ -18,9 +18,10 @@ hosts = st.one_of(st.from_regex(r"[a-z]([a-z0-9-]{0,20}[a-z0-9])?(\.[a-z]{2,5})?
 ports = st.integers(1, 65535)
 units = st.integers(1, 247)
 bauds = st.integers(1, 12_000_000)
+numbers = st.none() | st.integers(1, 2**32 - 1)
 urls = st.one_of(
-    st.builds(SerialUrl, paths, bauds),
-    st.builds(SocketUrl, hosts, ports),
+    st.builds(SerialUrl, paths, bauds, st.sampled_from(PARITIES), numbers),
+    st.builds(SocketUrl, hosts, ports, numbers),
     st.builds(ModbusTcpUrl, hosts, ports, units),
     st.builds(ModbusRtuUrl, paths, bauds, units),
     st.builds(FixtureTcpUrl, hosts, ports),
@@ -33,7 +34,9 @@ urls = st.one_of(
     [
         ("serial:///dev/ttyUSB0?baud=115200", SerialUrl("/dev/ttyUSB0", 115200)),
         ("serial:///dev/ttyUSB0", SerialUrl("/dev/ttyUSB0", 460800)),
+        ("serial:///dev/x?parity=even&serial_no=4711", SerialUrl("/dev/x", 460800, "even", 4711)),
         ("socket://10.0.0.5:4001", SocketUrl("10.0.0.5", 4001)),
+        ("socket://10.0.0.5:4001?serial_no=4711", SocketUrl("10.0.0.5", 4001, 4711)),
         ("socket://[::1]:4001", SocketUrl("::1", 4001)),
         ("modbus+tcp://cnc.local:502?unit=3", ModbusTcpUrl("cnc.local", 502, 3)),
         ("modbus+tcp://cnc.local:502", ModbusTcpUrl("cnc.local", 502, 1)),
@@ -70,6 +73,9 @@ def test_understood(text, url):
         ("serial:///dev/x?baud=99999999999", "baud"),
         ("serial:///dev/x?baud=1&baud=2", "twice"),
         ("serial:///dev/x?baud", "key=value"),
+        ("serial:///dev/x?parity=mark", "parity='mark' is none of none, even, odd"),
+        ("serial:///dev/x?serial_no=0", "serial_no='0'"),
+        ("socket://h:1?serial_no=4294967296", "serial_no"),
         ("serial:///dev/x?speed=1", "unknown key 'speed'"),
         ("serial:///dev/x\n", "control characters"),
         ("modbus+tcp://h:502?unit=248", "unit='248'"),

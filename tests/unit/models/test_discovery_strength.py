@@ -78,3 +78,21 @@ def test_a_time_constant_is_less_sure_than_its_fit_and_a_pitch_is_not() -> None:
     assert warm["tau_s"][0] == 1000.0
     assert warm["tau_s"][1] == pytest.approx(np.hypot(40.0, 1000.0 * TIME_TRUE_TO_FORM))
     assert shape_of(Pick(BY_NAME["cyclic_error"], "X", {"pitch_mm": 10.0}), {"pitch_mm": 0.01})["pitch_mm"] == (10.0, 0.01)
+
+
+def test_what_a_sensor_followed_is_part_of_a_swing_and_what_is_constant_in_it_is_not() -> None:
+    """Air that swings by 6 K and stands 5 K above where the sensor began; the wave beside the sensor has next to nothing left to hold."""
+    effect = BY_NAME["air_refraction"]
+    by = {form.name: form for form in effect.forms}
+    t = np.linspace(0.0, 1.3, 200)  # cycles
+    waves, ones = 2.0 * np.pi * t, np.ones(200)
+    columns = {
+        effect.signal: np.column_stack([np.sin(waves), np.cos(waves)]),
+        by["sensor"].signal: (5.0 + 6.0 * np.sin(waves))[:, None],
+        by["offset and drift"].signal: np.column_stack([ones, t]),
+    }
+    pick = Pick(effect, "", {"period_s": 5000.0}, forms=(by["sensor"],))
+    strength, u = strength_of(scene_of(columns), pick, np.array([0.1, 0.0, 1.0]), np.zeros((3, 3)))
+    assert strength == pytest.approx(6.1, abs=1e-6)
+    assert u > 0.3  # with the constant taken for a part of the swing the strength is another: that much is not known
+    assert u < 6.0

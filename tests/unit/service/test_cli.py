@@ -223,3 +223,20 @@ def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signa
     process.send_signal(number)
     assert process.wait(timeout=20) == code
     process.stdout.close()
+
+
+def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsys):
+    """Notes carry what safety rests on: a bar that still hangs in, a table that may be in force."""
+    from service.cli import app as module
+    from service.errors import DoorOpen
+
+    def fails(**_: object) -> None:
+        error = DoorOpen("the door is open", "close it")
+        error.add_note("cup and bar may still be mounted: take them out before anything moves")
+        raise error
+
+    monkeypatch.setattr(module, "app", fails)
+    assert cli.run(["check-config", "x"]) == 2
+    assert capsys.readouterr().err == (
+        "error ILK-003: the door is open - close it; cup and bar may still be mounted: take them out before anything moves\n"
+    )

@@ -73,7 +73,7 @@ def test_position_is_right_within_half_a_period(store: Store, campaign_id: int, 
 
 def test_document_is_complete(store: Store, campaign_id: int) -> None:
     run = stored(store, campaign_id, stream(), END)
-    assert list(run) == ["format", "campaign", "run_id", "test", "role", "machine", "setup", "columns"]
+    assert list(run) == ["format", "campaign", "run_id", "test", "role", "machine", "setup", "columns", "timing"]
     assert (run["format"], run["campaign"], run["run_id"], run["machine"]) == ("abbe-run/1", "c1", "r01", MACHINE)
     columns = run["columns"]
     assert {len(values) for values in columns.values()} == {1000}

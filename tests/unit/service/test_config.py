@@ -56,7 +56,7 @@ def test_values_and_defaults(file: Path) -> None:
     machine = loaded.machine
     assert (machine.name, machine.chain, machine.tool_mm) == ("VMC-1", "w-X-Y-b-Z-t", (0.0, 0.0, 120.0))
     assert (machine.stroke_mm.Z, machine.pivots_mm.X, machine.pivots_mm.Y) == ((0.0, 450.5), (300.0, 250.0, -150.0), (0.0, 0.0, 0.0))
-    assert (machine.limits.table_value_um, machine.limits.table_change_um, machine.limits.table_step_um) == (200.0, 50.0, 20.0)
+    assert (machine.limits.table_value_um, machine.limits.table_change_um, machine.limits.table_step_um) == (100.0, 50.0, 20.0)
     assert (machine.web.host, machine.web.port, machine.store.url) == ("127.0.0.1", 8080, "sqlite:///abbe.sqlite3")
     assert [(one.name, one.timezone, one.recipe) for one in machine.schedule] == [("nightly", "Europe/Berlin", "quick-check")]
     assert loaded.database_url == f"sqlite:///{file.parent / 'abbe.sqlite3'}"
@@ -106,7 +106,7 @@ BAD = [
     ("table_change_um = 50", 'table_change_um = "much"', "limits.table_change_um: expected a number, got 'much'"),
     ("table_change_um = 50", 'table_change_um = "50"', "limits.table_change_um: expected a number, got '50'"),
     ("table_change_um = 50", "temperature_c = [24, 18]", "limits.temperature_c: expected"),
-    ("table_change_um = 50", "qqq = 1", "unknown key 'limits.qqq' - valid keys here: feed_mm_min, table_change_um"),
+    ("table_change_um = 50", "qqq = 1", "unknown key 'limits.qqq' - valid keys here: continue_after, feed_mm_min, measurement_a"),
     ("[limits]", "[limit]", "unknown key 'limit' - did you mean 'limits'?"),
     ('name = "VMC-1"', 'name = "VMC-1"\nweb = 3', "web: expected a table of keys, got 3"),
     ("modbus+tcp://127.0.0.1:1502", "modbus+tcp://127.0.0.1", "devices: cnc = .*the port is missing"),
@@ -114,13 +114,23 @@ BAD = [
     ("modbus+tcp://127.0.0.1:1502", "socket://127.0.0.1:1502", "devices: cnc = .*expected modbus"),
     ("me:topsecret@127.0.0.1:1883", "me:topsecret@127.0.0.1:bad", "mqtt.url"),
     ('cron = "0 3 * * *"', 'cron = "0 3 * *"', r"schedule\[1\].cron: expected a cron expression"),
-    ('cron = "0 3 * * *"', "", r"key 'schedule\[1\].cron' is missing"),
+    ('cron = "0 3 * * *"', "", r"schedule\[1\]: expected either cron = ... or every_h = ..., got neither"),
     (
         "Europe/Berlin",
         "Europe/Atlantis",
         r"schedule\[1\].timezone: expected an IANA time zone .*, got 'Europe/Atlantis'",
     ),
     ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\ncorn = 1', r"unknown key 'schedule\[1\].corn' - did you mean 'cron'?"),
+    ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\nevery_h = 6', "expected either cron = ... or every_h = ..., got both"),
+    ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\ncatch_up = "all"', r"schedule\[1\].catch_up: expected 'skip' or 'once'"),
+    ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\nneeds = { warm = 3 }', r"unknown key 'schedule\[1\].needs.warm'"),
+    ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\nneeds = { operator = "present" }', "'nightly' needs an operator, expected .*staffed"),
+    (
+        "[[schedule]]",
+        '[[maintenance]]\nname="m"\ncron="0 3 * * *"\n[[schedule]]',
+        r"maintenance\[1\]: expected either cron and hours, or days",
+    ),
+    ("[[schedule]]", '[[staffed]]\nname="m"\ndays=["fri"]\nstart=25\nend=06:00:00\n[[schedule]]', r"staffed\[1\].start: expected"),
     ("[[schedule]]", '[[schedule]]\nname="nightly"\ncron="0 3 * * *"\n[[schedule]]', "two schedules are named 'nightly'"),
     ('name = "VMC-1"', "name = ", "not valid TOML: .*line 2"),
 ]

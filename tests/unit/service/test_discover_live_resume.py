@@ -22,12 +22,14 @@ from service import cli
 from service.errors import MeasurementFault
 from service.runs.codec import JSON_CODEC, encode_json
 from service.runs.columns import pack_columns
-from service.sequences.runner import MOVING
+from service.sequences.interlocks import DRIVES, MOVING, REFERENCED, REMOTE
 from service.storage.owner import Owner
 from service.storage.records import NewVersion
 from service.storage.store import Store
 from service.workflows.discover_live import rounds
 from tests.unit.service.discovery_bench import MACHINE, Search, circle, write_case
+
+READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
 
 WRITES = ("add_campaign", "start_run", "append_chunk", "finish_run", "add_discovery", "add_discovery_step")
 OLD = ("r01", "r02", "r03", "r04")
@@ -64,7 +66,7 @@ class Bench:
         self.measured: list[str] = []
         self.search = Asks()
         self.boot, self.writes = BOOT, 0
-        self.now_s, self.bits = 7000.0, 0
+        self.now_s, self.bits = 7000.0, READY
         self.left: int | None = None
         self._folder, self._patch = folder, monkeypatch
         self._file()
@@ -106,7 +108,10 @@ class Bench:
         async def comp_status() -> Any:
             return SimpleNamespace(boot_id=self.boot, bank_crc=(1, 2), active_bank=0)
 
-        yield SimpleNamespace(controller=SimpleNamespace(status=status, comp_status=comp_status))
+        async def abort() -> None:
+            """A hold that a killed process may have left is taken away; nothing moves here."""
+
+        yield SimpleNamespace(ballbar=None, laser=None, controller=SimpleNamespace(status=status, comp_status=comp_status, abort=abort))
 
     async def _measure_test(self, _session: Any, store: Store, _site: Any, campaign: Any, test: Any, *_rest: Any) -> int:
         number = 5 + len(self.measured)
@@ -280,7 +285,7 @@ def test_a_late_repeat_waits_until_it_is_late(bench: Bench, capsys: Any) -> None
 
 
 def test_nobody_is_asked_to_reach_into_a_machine_that_runs_a_path_to_its_end(bench: Bench, capsys: Any) -> None:
-    bench.bits = 1 << MOVING
+    bench.bits = READY | 1 << MOVING
     assert bench.live() == 2
     assert "error SEQ-002: the machine is moving" in capsys.readouterr().err
     assert bench.measured == []

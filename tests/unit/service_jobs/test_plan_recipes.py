@@ -18,7 +18,7 @@ from service.devices.session import DeviceUrls
 from service.errors import AbbeError, ConfigError
 from service.sequences.check import dry_run, dry_run_campaign
 from service.sequences.recipe_file import parse_recipe, read_recipe, recipe_text
-from service.sequences.recipes import Diagonal, Helix, Linear
+from service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
 from service.sequences.setups import shared_setups
 from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
 from service.site import Site, machine_doc
@@ -49,11 +49,22 @@ diagonals = st.builds(
     Diagonal, names, names, roles, st.sampled_from(list(DIAGONALS)), st.integers(1, 500), st.sampled_from(["XYZ", "ZYX", ""])
 )
 share = st.floats(0.0, 1.0)
-lines = st.builds(Linear, names, names, roles, st.integers(0, 2), n=st.integers(5, 1000), at=st.tuples(share, share))
+again = {"cycles": st.integers(1, 50), "overrun_mm": st.floats(0.0, 8.0)}
+lines = st.builds(
+    Linear, names, names, roles, st.integers(0, 2), n=st.integers(5, 1000), at=st.tuples(share, share), offset_share=st.just(0.3), **again
+)
+faces = st.builds(FaceDiagonal, names, names, roles, st.sampled_from(["XY", "YZ", "ZX"]), st.sampled_from(["pp", "np"]), at=share, **again)
+cups = (names, names, roles, st.tuples(millimetres, millimetres, millimetres), st.floats(1.0, 2000.0))
+places = st.builds(HelixPoints, *cups, points=st.integers(20, 2000), samples=st.integers(1, 1000), settle_s=st.floats(0.0, 60.0))
+angle = st.floats(0.0, 360.0)
+circles = st.builds(
+    Circle, *cups, st.sampled_from(["XY", "YZ", "ZX"]), angle, st.floats(30.0, 720.0), angle, angle, direction=st.sampled_from([1, -1])
+)
+recipe = helices | diagonals | lines | faces | places | circles
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.lists(helices | diagonals | lines, min_size=1, max_size=5, unique_by=(lambda r: r.label, lambda r: r.setup_id)), names)
+@given(st.lists(recipe, min_size=1, max_size=5, unique_by=(lambda r: r.label, lambda r: r.setup_id)), names)
 def test_any_campaign_comes_back_from_its_file_as_it_went_in(recipes, name):
     told = shared_setups(tuple(recipes), "f")
     assert parse_recipe(recipe_text(name, told, "a note"), "f") == (name, told)
@@ -208,13 +219,18 @@ def test_set_ups_that_cannot_be_shared_are_named():
     first = Helix("a", "S1", "identify", cup, 150.0)
     for second, says in (
         (Helix("b", "S1", "identify", (301.0, 250.0, 50.0), 150.0), "another cup"),
-        (Helix("b", "S1", "identify", cup, 150.0), "must run back"),
+        (Helix("b", "S1", "identify", cup, 150.0, opens=-1), "another cup"),
         (Linear("b", "S1", "identify", 0), "share a set-up"),
     ):
         with pytest.raises(ConfigError, match=says):
             shared_setups((first, second), "f")
     with pytest.raises(ConfigError, match="another alignment"):
         shared_setups((Diagonal("a", "D", "identify", "ppp"), Diagonal("b", "D", "identify", "npp")), "f")
+    with pytest.raises(ConfigError, match="another line"):
+        shared_setups((Linear("a", "L", "identify", 0), Linear("b", "L", "identify", 1)), "f")
+    low = Circle("a", "S1", "identify", (300.0, 250.0, 225.0), 150.0, "YZ", -90.0, 360.0, feed_in_deg=0.0, feed_out_deg=0.0)
+    with pytest.raises(ConfigError, match="below the cup"):
+        shared_setups((low, replace(low, label="b", radius_mm=100.0)), "f")
     with pytest.raises(ConfigError, match="taken down before"):
         shared_setups((first, Linear("b", "S2", "identify", 0), Helix("c", "S1", "identify", cup, 100.0)), "f")
 

@@ -6,13 +6,16 @@ from types import SimpleNamespace
 
 import pytest
 
+from drivers.api import BarBatch, BarSample
 from drivers.errors import LinkDown, ReplyTimeout
 from service.devices.session import Session
 from service.errors import MeasurementFault
 from service.sequences.guard import UNDELIVERED, motion_guard, warnings_of
-from service.sequences.runner import DRIVES, PATH, REFERENCED, REMOTE, Runner
+from service.sequences.interlocks import DRIVES, PATH, REFERENCED, REMOTE
+from service.sequences.runner import Runner
 from service.sequences.steps import MountBar, MountLaser, RecordPath, TestPlan, Unmount
-from service.workflows.measure import Meter, OpenCampaign, measure_test
+from service.workflows.measure import OpenCampaign, measure_test
+from service.workflows.meter import Meter
 
 READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
 RUNS_ON = RecordPath(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 100.0, 100, 1)
@@ -26,10 +29,12 @@ class FakeController:
         self.events, self.deaf = events, deaf
 
     async def status(self):
-        return SimpleNamespace(bits=READY | 1 << PATH, path_points_done=0, path_start_us=5, path_end_us=0, ctrl_us=7)
+        return SimpleNamespace(
+            bits=READY | 1 << PATH, path_points_done=0, path_start_us=5, path_end_us=0, ctrl_us=7, position_mm=RUNS_ON.points_mm[0]
+        )
 
     async def comp_status(self):
-        return SimpleNamespace(active_bank=0, bank_crc=(1, 2), gen=3)
+        return SimpleNamespace(active_bank=0, bank_crc=(1, 2), gen=3, boot_id=7)
 
     async def load_path(self, points_mm):
         self.events.append("loaded")
@@ -46,20 +51,61 @@ class FakeController:
 class MuteBar:
     """A box that says nothing any more; closing its stream is an event of its own."""
 
+    name = "bar"
+
     def __init__(self, events: list[str]) -> None:
         self.events = events
 
+    async def make_ready(self, *, within_s):
+        self.events.append("asked who it is")
+
     @asynccontextmanager
-    async def stream(self, rate_hz):
+    async def stream(self, rate_hz, tap=None):
         async def batches():
-            if rate_hz < 0:
-                yield None
+            yield BarBatch(0.0, (BarSample(0, 0, 0, 0),))
+            while "started" not in self.events:  # noqa: ASYNC110 - what happened is a plain list
+                await asyncio.sleep(0)
             raise ReplyTimeout("bar", "read samples", "no sample for 1 s", "box switched off?")
 
         try:
             yield batches()
         finally:
             self.events.append("stream closed")
+
+
+class FakeRecorder:
+    """Keeps nothing."""
+
+    def tap(self):
+        return None
+
+    async def add_bar(self, batch):
+        pass
+
+    def doc(self):
+        return {"gaps": []}
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+    def discard(self):
+        pass
+
+    behind = False
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_recorded(monkeypatch):
+    """Where samples go is tested elsewhere."""
+
+    @asynccontextmanager
+    async def recording(*_):
+        yield FakeRecorder()
+
+    monkeypatch.setattr("service.workflows.measure.recording", recording)
+
+
+SITE = SimpleNamespace(doc={}, name="m", capture=None)
 
 
 class Fixture:
@@ -80,7 +126,7 @@ def session(events: list[str], *, deaf: bool = False) -> Session:
 async def test_the_axes_stop_before_the_mute_box_is_talked_to_and_nothing_is_asked():
     events: list[str] = []
     with pytest.raises(ReplyTimeout) as caught:
-        await Runner(session(events)).run(PLAN, None, lambda *_: None)
+        await Runner(session(events)).run(PLAN, FakeRecorder(), lambda *_: None)
     assert events[:4] == ["loaded", "started", "stopped", "stream closed"]
     assert "unmounted" not in events
     assert UNDELIVERED not in str(caught.value)
@@ -88,7 +134,7 @@ async def test_the_axes_stop_before_the_mute_box_is_talked_to_and_nothing_is_ask
 
 async def test_a_stop_that_does_not_get_through_is_part_of_the_error():
     with pytest.raises(ReplyTimeout) as caught:
-        await Runner(session([], deaf=True)).run(PLAN, None, lambda *_: None)
+        await Runner(session([], deaf=True)).run(PLAN, FakeRecorder(), lambda *_: None)
     assert str(caught.value) == f"bar: read samples: no sample for 1 s; {UNDELIVERED} (box switched off?)"
 
 
@@ -175,7 +221,7 @@ async def test_a_run_keeps_the_reason_why_it_ended(monkeypatch, error, ended):
     store, clock = FakeStore(), SimpleNamespace(utc=lambda: SimpleNamespace(isoformat=lambda: "now"), monotonic_s=lambda: 1.0)
     store.append_chunk = None
     with pytest.raises(type(error)):
-        await measure_test(session([]), store, SimpleNamespace(doc={}), OpenCampaign(1, 0), PLAN, lambda *_: None, clock)
+        await measure_test(session([]), store, SITE, OpenCampaign(1, 0), PLAN, lambda *_: None, clock)
     assert store.ended == ended
 
 
@@ -217,9 +263,10 @@ async def test_a_set_up_begins_when_it_is_mounted_and_all_its_runs_say_so():
     for label, steps in ways:
         plan = TestPlan(label, "ballbar_helix", "identify", {"setup_id": "A"}, steps)
         assert plan.mounts == (label == "first")
-        await measure_test(devices, store, SimpleNamespace(doc={}), campaign, plan, lambda *_: None, clock)
-    assert campaign.mounted_us == {"A": 180_000_000}  # asked for the start document, for the interlocks, and when it was done
-    assert store.ends[0]["mounted_us"] == 180_000_000
-    assert [doc["setup"]["t_set_s"] for doc in store.starts] == [30.0, 150.0, 150.0]
+        await measure_test(devices, store, SITE, campaign, plan, lambda *_: None, clock)
+    # Asked for the start document, for somebody else's program, by the watcher, for the interlocks, and when it was done.
+    assert campaign.mounted_us == {"A": 300_000_000}
+    assert store.ends[0]["mounted_us"] == 300_000_000
+    assert [doc["setup"]["t_set_s"] for doc in store.starts] == [30.0, 270.0, 270.0]
     assert all("mounted_us" not in end for end in store.ends[1:])
     assert TestPlan("l", "laser_linear", "identify", {}, (MountLaser((1.0, 0.0, 0.0)),)).mounts

@@ -62,7 +62,7 @@ def test_laser_lines_approach_their_start_in_the_direction_of_the_first_motion()
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_helix_too_approaches_its_start_in_the_direction_of_the_first_motion(direction, axis):
     plan = Helix("h", "A", "identify", (300.0, 250.0, 200.0), 150.0, direction=direction, axis=axis).plan(MACHINE)
-    _, approach, start = (s.target_mm for s in plan.steps if isinstance(s, MoveTo))
+    *_, approach, start = (s.target_mm for s in plan.steps if isinstance(s, MoveTo))
     path = np.array(next(s for s in plan.steps if isinstance(s, RecordPath)).points_mm)
     assert start == tuple(path[0])
     for a in range(3):
@@ -73,7 +73,7 @@ def test_a_helix_too_approaches_its_start_in_the_direction_of_the_first_motion(d
 
 def test_an_approach_ends_at_the_stroke():
     plan = Helix("h", "A", "identify", (300.0, 250.0, 300.0), 149.9).plan(MACHINE)
-    assert [s.target_mm for s in plan.steps if isinstance(s, MoveTo)][1] == (299.5, 249.5, 450.0)
+    assert [s.target_mm for s in plan.steps if isinstance(s, MoveTo)][2] == (299.5, 249.5, 450.0)
     dry_run(MACHINE, plan)
 
 
@@ -89,7 +89,7 @@ def test_two_helices_in_one_set_up_mount_once_and_clear_away_once():
     out = Helix("out", "A", "identify", (300.0, 250.0, 100.0), 150.0, unmount=False).plan(MACHINE)
     back = Helix("back", "A", "identify", (300.0, 250.0, 100.0), 150.0, direction=-1, mount=False).plan(MACHINE)
     kinds = [type(s) for s in out.steps + back.steps]
-    assert kinds == [MoveTo, MountBar, MoveTo, MoveTo, RecordPath, MoveTo, MoveTo, RecordPath, Unmount]
+    assert kinds == [MoveTo, MountBar, MoveTo, MoveTo, MoveTo, RecordPath, MoveTo, MoveTo, RecordPath, Unmount]
 
 
 @pytest.mark.parametrize("chain", ["w-X-Y-b-Z-t", "w-b-X-Y-Z-t", "w-Z-b-X-Y-t"])

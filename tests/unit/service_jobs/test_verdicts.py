@@ -4,17 +4,21 @@ import numpy as np
 import pytest
 
 from models.verification import Figure
-from service.workflows.verify import Figures, decide, judge, overall
+from service.errors import TableRefused
+from service.workflows.verify import Figures, check_before, decide, judge, overall
 
 NONE = np.zeros(0)
 
 
-def figures(ppp: float, others: float = 5.0, helix: float | None = 5.0, u: float = 0.5) -> Figures:
-    def figure(um: float) -> Figure:
+AIR = (20.0, 20.4)
+
+
+def figures(ppp: float, others: float = 5.0, helix: float | None = 5.0, u: float = 0.5, u_helix: float = 0.5, air=AIR, crc=(7,)) -> Figures:
+    def figure(um: float, u: float = u) -> Figure:
         return Figure(um * 1e-3, u * 1e-3, NONE, NONE)
 
     diagonals = {"ppp": figure(ppp)} | {k: figure(others) for k in ("npp", "pnp", "ppn")}
-    return Figures(diagonals, None if helix is None else figure(helix))
+    return Figures(diagonals, None if helix is None else figure(helix, u_helix), air, frozenset(crc))
 
 
 @pytest.mark.parametrize(
@@ -28,10 +32,24 @@ def figures(ppp: float, others: float = 5.0, helix: float | None = 5.0, u: float
         (figures(40), figures(10, helix=7.5), False, "helix got worse"),
         (figures(40, helix=2.0), figures(10, helix=6.9), False, "helix got worse"),
         (figures(40), figures(10, helix=None), False, "measured only once"),
+        (figures(40, helix=None), figures(10), False, "measured only once"),
+        (figures(40, helix=None), figures(10, helix=None), True, "40.0 → 10.0"),
+        (figures(40, u=20), figures(10, u=20), False, "no improvement beyond its uncertainty"),
+        (figures(40), figures(10, u_helix=20), False, "cannot tell whether nothing got worse: the helix is uncertain by 40.0 µm"),
+        (figures(40), figures(float("nan")), False, "no number"),
+        (figures(40), figures(10, helix=float("nan")), False, "no number"),
+        (figures(40), figures(10, u_helix=float("inf")), False, "no number"),
+        (figures(float("nan")), figures(10), False, "no number"),
+        (figures(40), figures(10, air=(20.9, 21.1)), False, "20.0 to 21.1 °C"),
+        (figures(40), figures(10, air=(20.8, 20.9)), True, "40.0 → 10.0"),
+        (figures(40), figures(10, air=None), False, "how warm the air was is not known"),
+        (figures(40), figures(10, crc=(7, 8)), False, "measured with table 00000007, 00000008, brought into force was 00000007"),
+        (figures(40), figures(10, crc=(None,)), False, "one that nobody named"),
+        (figures(40), figures(10, crc=()), False, "one that nobody named"),
     ],
 )
 def test_keep_only_what_is_better_and_nowhere_worse(before, after, keep, why):
-    decision = decide(before, after)
+    decision = decide(before, after, 7)
     assert decision.keep is keep
     assert why in decision.text
 
@@ -47,3 +65,10 @@ def test_the_worst_verdict_counts_and_nothing_judged_is_no_pass():
     assert overall(["pass", "cannot tell"]) == "cannot tell"
     assert overall(["cannot tell", "fail"]) == "fail"
     assert overall([]) == "cannot tell"
+
+
+@pytest.mark.parametrize(("before", "why"), [(figures(float("nan")), "no number"), (figures(40, air=None), "how warm the air was")])
+def test_a_verification_that_nothing_compares_with_is_refused_before_anything_is_written(before, why):
+    with pytest.raises(TableRefused, match=why):
+        check_before(before)
+    check_before(figures(40))

@@ -10,6 +10,7 @@ from itertools import count
 from typing import Any
 
 from service.events import Progress
+from service.scheduler.ports import OpenSlot
 from service.scheduler.slots import Schedule
 
 
@@ -61,7 +62,8 @@ async def settle() -> None:
 class FakeLedger:
     def __init__(self) -> None:
         self.states: dict[tuple[str, datetime], str] = {}
-        self.claims = 0
+        self.reasons: dict[tuple[str, datetime], str] = {}
+        self.nobodys: set[tuple[str, datetime]] = set()
 
     async def claim(self, schedule: str, slot_utc: datetime) -> bool:
         if (schedule, slot_utc) in self.states:
@@ -69,9 +71,41 @@ class FakeLedger:
         self.states[schedule, slot_utc] = "CLAIMED"
         return True
 
-    async def finish(self, schedule: str, slot_utc: datetime, state: str) -> None:
-        assert self.states[schedule, slot_utc] == "CLAIMED", "finished twice"
+    async def begin(self, schedule: str, slot_utc: datetime) -> None:
+        assert self.states[schedule, slot_utc] == "CLAIMED", "begun twice"
+        self.states[schedule, slot_utc] = "RUNNING"
+
+    async def release(self, schedule: str, slot_utc: datetime) -> None:
+        if self.dead:
+            return
+        assert self.states[schedule, slot_utc] == "CLAIMED", "given back after it began"
+        self.states[schedule, slot_utc] = "RELEASED"
+        self.nobodys.add((schedule, slot_utc))
+
+    async def adopt(self, schedule: str) -> list[OpenSlot]:
+        """What was given back, and what a service left that `lose_owner` has ended."""
+        found = sorted((slot, self.states[name, slot]) for name, slot in self.nobodys if name == schedule)
+        self.nobodys -= {(schedule, slot) for slot, _ in found}
+        for slot, state in found:
+            self.states[schedule, slot] = "CLAIMED" if state != "LOST RUNNING" else "RUNNING"
+        return [OpenSlot(slot, state == "LOST RUNNING") for slot, state in found]
+
+    dead = False
+    """Nothing is written any more: the power is off."""
+
+    def lose_owner(self) -> None:
+        """The power goes: nothing more is written, and what is open is nobody's."""
+        lost = {key: f"LOST {state}" for key, state in self.states.items() if state in ("CLAIMED", "RUNNING")}
+        self.states |= lost
+        self.nobodys |= set(lost)
+
+    async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
+        if self.dead:
+            return
+        assert self.states[schedule, slot_utc] in ("CLAIMED", "RUNNING"), "finished twice"
+        assert len(state) <= 30
         self.states[schedule, slot_utc] = state
+        self.reasons[schedule, slot_utc] = reason
 
     async def last_claimed(self, schedule: str) -> datetime | None:
         return max((slot for name, slot in self.states if name == schedule), default=None)

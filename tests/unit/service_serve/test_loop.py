@@ -157,7 +157,7 @@ async def test_stopping_interrupts_the_job_and_says_so() -> None:
     bench = Bench(utc(2026, 6, 1, 3, 59, 30), WEEKLY)
     async with bench.working():
         await bench.clock.pass_time(60)
-        assert bench.ledger.of("CLAIMED") == [utc(2026, 6, 1, 4)]
+        assert bench.ledger.of("RUNNING") == [utc(2026, 6, 1, 4)]
     assert bench.ledger.of("interrupted") == [utc(2026, 6, 1, 4)]
 
 

@@ -1,0 +1,101 @@
+"""A process that has everything imported and forks a measuring child on demand, so that a hundred kills do not cost a hundred starts.
+
+Reads one JSON line a job from standard input: ``{"folder": ..., "urls": {...}, "name": ..., "untouched": true}``, answers the child's pid,
+and when it has ended its exit code (negative: the signal). The child does what `abbe measure` does, and with --resume when it was begun.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+from service.devices.alone import alone
+from service.devices.session import DeviceUrls, open_session
+from service.sequences.recipes import Circle, Diagonal, Helix, Linear
+from service.sequences.setups import shared_setups
+from service.sequences.steps import CampaignPlan
+from service.site import Site, machine_doc
+from service.storage.store import Store
+from service.workflows.campaign_run import Confirm
+from service.workflows.measure import Manner, measure
+from service.workflows.recover import recover
+from service.workflows.resume import resume
+from tests.faults.sequencer_world import MACHINE
+
+
+def plan(name: str) -> CampaignPlan:
+    """Eight tests on five set-ups: three of them share a cup (the bar is changed), two a mirror."""
+    centre = (300.0, 250.0, 100.0)
+    recipes = (
+        *shared_setups(
+            (
+                Helix("helix", "B1", "identify", centre, 40.0, turns=3.0, chord_mm=2.0),
+                Helix("helix-back", "B1", "identify", centre, 40.0, turns=3.0, chord_mm=2.0, direction=-1),
+                Helix("longer", "B1", "identify", centre, 60.0, turns=3.0, chord_mm=3.0),
+            ),
+            name,
+        ),
+        Circle("circle", "B2", "identify", (200.0, 200.0, 150.0), 40.0, feed_in_deg=20.0, feed_out_deg=20.0),
+        Linear("lineX", "L1", "identify", 0, n=7),
+        Linear("lineZ", "L2", "identify", 2, n=7),
+        Diagonal("diagXYZ", "D1", "identify", "ppp", 2, unmount=False),
+        Diagonal("diagZYX", "D1", "identify", "ppp", 2, "ZYX", mount=False),
+    )
+    return CampaignPlan(name, tuple(r.plan(MACHINE) for r in recipes))
+
+
+async def job(words: dict[str, Any]) -> None:
+    """Measure, or go on measuring."""
+
+    async def confirm(_: str) -> bool:
+        return bool(words["untouched"])
+
+    urls = DeviceUrls(**words["urls"])
+    site = Site("sim", MACHINE, machine_doc("sim", MACHINE), urls)
+    with Store.open(f"sqlite:///{Path(words['folder']) / 'abbe.sqlite3'}") as store:
+        campaign = plan(words["name"])
+        with alone(urls.cnc):
+            await at_work(urls, store, site, campaign, confirm)
+
+
+async def at_work(urls: DeviceUrls, store: Store, site: Site, campaign: CampaignPlan, confirm: Confirm) -> None:
+    """Open the devices, and measure what is left."""
+    async with open_session(urls) as session:
+        await recover(session.controller, store, site)
+        begun = any(c.name == campaign.name and store.checkpoints(c.id) for c in store.campaigns())
+        found = await resume(session, store, site, campaign, campaign.name, confirm) if begun else None
+        for line in found.said if found is not None else ():
+            print(line, file=sys.stderr)  # noqa: T201
+        # killed between a campaign's first line and its journal's: there is nothing to go on with, and nothing was measured
+        empty = next((c for c in store.campaigns() if c.name == campaign.name and found is None), None)
+        first = None if empty is None else (empty.id, int(empty.doc["ctrl0_us"]))
+        await measure(session, store, site, campaign, campaign=first, manner=Manner(confirm=confirm, resumed=found))
+
+
+def main() -> None:
+    """Fork a child for every line."""
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    for line in sys.stdin:
+        pid = os.fork()
+        if pid == 0:
+            try:
+                asyncio.run(job(json.loads(line)))
+            except BaseException:  # noqa: BLE001 - a child that fails says why, and ends
+                traceback.print_exc()
+                os._exit(1)
+            os._exit(0)
+        sys.stdout.write(f"{pid}\n")
+        sys.stdout.flush()
+        _, status = os.waitpid(pid, 0)
+        sys.stdout.write(f"{os.waitstatus_to_exitcode(status)}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""A simulated machine in this process, on real sockets and a real pty, whose speed can be changed; and small recipes of every kind.
+
+The clock that reactions are measured with is the simulated controller's own: the instant of an event and the instants of all commands stand
+in one log. While a reaction is awaited one simulated second lasts one second of wall time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import random
+import typing
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.api import BarBatch
+from models.machine import Machine
+from service.devices.session import DeviceUrls, Session, open_session
+from service.sequences import recipes
+from service.sequences.check import step_seconds
+from service.sequences.control import Control
+from service.sequences.interlocks import Watching
+from service.sequences.setups import shared_setups
+from service.sequences.steps import CampaignPlan, MoveTo, TestPlan
+from service.site import Site, machine_doc
+from service.storage.store import Store
+from simulators.cnc.log import Command
+from simulators.scenario import Scenario
+from simulators.site import Site as Simulated
+from tests.faults.on_sphere import OnSphere
+
+MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]), np.zeros((3, 3)), np.array([0.0, 0.0, -120.0]))
+SMALL: dict[str, Any] = {
+    "label": "test",
+    "setup_id": "S",
+    "role": "identify",
+    "centre_mm": (300.0, 250.0, 100.0),
+    "radius_mm": 30.0,
+    "turns": 3.0,
+    "chord_mm": 3.0,
+    "points": 5,
+    "n": 5,
+    "steps": 2,
+    "samples": 5,
+    "axis": 2,
+    "plane": "XY",
+    "feed_in_deg": 20.0,
+    "feed_out_deg": 20.0,
+    "settle_s": 0.1,
+    "at": 0.5,
+}
+PATIENT = Watching(unknown_s=5.0)
+"""For tests that are not about silence: simulators and service share one process here, on a computer that others use."""
+DIAGONALS = {"Diagonal": "ppp", "FaceDiagonal": "pp"}
+
+
+def kinds() -> dict[str, type[Any]]:
+    """Every recipe that there is: a new one joins by itself."""
+    return {kind.__name__: kind for union in typing.get_args(recipes.Recipe) for kind in (typing.get_args(union) or (union,))}
+
+
+def small(kind: str, **more: Any) -> TestPlan:
+    """A short test of a kind."""
+    made = kinds()[kind]
+    names = {f.name for f in dataclasses.fields(made)}
+    words = {k: v for k, v in SMALL.items() if k in names} | ({"diagonal": DIAGONALS[kind]} if "diagonal" in names else {})
+    plan: TestPlan = made(**(words | more)).plan(MACHINE)
+    return plan
+
+
+def on_one_cup(*radii_mm: float) -> CampaignPlan:
+    """Helices with bars of these lengths on one cup, the bar changed where it has to be."""
+    made = tuple(
+        recipes.Helix(f"r{k}", "B1", "identify", (300.0, 250.0, 100.0), r, turns=3.0, chord_mm=3.0, direction=-1 if k % 2 else 1)
+        for k, r in enumerate(radii_mm)
+    )
+    return CampaignPlan("c", tuple(r.plan(MACHINE) for r in shared_setups(made, "test")))
+
+
+class Paced(Simulated):
+    """Simulators whose speed can be changed: simulated time is the sum of what has passed at each speed."""
+
+    speed, _at_s, _last_s = 1.0, 0.0, 0.0
+
+    def advance(self) -> None:
+        now = asyncio.get_running_loop().time()
+        if self._last_s:
+            self._at_s += self.speed * (now - self._last_s)
+        self._last_s = now
+        self.world.advance(self._at_s)
+
+    def pace(self, speed: float) -> None:
+        """From now on so many simulated seconds per second."""
+        self.advance()
+        self.speed = speed
+
+    def now_s(self) -> float:
+        """Simulated time."""
+        self.advance()
+        return self.world.time_s
+
+    def motions(self, after_s: float = -1.0) -> list[Command]:
+        """Commands that start, feed or free a motion."""
+        return [c for c in self.registers.log if c.moves and c.time_s > after_s]
+
+    def make_ready(self) -> None:
+        """What a person does at the panel and inside, between two tests."""
+        controller = self.world.controller
+        controller.set_estop(pressed=False)
+        controller.set_door(is_open=False)
+        controller.switches.remote, controller.switches.program_running = True, False
+        controller.switches.spindle_turning = False
+        controller.reset_alarm()
+        self.world.laser.block(blocked=False)
+        self.world.ballbar.push(out=False)
+        self.world.laser.unmount()
+        self.world.ballbar.unmount()
+
+
+@dataclasses.dataclass
+class Bench:
+    """A simulated machine and an open session with it."""
+
+    sim: Paced
+    session: Session
+    site: Site
+    sphere: OnSphere
+
+
+@asynccontextmanager
+async def bench(folder: Path, *, cnc_url: Callable[[str], str] = lambda url: url, **scenario: Any) -> AsyncIterator[Bench]:
+    """Simulators and a session, closed with the block; a bar that was driven off its sphere fails the test."""
+    sim = Paced(Scenario(**scenario), folder)
+    sphere = OnSphere(sim.world)
+    try:
+        ready = await sim.start()
+        urls = DeviceUrls(cnc_url(ready["cnc"]), ready["ballbar"], ready["laser"], ready["fixture"])
+        async with open_session(urls) as session:
+            yield Bench(sim, session, Site("sim", MACHINE, machine_doc("sim", MACHINE), urls, watching=PATIENT), sphere)
+    finally:
+        await sim.stop()
+    assert not sphere.wrong, "\n".join(sphere.wrong)
+
+
+class Keeps:
+    """A recorder that keeps records in memory and lets samples go."""
+
+    def __init__(self) -> None:
+        self.records: list[dict[str, Any]] = []
+
+    def tap(self) -> None:
+        return None
+
+    async def add_bar(self, batch: BarBatch) -> None:
+        return None
+
+    async def add_record(self, record: dict[str, Any]) -> None:
+        self.records.append(record)
+
+
+class AtStep(Control):
+    """Does something when a step is reached, or a moment of wall time later."""
+
+    def __init__(self, step: int, do: Callable[[], None], delay_s: float = 0.0) -> None:
+        super().__init__()
+        self._step, self._do, self._delay_s = step, do, delay_s
+        self.done = False
+
+    def place(self, step: int, steps: int, points: int) -> None:
+        super().place(step, steps, points)
+        if step == self._step and not self.done:
+            self.done = True
+            if self._delay_s:
+                asyncio.get_running_loop().call_later(self._delay_s, self._do)
+            else:
+                self._do()
+
+
+class InTest(Control):
+    """Does something at a step of the n-th run (from 0)."""
+
+    def __init__(self, store: Store, run: int, step: int, do: Callable[[], None]) -> None:
+        super().__init__()
+        self._where, self._do, self._store, self.done = (run, step), do, store, False
+
+    def place(self, step: int, steps: int, points: int) -> None:
+        super().place(step, steps, points)
+        if not self.done and step == self._where[1] and len(self._store.runs()) == self._where[0] + 1:
+            self.done = True
+            self._do()
+
+
+def number(plan: CampaignPlan, test: int, kind: type, nth: int = 0) -> int:
+    return [k + 1 for k, s in enumerate(plan.tests[test].steps) if isinstance(s, kind)][nth]
+
+
+def step_numbers(plan: TestPlan) -> list[int]:
+    """Steps that the runner works on, from 1: a move to where the machine stands is none."""
+    here, found = None, []
+    for k, step in enumerate(plan.steps):
+        if not (isinstance(step, MoveTo) and here == step.target_mm):
+            found.append(k + 1)
+        here = step_seconds(step, here)[1]
+    return found
+
+
+def rng(*words: object) -> random.Random:
+    """Draws that belong to a case and to nothing else."""
+    return random.Random("/".join(map(str, words)))

@@ -1,0 +1,121 @@
+"""Export and import of random tables: no correction differs by more than half of the format's unit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.functions.motions import PLACES, SQUARENESS
+from models.machine import AXES, Machine
+from service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable
+from service.formats.registry import FORMATS, Format
+from service.formats.settings import Settings
+
+MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [-400.0, 0.0], [-300.0, 100.0]]))
+EXACT_MM = 1e-9
+
+
+@st.composite
+def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, Settings]:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    n = draw(st.integers(3, min(form.limits.points, 40)))
+    decimals = draw(st.integers(3, 7))
+    told = Settings(
+        reference_mm=None,
+        decimals=decimals,
+        machine=MACHINE,
+        unit_mm=draw(st.sampled_from([1e-3, 1e-4])),
+        magnification=draw(st.integers(1, 3)),
+    )
+    step = draw(st.integers(5, 500)) / 10
+    even = form.limits.equidistant or draw(st.booleans())
+    size = draw(st.sampled_from([1e-5, 0.003, 0.05]))
+    if form.key in ("fanuc-pitch", "fanuc-lattice", "centroid"):
+        told = replace(told, reference_mm=(0.0, 0.0, 0.0), counts_per_mm=draw(st.sampled_from([1000.0, 40000 / 25.4])), largest_step=10**6)
+    grids = [_grid(rng, n if not form.limits.lattice else min(n, 6), step, even) for _ in AXES]
+    if form.limits.lattice:
+        values = rng.uniform(-size, size, (*(g.size for g in grids), 3))
+        return Compensation(lattice=Lattice((grids[0], grids[1], grids[2]), values)), told
+    if form.limits.motions and draw(st.booleans()):
+        return Compensation(motions=_motions(rng, grids, size)), told
+    pairs = [(a, o) for a in range(3) for o in range(3) if (a == o or form.limits.cross) and (a == o or draw(st.booleans()))]
+    tables = tuple(
+        _table(rng, a, o, grids[a], size, directional=form.limits.directional and a == o and draw(st.booleans())) for a, o in pairs
+    )
+    products = ()
+    if form.limits.products and draw(st.booleans()):
+        angle = Curve("Y", grids[1], rng.uniform(-1, 1, grids[1].size) * size * 1e-3)
+        products = (ProductTable("X", angle, Curve("Z", grids[2], np.round(grids[2] - grids[2][0], 3))),)
+    return Compensation(tables, products), told
+
+
+def _grid(rng: np.random.Generator, n: int, step: float, even: bool) -> np.ndarray:
+    if even:
+        return np.round(step * np.arange(n), 4)
+    return np.round(np.cumsum(rng.uniform(0.5, 50.0, n)) - 100.0, 4)
+
+
+def _table(rng: np.random.Generator, a: int, o: int, grid: np.ndarray, size: float, *, directional: bool) -> AxisTable:
+    forward = rng.uniform(-size, size, grid.size)
+    forward[0] = 0.0
+    backward = rng.uniform(-size, size, grid.size) if directional else forward
+    return AxisTable(AXES[a], AXES[o], grid, forward, backward)
+
+
+def _motions(rng: np.random.Generator, grids: list[np.ndarray], size: float) -> Motions:
+    curves = {
+        n: Curve(AXES[a], grids[a], rng.uniform(-size, size, grids[a].size) * (1.0 if c < 3 else 1e-3)) for n, (a, c) in PLACES.items()
+    }
+    return Motions(MACHINE, curves, {n: float(v) for n, v in zip(SQUARENESS, rng.uniform(-1e-4, 1e-4, 3), strict=True)})
+
+
+def _unit(form: Format, told: Settings) -> float:
+    if form.key.startswith("fanuc"):
+        return told.unit_mm * told.magnification
+    return 1.0 / told.counts_per_mm if form.key == "centroid" else told.step_mm
+
+
+@pytest.mark.parametrize("key", FORMATS)
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_nothing_differs_by_more_than_half_a_unit(key: str, data: st.DataObject) -> None:
+    form = FORMATS[key]
+    comp, told = data.draw(cases(form))
+    files = form.write(comp, told)
+    found = form.read(files, told)
+    half = 0.5 * _unit(form, told) + EXACT_MM
+    if form.limits.motions and comp.motions is None:  # tables go out as the error motions they correct
+        assert found.motions is not None
+        for t in comp.tables:
+            curve = found.motions.curves[f"E{t.output}{t.axis}"]
+            assert np.abs(curve.value + t.forward_mm).max() <= half
+        return
+    _compare_tables(comp, found, half)
+    for p, q in zip(comp.products, found.products, strict=True):
+        assert (p.output, p.angle.axis, p.lever.axis) == (q.output, q.angle.axis, q.lever.axis)
+        assert np.abs(p.angle.value - q.angle.value).max() <= half * 1e-3 + 1e-12
+        assert np.abs(p.lever.value - q.lever.value).max() <= half
+    if comp.lattice is not None:
+        assert found.lattice is not None
+        assert np.abs(comp.lattice.correction_mm - found.lattice.correction_mm).max() <= half
+    if comp.motions is not None:
+        assert found.motions is not None
+        for n, c in comp.motions.curves.items():
+            assert np.abs(c.value - found.motions.curves[n].value).max() <= (half if PLACES[n][1] < 3 else half * 1e-3 + 1e-12)
+        assert found.motions.squareness_rad == pytest.approx(dict(comp.motions.squareness_rad), abs=half * 1e-3 + 1e-12)
+    again = form.write(found, told)  # columns of two directions that are alike after rounding become one: from then on nothing changes
+    assert form.write(form.read(again, told), told) == again
+
+
+def _compare_tables(comp: Compensation, found: Compensation, half: float) -> None:
+    wanted = {t.name: t for t in comp.tables}
+    have = {t.name: t for t in found.tables}
+    assert set(wanted) == set(have)
+    for name, t in wanted.items():
+        assert have[name].position_mm == pytest.approx(t.position_mm, abs=1e-3 if t.position_mm.size and half > 1e-4 else 2e-6)
+        assert np.abs(have[name].forward_mm - t.forward_mm).max() <= half
+        assert np.abs(have[name].backward_mm - t.backward_mm).max() <= half

@@ -1,0 +1,30 @@
+"""What many tests need and do not test: a control whose sign, axis and unit count as proved."""
+
+from __future__ import annotations
+
+from drivers.api import Controller
+from drivers.registry import open_controller
+from service.site import Site
+from service.storage.store import Store
+from service.workflows.commission import KIND
+from service.workflows.proved_levels import identity
+
+NAME = f"{KIND} pretended"
+
+
+async def as_if_commissioned(controller: Controller, store: Store, site: Site) -> None:
+    """Put a proof of this control into the store, as a commissioning would that had found nothing wrong."""
+    if any(c.name == NAME for c in store.campaigns()):
+        return
+    machine = store.add_machine(site.name, site.doc)
+    campaign = store.add_campaign(machine, NAME, {})
+    store.add_solution(campaign, KIND, [], {"proved": True, "faults": [], "identity": identity(await controller.identify())})
+
+
+async def as_if_commissioned_at(url: str, store: Store, site: Site) -> None:
+    """The same for a control that nobody has opened."""
+    controller = await open_controller(url)
+    try:
+        await as_if_commissioned(controller, store, site)
+    finally:
+        await controller.close()

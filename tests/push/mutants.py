@@ -1,0 +1,86 @@
+# ruff: noqa: E501 - an edit names the line that it replaces
+"""Mistakes that somebody could make in the protocol, as edits of its source: the sweep has to notice every one."""
+
+from __future__ import annotations
+
+from tests.push.loading import Edits
+
+LOOKS_SAFE = ("machine", 'return f"not safe now: {truth.unsafe}" if truth.unsafe else ""', 'return ""')
+
+MUTANTS: dict[str, Edits] = {
+    "second read-back skipped": (
+        ("staging", "step = bracket(known, image.bank, words, again=True)", "step = bracket(known, image.bank, words, again=False)"),
+        ("staging", "known.image != image.data or known.meaning != image.meaning:", "known.image != image.data:"),
+    ),
+    "full read-back skipped": (
+        (
+            "staging",
+            "step = bracket(known, image.bank, words, again=True)",
+            "step = Op(Kind.LOOK) if known.truth is None else Coherent(known.truth)",
+        ),
+        ("staging", "if known.image != image.data or known.meaning != image.meaning:", "if False:"),
+    ),
+    "journal after the action": (
+        (
+            "machine",
+            'return record(State.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"])',
+            'return record(State.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"]) if known.asked else '
+            'Op(Kind.ACTIVATE, bank=f["target"], crc=f["crc"], gen=f["staged_gen"], owner=f["owner"])',
+        ),
+    ),
+    "activation sent again blindly": (("machine", "not known.asked and not known.stop:", "(not known.asked or known.doubts):"),),
+    "only the first chunk compared": (("learn", "outcome.value == op.data:", "(op.first > 0 or outcome.value == op.data):"),),
+    "boot id ignored": (
+        ("machine", '(truth.boot, truth.gen) != (f["boot"], f["probation_gen"])', 'truth.gen != f["probation_gen"]'),
+        ("machine", ' or known.start.boot != f["boot"])', ")"),
+    ),
+    "generation of the snapshot used": (("machine", 'expect_gen=f["staged_gen"])', 'expect_gen=f["gen"])'),),
+    "generation of the last look used": (
+        ("machine", "if truth.gen != gen:", "if False:"),
+        ("machine", 'expect_gen=f["staged_gen"])', "expect_gen=truth.gen)"),
+    ),
+    "reasons noted, table written": (("machine", "reasons=reasons) if reasons else", "reasons=reasons) if False else"),),
+    "approval of the machine's name": (
+        ("approval", '[known["image"], known["base_image"], known["machine"], known["limits"], expiry]', '[known["machine"], expiry]'),
+    ),
+    "approval without the base": (("approval", 'known["image"], known["base_image"], ', 'known["image"], '),),
+    "approval never ends": (("machine", "truth.now_s >= known.approved_until_s", "False"),),
+    "way back without the old table": (
+        ("back", 'if truth.states[other] == SEALED and truth.crc[other] == f["base_crc"]:', "if True:"),
+        ("back", "if step is not None and known.image == base:", "if step is not None:"),
+    ),
+    "late command not shut out": (("machine", "if not known.fenced:\n        return Op(Kind.RELEASE", "if False:\n        return Op(Kind.RELEASE"),),
+    "doubt taken for no": (("machine", "which = in_force(f, known.truth)", 'which = "base"'),),
+    "axes exchanged in the encoder": (("codec", "np.round(tables.correction_mm[a][:, i] * 1e6", "np.round(tables.correction_mm[i][:, a] * 1e6"),),
+    "sign exchanged in the encoder": (("codec", "np.round(tables.correction_mm[a][:, i] * 1e6", "np.round(-tables.correction_mm[a][:, i] * 1e6"),),
+    "sign exchanged in encoder and decoder": (
+        ("codec", "np.round(tables.correction_mm[a][:, i] * 1e6", "np.round(-tables.correction_mm[a][:, i] * 1e6"),
+        ("second_decoder", "return value * _register(data, 6) / 1_000_000", "return -value * _register(data, 6) / 1_000_000"),
+    ),
+    "verification always passes": (("machine", "known.verdict.value.passed:", "(known.verdict.value.passed or question is Kind.VERIFY):"),),
+    "probe always passes": (("machine", "known.verdict.value.passed:", "(known.verdict.value.passed or question is Kind.PROBE):"),),
+    "kept without a last look": (("machine", "    step = _confirm(f, known)\n    if step is None:\n        return record(State.ROLLBACK", "    step = record(State.PROBATION)\n    if step is None:\n        return record(State.ROLLBACK"),),
+    "recovery goes on with the probation": (("machine", "if not known.mine:\n        return \"interrupted", "if False:\n        return \"interrupted"),),
+    "way back against an e-stop": (("back", "if truth.unsafe:\n        return _pending(state, f\"not safe now: {truth.unsafe}\")\n    if truth.states", "if False:\n        return _pending(state, \"\")\n    if truth.states"), ("back", "    if truth.unsafe:\n        return _pending(state, f\"not safe now: {truth.unsafe}\")\n    return", "    return")),
+    "armed against an e-stop": (LOOKS_SAFE,),
+    "new table written in place": (("machine", '"target": 1 - active}', '"target": active}'),),
+    "a person's words overwritten": (("staging", "if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):", "if False:"),),
+    "a person's table switched away": (("back", 'if which == "neither":', "if False:"),),
+    "journal not chained": (("entries", "str(state), doc, utc, prev]", 'str(state), doc, utc, ""]'),),
+    "level not asked": (("machine", "    if no:\n", "    if False:\n"),),
+    "way back without an entry": (
+        (
+            "back",
+            "return _armed(step.truth, other, State.ROLLBACK)",
+            'return Op(Kind.ACTIVATE, bank=other, crc=f["base_crc"], gen=step.truth.gen, owner=known.lease)',
+        ),
+    ),
+    "another's lease not respected": (
+        ("machine", "if isinstance(known.verdict, Refused):\n        return _abandon(f, known, State.APPROVED", "if False:\n        return _abandon(f, known, State.APPROVED"),
+        ("machine", "if isinstance(known.verdict, Done):\n        return record(State.LEASED)", "if known.verdict is not None:\n        return record(State.LEASED)"),
+        ("machine", 'if truth.owner != f["owner"]:', "if False:"),
+    ),
+    "what is pending is forgotten": (("back", "    if known.rested:", "    if known.rested or state is State.ROLLBACK_PENDING:"),),
+}  # fmt: skip
+BY_PROBE = "sign exchanged in encoder and decoder"
+"""No read-back can see this one."""

@@ -1,0 +1,84 @@
+"""Bad tables are rejected with a reason each, before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from service.push.candidate import Candidate, Scene
+from service.push.limits import PushLimits
+from service.push.validate import reasons_against
+from tests.push.bad_tables import CLASSES, EACH, NOW_S, good, signed
+from tests.push.loading import real
+from tests.push.world import Case, World
+
+LIMITS = PushLimits()
+
+
+def in_the_world(reasons: list[str]) -> World:
+    world = World(real(), Case("bad table", reasons=tuple(reasons)), {})
+    assert world.run() == []
+    return world
+
+
+def test_there_are_all_classes_of_the_specification() -> None:
+    assert len(CLASSES) >= 40
+
+
+@pytest.mark.parametrize("k", range(EACH))
+def test_nothing_speaks_against_a_good_table(k: int) -> None:
+    candidate, scene = good(Random(k))
+    assert reasons_against(candidate, scene, LIMITS) == []
+    assert str(in_the_world([]).journal[-1].state) == "KEEP"
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_every_class_is_rejected_with_its_reason_and_without_a_write(name: str) -> None:
+    make, word = CLASSES[name]
+    for k in range(EACH):
+        candidate, scene = make(Random(f"{name} {k}"))
+        reasons = reasons_against(candidate, scene, LIMITS)
+        assert any(reason.startswith(word) for reason in reasons), (k, reasons)
+        world = in_the_world(reasons)
+        assert str(world.journal[-1].state) == "REJECTED"
+        assert world.journal[-1].doc["reasons"] == reasons
+        assert not [event for event in world.events if event[0] in ("write", "activated", "leased")]
+
+
+UNATTENDED = {
+    "a second push within a day": (lambda c, s: (c, replace(s, attended=False, last_push_s=NOW_S - 3600.0)), "POLICY TIME"),
+    "walked away over a month": (
+        lambda c, s: (c, replace(s, attended=False, month_ago={("Y", "Y"): (0.0,) + (0.0601,) * 8, **{}})), "POLICY WALK",
+    ),
+    "base replaced since": (lambda c, s: (c, replace(s, active_crc=0x1234)), "BASE"),
+    "signature of another table": (
+        lambda c, s: (replace(c, seal=replace(c.seal, digest="0" * 64)), s), "SIGNATURE",
+    ),
+    "three tables of an axis together": (lambda c, s: (c, s), "VALUE"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNATTENDED)
+def test_what_the_classes_do_not_hold_is_rejected_too(name: str) -> None:
+    change, word = UNATTENDED[name]
+    candidate, scene = good(Random(3))
+    limits = replace(LIMITS, value_mm=0.012) if word == "VALUE" else LIMITS
+    made: tuple[Candidate, Scene] = change(candidate, scene)
+    assert [r for r in reasons_against(*made, limits) if r.startswith(word)]
+
+
+def test_all_reasons_are_told_at_once() -> None:
+    candidate, scene = good(Random(5))
+    bad = signed(replace(candidate, machine="other", lsb_nm=1, evidence=replace(candidate.evidence, run_count=0)))
+    words = {reason.split(":")[0] for reason in reasons_against(bad, scene, LIMITS)}
+    assert words == {"MACHINE", "SCALE", "RUNS"}
+
+
+def test_a_limit_itself_is_allowed_and_nothing_is_clamped() -> None:
+    candidate, scene = good(Random(7))
+    worst = max(abs(v) for v in candidate.columns[1].correction_mm)
+    before = candidate.columns
+    assert reasons_against(candidate, scene, replace(LIMITS, change_mm=max(LIMITS.change_mm, worst))) == []
+    assert candidate.columns is before

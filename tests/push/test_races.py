@@ -1,0 +1,25 @@
+"""Two services, or two operators of one, push into one simulated controller at once: one owner, and no writes of both mixed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.push.races import DATABASES, races
+from tests.scenarios.conftest import simulated
+
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(600)]
+
+COUNT = 100 if os.environ.get("ABBE_TEST_LONG") == "1" else 5
+
+
+@pytest.mark.parametrize("case", DATABASES)
+def test_two_that_push_at_once(tmp_path: Path, case: str) -> None:
+    """`python -m tests.campaigns.push races` does 200 of each."""
+    with simulated(tmp_path, "--speed", "60") as sims:
+        found = races(sims.ready["cnc"], sims.ask, tmp_path, DATABASES[case], COUNT, 3)
+    assert found.violations == [], found.text()
+    assert found.met >= COUNT // 2, found.text()
+    assert found.writes > 0

@@ -1,0 +1,319 @@
+"""Proposals on a simulated machine, on one identification: everything that refuses one writes no register; then one goes all the way."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.cli import run
+from service.clock import SystemClock
+from service.config import load_machine
+from service.devices.session import DeviceUrls, open_session
+from service.errors import StoreError, TableRefused
+from service.events import ignore_progress
+from service.push.book import read_entries
+from service.sequences.campaigns import identification, verification
+from service.sequences.interlocks import Watching
+from service.sequences.steps import CampaignPlan
+from service.site import Site, site_of
+from service.storage.records import ApprovalRecord
+from service.storage.store import Store
+from service.workflows.correct import Correction, push
+from service.workflows.measure import measure
+from service.workflows.proposal_checks import approve
+from service.workflows.proposal_doc import digest_of_doc, load
+from service.workflows.proposal_states import standing, standing_of
+from service.workflows.proposals import load_runs, login
+from tests.pretended import as_if_commissioned
+from tests.scenarios.conftest import Sims, simulated
+from tests.scenarios.world import registers
+
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
+RATE_HZ = 50
+SIMS = ("--speed", "80", "--seed", "2")
+TWO = "[limits]\ntwo_people = true\n"
+
+
+def controller_words(sims: Sims) -> tuple[int, ...]:
+    """Boot id and generation; active bank, CRC and state of both banks, lease: read by hand."""
+    return registers(sims, 5, 4) + registers(sims, 208, 11)
+
+
+@dataclass
+class Shop:
+    """A machine with an identification, a verification, and proposal 1."""
+
+    sims: Sims
+    site: Site
+    url: str
+    untouched: tuple[int, ...]
+    proposed: int
+
+    @property
+    def file(self) -> str:
+        return str(self.sims.machine_file)
+
+    def words(self) -> tuple[int, ...]:
+        return controller_words(self.sims)
+
+    def copy(self, store: Store) -> int:
+        """The same proposal once more, without any approval."""
+        one = store.proposal(1)
+        return store.add_proposal(one.machine, one.solution_id, one.doc, one.digest)
+
+
+async def measured(site: Site, store: Store) -> None:
+    full = identification(site.machine, rate_hz=RATE_HZ, name="june")
+    tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
+    site = replace(site, watching=Watching(unknown_s=5.0))
+    async with open_session(site.urls) as session:
+        await as_if_commissioned(session.controller, store, site)
+        await measure(session, store, site, CampaignPlan("june", tests), progress=ignore_progress)
+        await measure(session, store, site, verification(site.machine, rate_hz=RATE_HZ, name="start"), progress=ignore_progress)
+
+
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with simulated(tmp_path_factory.mktemp("proposals"), *SIMS, extra=TWO) as sims:
+        loaded = load_machine(sims.machine_file)
+        site = site_of(loaded.machine)
+        with Store.open(loaded.database_url) as store:
+            asyncio.run(measured(site, store))
+        before = controller_words(sims)
+        code = run(["comp", "propose", str(sims.machine_file), "june"])
+        yield Shop(sims, site, loaded.database_url, before, code)
+
+
+@dataclass
+class Later(SystemClock):
+    """A clock that is some hours ahead of the computer's."""
+
+    hours: float = 0.0
+
+    def utc(self) -> datetime:
+        return super().utc() + timedelta(hours=self.hours)
+
+
+def try_push(shop: Shop, store: Store, number: int, *, site: Site | None = None, hours: float = 0.0) -> Correction:
+    async def work() -> Correction:
+        async with open_session((site or shop.site).urls) as session:
+            ids = [r.id for r in store.runs("start")]
+            runs = await load_runs(store, ids)
+            return await push(session, store, site or shop.site, number, runs, progress=ignore_progress, clock=Later(hours))
+
+    return asyncio.run(work())
+
+
+def test_proposing_writes_nothing_to_the_controller(shop):
+    assert shop.proposed == 0
+    assert shop.words() == shop.untouched
+
+
+CHANGED: dict[str, tuple[Callable[[Site], Site], float, str]] = {
+    "another machine": (lambda s: replace(s, name="other", doc=s.doc | {"name": "other"}), 0.0, "MACHINE: the table is for 'sim'"),
+    "another tool": (lambda s: replace(s, doc=s.doc | {"tool_mm": [0.0, 0.0, -90.0]}), 0.0, "MACHINE: the machine file describes another"),
+    "another temperature window": (lambda s: replace(s, limits=replace(s.limits, temperature_c=(30.0, 32.0))), 0.0, "TEMPERATURE"),
+    "a wider temperature window": (
+        lambda s: replace(s, limits=replace(s.limits, temperature_c=(10.0, 40.0))),
+        0.0,
+        "LIMITS: .*temperature_c 18 to 24 then, 10 to 40 now",
+    ),
+    "another limit": (lambda s: replace(s, limits=replace(s.limits, value_mm=0.2)), 0.0, "LIMITS: .*value_mm 0.1 then, 0.2 now"),
+    "an old measurement": (lambda s: s, 73.0, "STALE: measured 73"),
+    "too few runs for these limits": (lambda s: replace(s, limits=replace(s.limits, runs=99)), 0.0, "RUNS"),
+    "nobody's approval": (lambda s: s, 0.0, "APPROVAL: nobody has approved it"),
+}
+
+
+@pytest.mark.parametrize("what", CHANGED)
+def test_what_is_not_as_it_was_refuses_the_push_and_writes_nothing(shop, what):
+    change, hours, reason = CHANGED[what]
+    with Store.open(shop.url) as store:
+        number = shop.copy(store)
+        if what != "nobody's approval":
+            approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+        with pytest.raises(TableRefused, match=reason):
+            try_push(shop, store, number, site=change(shop.site), hours=hours)
+        assert store.push_entries("sim") == []
+    assert shop.words() == shop.untouched
+
+
+def test_an_approval_ends_and_binds_who_and_what(shop):
+    with Store.open(shop.url) as store:
+        number = shop.copy(store)
+        approve(store, number, load(store, number), "anna", 0.5, SystemClock())
+        with pytest.raises(TableRefused, match="APPROVAL: the approval of anna expired"):
+            try_push(shop, store, number, hours=1.0)
+
+        own, good = shop.copy(store), store.approvals(number)[0]
+        store.add_approval(replace(good, proposal_id=own, name=f" {login().upper()} "))  # past the check of the command
+        with pytest.raises(TableRefused, match=r"APPROVAL: .* proposed it and cannot be the one"):
+            try_push(shop, store, own)
+
+        other = shop.copy(store)
+        store.add_approval(ApprovalRecord(0, other, "anna", "anna", good.digest, "2099-01-01T00:00:00.000000Z", ""))  # prolonged by hand
+        with pytest.raises(TableRefused, match="APPROVAL: what anna approved is not this table"):
+            try_push(shop, store, other)
+        assert store.push_entries("sim") == []
+    assert shop.words() == shop.untouched
+
+
+def change_row(url: str, number: int, change: Callable[[dict[str, Any]], None], *, sealed: bool) -> None:
+    """Change a row behind the program's back; ``sealed``: with a new digest of the document."""
+    with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as raw:
+        doc = json.loads(raw.execute("SELECT doc FROM proposals WHERE id = ?", (number,)).fetchone()[0])
+        change(doc)
+        raw.execute("UPDATE proposals SET doc = ? WHERE id = ?", (json.dumps(doc), number))
+        if sealed:
+            raw.execute("UPDATE proposals SET digest = ? WHERE id = ?", (digest_of_doc(doc), number))
+        raw.commit()
+
+
+def bend(doc: dict[str, Any]) -> None:
+    doc["candidate"]["columns"][4]["correction_mm"][5] += 0.0001
+
+
+def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys):
+    with Store.open(shop.url) as store:
+        plain, sealed = shop.copy(store), shop.copy(store)
+        for number in (plain, sealed):
+            approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+        change_row(shop.url, plain, bend, sealed=False)
+        change_row(shop.url, sealed, bend, sealed=True)
+        with pytest.raises(StoreError, match="was changed after it was stored"):
+            try_push(shop, store, plain)
+        with pytest.raises(TableRefused, match=r"(?s)HASH.*APPROVAL: what anna approved is not this table"):
+            try_push(shop, store, sealed)
+        assert store.push_entries("sim") == []
+    assert shop.words() == shop.untouched
+    capsys.readouterr()
+    assert run(["comp", "push", shop.file, str(plain), "--before", "start"]) == 2
+    assert "error STO-001" in capsys.readouterr().err
+    assert run(["comp", "show", "--machine", shop.file, "--json"]) == 0  # one bad row does not hide the others
+    states = {p["proposal"]: p["state"] for p in json.loads(capsys.readouterr().out)["proposals"]}
+    assert (states[plain], states[1]) == ("changed", "proposed")
+
+
+def test_a_restarted_control_with_the_same_table_and_generation_is_refused(shop, tmp_path):
+    with simulated(tmp_path, *SIMS) as restarted, Store.open(shop.url) as store:
+        number = shop.copy(store)
+        approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+        before = controller_words(restarted)
+        assert before[2:] == shop.untouched[2:]  # generation, banks
+        assert before[:2] != shop.untouched[:2]  # boot id
+        r = restarted.ready
+        site = replace(shop.site, urls=DeviceUrls(r["cnc"], r["ballbar"], r["laser"], r["fixture"]))
+        with pytest.raises(TableRefused, match=r"(?s)RESTART.*CHANGED"):
+            try_push(shop, store, number, site=site)
+        assert controller_words(restarted) == before
+        assert store.push_entries("sim") == []
+
+
+def test_a_proposal_with_reasons_is_kept_to_look_at_and_goes_nowhere(shop, capsys):
+    strict = shop.sims.machine_file.with_name("strict.toml")
+    strict.write_text(shop.sims.machine_file.read_text() + "table_value_um = 5\n")  # under [limits]
+    capsys.readouterr()
+    assert run(["comp", "propose", str(strict), "june", "--json"]) == 1
+    doc = json.loads(capsys.readouterr().out)
+    assert doc["state"] == "refused"
+    assert any(reason.startswith("VALUE") for reason in doc["reasons"])
+    number = str(doc["proposal"])
+    assert run(["comp", "approve", number, "--as", "anna", "--machine", str(strict)]) == 1
+    assert "reasons against it" in capsys.readouterr().out
+    assert run(["comp", "push", str(strict), number, "--before", "start"]) == 1
+    assert "not pushed: VALUE" in capsys.readouterr().out
+    assert run(["comp", "push", shop.file, number, "--before", "start"]) == 1  # and not under wider limits either
+    assert "not pushed: LIMITS" in capsys.readouterr().out
+    assert shop.words() == shop.untouched
+
+
+def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
+    def abbe(*words: str) -> tuple[int, str]:
+        capsys.readouterr()
+        code = run(["comp", *words])
+        said = capsys.readouterr()
+        assert code != 2, said.err
+        return code, said.out
+
+    def state() -> str:
+        return str(json.loads(abbe("show", "1", "--machine", shop.file, "--json")[1])["state"])
+
+    base = shop.words()[4:8]
+    assert state() == "proposed"
+    page = tmp_path / "diff.html"
+    code, out = abbe("diff", "1", "--machine", shop.file, "--html", str(page))
+    assert (code, out.count(" over ")) == (0, 10)  # nine rows and the largest
+    text = page.read_text()
+    assert text.count("<polyline") == 18
+    assert text.count('class="band"') == 9
+    assert "http" not in text.replace("http-equiv", "")
+    assert abbe("diff", "1", "--with", "1", "--machine", shop.file)[1].count("+0.00") == 10
+
+    # two people: the proposer cannot approve, nobody can push before somebody else has
+    assert abbe("approve", "1", "--machine", shop.file)[0] == 1
+    assert abbe("push", shop.file, "1", "--before", "start")[0] == 1
+    assert shop.words() == shop.untouched
+    assert abbe("approve", "1", "--as", "anna", "--machine", shop.file)[0] == 0
+    assert state() == "approved"
+
+    with Store.open(shop.url) as store:
+        twin = shop.copy(store)
+    with Store.open(shop.url) as store:
+        # the work of `abbe comp push`, patient with a computer that others use, too
+        kept = try_push(shop, store, 1, site=replace(shop.site, watching=Watching(unknown_s=5.0)))
+        assert (kept.decision.keep, kept.proposal) == (True, 1), kept.decision.text
+    assert state() == "kept"
+    with Store.open(shop.url) as store:
+        approved = next(e.doc for e in store.push_entries("sim") if e.state == "APPROVED")
+        assert approved["approval"] == store.approvals(1)[0].digest  # the machine of the push checked the person's own yes
+        assert approved["approved_by"].startswith("anna; pushed by ")
+        entries, docs, proposed = read_entries(store, "sim"), {t.id: t.doc for t in store.tables()}, load(store, 1)
+        now_s = SystemClock().utc().timestamp()
+        assert standing(store, twin, proposed, now_s).word == "superseded"  # of the same time: banks were written since
+        for k, word in ((0, "proposed"), (1, "pushed"), (len(entries) - 1, "pushed"), (len(entries), "kept")):
+            assert standing_of(1, proposed, [], entries[:k], docs, now_s).word == word
+        assert standing_of(1, proposed, [], [], docs, proposed.valid_until_s).word == "expired"
+    pushed = shop.words()
+    code, out = abbe("push", shop.file, str(twin), "--before", "start")
+    assert code == 1
+    assert "not pushed: BASE" in out
+    assert shop.words() == pushed
+
+    assert abbe("rollback", shop.file)[0] == 0
+    assert active_crc(shop.sims) == base_crc(base)
+    assert state() == "rolled back"
+
+    # the base is in force again, byte for byte, but banks were written since: another generation
+    before = shop.words()
+    with Store.open(shop.url) as store:
+        entries = len(store.push_entries("sim"))
+        again = shop.copy(store)
+        row = store.approvals(1)[0]
+        store.add_approval(replace(row, proposal_id=again))
+        with pytest.raises(TableRefused, match="GENERATION") as refused:
+            try_push(shop, store, again)
+        assert "BASE" not in str(refused.value)
+        assert len(store.push_entries("sim")) == entries
+    assert shop.words() == before
+    code, out = abbe("approve", "1", "--as", "anna", "--machine", shop.file)
+    assert (code, "rolled back" in out) == (1, True)
+
+
+def active_crc(sims: Sims) -> int:
+    words = registers(sims, 208, 5)
+    high, low = words[1 + 2 * words[0] :][:2]
+    return high << 16 | low
+
+
+def base_crc(words: tuple[int, ...]) -> int:
+    high, low = words[1 + 2 * words[0] :][:2]
+    return high << 16 | low

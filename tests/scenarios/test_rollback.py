@@ -1,0 +1,184 @@
+"""The table of before, by a person's order: only what the journal knows, through the same machine, and nothing else is written.
+
+Mutations that were seen to be caught: taking any table in force for known (`test_a_hand_set_table_...`), verdicts without a look at the
+journal (`test_a_table_that_nobody_knows_...`), a journal that is not checked (`test_a_changed_journal_...`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from drivers.cnc.tables import crc32, encode
+from service.cli import run
+from service.errors import PushNotBegun, StoreError, TableMismatch, TableRefused
+from service.push.book import StoreBook, read_entries
+from service.push.entries import check_chain
+from service.push.states import State
+from service.workflows import rollback as workflow
+from service.workflows.base_table import read_base
+from service.workflows.recover import recover
+from service.workflows.rollback import rollback
+from service.workflows.tables import table_image
+from tests.scenarios.test_push import active, bench, last, linear_tables, push, steep
+
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
+
+
+async def generation(session) -> int:
+    return (await session.controller.comp_status()).gen
+
+
+async def test_back_byte_for_byte_and_forward_again_and_to_the_beginning(start_sims, tmp_path):
+    sims = start_sims("--speed", "5")
+    async with bench(sims, tmp_path) as (site, store, session):
+        c = session.controller
+        first = await read_base(c)
+        with pytest.raises(TableRefused, match="nothing to take back"):
+            await rollback(c, store, site)
+        assert (await push(c, store, site, steep(site))).kept
+        kept = await read_base(c)
+        found = await rollback(c, store, site)
+        assert found is not None
+        assert found.how == "the table that was in force before push 1"
+        now = await read_base(c)
+        assert now.image == first.image
+        entries = read_entries(store, "sim")
+        check_chain(entries)
+        of_it = {e.state: e.doc for e in entries if e.push == 2}
+        assert of_it[State.APPROVED]["approved_by"].endswith("rollback")
+        for state, key in ((State.PROBED, "probe"), (State.VERIFIED, "verify")):
+            assert of_it[state][key] == "not measured: byte for byte the table that was in force before push 1; ordered back by a person"
+        assert State.STAGED in of_it  # read back, twice, like any other
+        with pytest.raises(TableRefused, match="was a rollback itself"):
+            await rollback(c, store, site)
+        assert await rollback(c, store, site, 1) is not None
+        assert (await read_base(c)).image == kept.image
+        before = await generation(session)
+        assert await rollback(c, store, site, 1) is None
+        assert await generation(session) == before
+        assert await rollback(c, store, site, 0) is not None
+        assert (await read_base(c)).image == first.image
+        with pytest.raises(TableRefused, match="no push 99"):
+            await rollback(c, store, site, 99)
+        assert (await session.controller.comp_status()).lease_owner == 0
+
+
+async def test_an_open_interlock_leaves_the_table_in_force(start_sims, tmp_path):
+    sims = start_sims("--speed", "5")
+    async with bench(sims, tmp_path) as (site, store, session):
+        await push(session.controller, store, site, steep(site))
+        before, gen = await active(session), await generation(session)
+        sims.ask("estop", on=True)
+        with pytest.raises(PushNotBegun, match="the old table is in force"):
+            await rollback(session.controller, store, site)
+        assert (await active(session), await generation(session), last(store)) == (before, gen, State.ABORTED)
+
+
+async def by_hand(session, image: bytes) -> None:
+    """Somebody else's table comes into force."""
+    c = session.controller
+    await c.lease(7, 60_000)
+    other = 1 - (await c.comp_status()).active_bank
+    await c.write_bank(other, image)
+    await c.seal(other, 7)
+    await c.activate(other, expect_crc=crc32(image), expect_gen=await generation(session), owner=7)
+    await c.release(7)
+
+
+async def test_a_hand_set_table_is_not_overwritten(start_sims, tmp_path):
+    sims = start_sims("--speed", "5")
+    async with bench(sims, tmp_path) as (site, store, session):
+        await push(session.controller, store, site, steep(site))
+        await by_hand(session, encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7)))
+        gen, entries = await generation(session), len(read_entries(store, "sim"))
+        for to in (None, 0, 1):
+            with pytest.raises(TableMismatch, match="not one that the push journal knows"):
+                await rollback(session.controller, store, site, to)
+        assert (await generation(session), len(read_entries(store, "sim"))) == (gen, entries)
+
+
+async def test_a_table_that_nobody_knows_is_refused_by_the_questions_too(start_sims, tmp_path, monkeypatch):
+    """Wherever the image comes from: what the journal does not hold as a base or as kept is not written."""
+    sims = start_sims("--speed", "5")
+    async with bench(sims, tmp_path) as (site, store, session):
+        await push(session.controller, store, site, steep(site))
+        gen = await generation(session)
+        image = encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7))
+        monkeypatch.setattr(workflow, "table_before_last_kept", lambda *_: workflow.Known(image, "m", "a table from elsewhere"))
+        with pytest.raises(TableRefused, match="UNKNOWN"):
+            await rollback(session.controller, store, site)
+        assert (await generation(session), last(store)) == (gen, State.REJECTED)
+
+
+def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, monkeypatch, capsys):
+    sims = start_sims("--speed", "5")
+    honest = StoreBook.append
+
+    async def dies(self, journal, wanted, doc):
+        if journal and journal[-1].state is State.PROBED and journal[-1].push == 2:
+            raise StoreError("the disk is full")
+        return await honest(self, journal, wanted, doc)
+
+    async def kept_and_open() -> tuple[int, int]:
+        async with bench(sims, tmp_path) as (site, store, session):
+            await push(session.controller, store, site, steep(site))
+            kept = await active(session)
+            with pytest.raises(StoreError):
+                await push(session.controller, store, site, linear_tables(site, np.full((3, 3), 2e-6)))
+            assert await active(session) != kept
+            return kept
+
+    async def now() -> tuple[tuple[int, int], list[tuple[int, State]]]:
+        async with bench(sims, tmp_path) as (_, store, session):
+            return await active(session), [(e.push, e.state) for e in read_entries(store, "sim")]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StoreBook, "append", dies)
+        kept = asyncio.run(kept_and_open())
+    assert run(["comp", "rollback", str(sims.machine_file)]) == 0
+    assert "push 2 was open and is finished" in capsys.readouterr().out
+    table, entries = asyncio.run(now())
+    assert (table, entries[-1]) == (kept, (2, State.ROLLED_BACK))
+    assert run(["comp", "rollback", str(sims.machine_file)]) == 0  # ordered once more: further back
+    assert "in force again (push 3" in capsys.readouterr().out
+    assert asyncio.run(now())[0][1] != kept[1]
+
+
+async def test_a_rollback_cut_short_leaves_the_table_that_was_verified(start_sims, tmp_path, monkeypatch):
+    sims = start_sims("--speed", "5")
+    async with bench(sims, tmp_path) as (site, store, session):
+        await push(session.controller, store, site, steep(site))
+        before, honest = await active(session), StoreBook.append
+
+        async def dies(self, journal, wanted, doc):
+            if journal and journal[-1].state is State.PROBED:
+                raise StoreError("the disk is full")
+            return await honest(self, journal, wanted, doc)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(StoreBook, "append", dies)
+            with pytest.raises(StoreError):
+                await rollback(session.controller, store, site)
+        assert "made active again" in await recover(session.controller, store, site)
+        assert (await active(session))[1] == before[1]
+        assert await rollback(session.controller, store, site) is not None  # push 1 is still the last kept one
+
+
+async def test_a_changed_journal_is_no_source_of_tables(start_sims, tmp_path):
+    sims = start_sims("--speed", "5")
+    async with bench(sims, tmp_path) as (site, store, session):
+        await push(session.controller, store, site, steep(site))
+        gen = await generation(session)
+        with closing(sqlite3.connect(tmp_path / "abbe.sqlite3")) as raw:
+            doc = json.loads(raw.execute("SELECT doc FROM push_entries WHERE seq = 0").fetchone()[0])
+            raw.execute("UPDATE push_entries SET doc = ? WHERE seq = 0", (json.dumps(doc | {"base_image": doc["image"]}),))
+            raw.commit()
+        with pytest.raises(StoreError, match="not what was written"):
+            await rollback(session.controller, store, site)
+        assert await generation(session) == gen
