@@ -1,0 +1,185 @@
+"""LinuxCNC as the bridge sees it: one snapshot of its state, a few commands, and the HAL items of machine.hal and volumetric.hal."""
+
+from __future__ import annotations
+
+import select
+from dataclasses import dataclass
+from pathlib import Path
+
+import hal
+import linuxcnc
+from network import Network, parameters
+
+JOINTS = 3
+SWITCH_TRIES, SWITCH_WAIT_S = 5, 0.03
+_LOST = (linuxcnc.error, SystemError, RuntimeError)
+
+
+class ControlGone(Exception):  # noqa: N818 - reads as what it is
+    """LinuxCNC has ended."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The control at one instant. ``ready``: it executes nothing and stands; positions are commanded ones in mm."""
+
+    estop: bool
+    drives_on: bool
+    homed: bool
+    ready: bool
+    in_position: bool
+    interpreting: bool
+    spindle: bool
+    door_open: bool
+    remote: bool
+    override_percent: int
+    position_mm: tuple[float, float, float]
+    line: int
+    queue: int
+
+
+class Control:
+    """A running LinuxCNC with the HAL files of this folder.
+
+    Raises
+    ------
+    ControlGone
+        It does not run, or not with three joints in mm.
+    """
+
+    def __init__(self) -> None:
+        try:
+            self._status, self._command, self._errors = linuxcnc.stat(), linuxcnc.command(), linuxcnc.error_channel()
+            self._status.poll()
+        except _LOST as error:
+            raise ControlGone(f"no status yet ({error})") from None
+        self._sent = -1
+        if self._status.joints != JOINTS or self._status.linear_units != 1.0:
+            raise ControlGone("no control with three joints in mm yet")
+        # Only now: whoever asks for HAL before the control has made it would make one himself.
+        self._component = hal.component("abbe-bridge")
+        self._component.ready()
+        axes = self._status.axis[:JOINTS]
+        self.low_mm = tuple(float(a["min_position_limit"]) for a in axes)
+        self.high_mm = tuple(float(a["max_position_limit"]) for a in axes)
+        self.fastest_mm_s = float(self._status.max_velocity)
+
+    def snapshot(self) -> Snapshot:
+        """Read the control's state.
+
+        Raises
+        ------
+        ControlGone
+            It has ended.
+        """
+        self._poll()
+        s = self._status
+        # The planner is done some servo periods before the joints are: what they are told counts.
+        still = all(self._get(f"joint.{n}.vel-cmd") == 0.0 for n in range(JOINTS))
+        idle = s.state == linuxcnc.RCS_DONE and s.interp_state == linuxcnc.INTERP_IDLE and s.echo_serial_number >= self._sent
+        return Snapshot(
+            estop=s.task_state == linuxcnc.STATE_ESTOP or not self._get("abbe-estop-ok"),
+            drives_on=s.task_state == linuxcnc.STATE_ON,
+            homed=all(s.homed[:JOINTS]),
+            ready=bool(idle and still and s.inpos and s.queue == 0),
+            in_position=bool(s.inpos and still),
+            interpreting=s.interp_state != linuxcnc.INTERP_IDLE,
+            spindle=bool(s.spindle[0]["enabled"]),
+            door_open=bool(self._get("abbe-door-open")),
+            remote=bool(self._get("abbe-remote")),
+            override_percent=round(s.feedrate * 100),
+            position_mm=tuple(float(self._get(f"joint.{n}.pos-cmd")) for n in range(JOINTS)),
+            line=int(s.motion_line),
+            queue=int(s.queue),
+        )
+
+    def complaints(self) -> list[str]:
+        """What the control has told its operator since the last call."""
+        told = []
+        while (entry := self._errors.poll()) is not None:
+            told.append(str(entry[1]).strip())
+        return told
+
+    # ---- motion ------------------------------------------------------------------------------------------------------------------
+
+    def mdi(self, line: str) -> None:
+        """Execute one line of G-code."""
+        self._mode(linuxcnc.MODE_MDI)
+        self._command.mdi(line)
+        self._sent = self._command.serial
+
+    def run(self, program: Path) -> None:
+        """Execute a program from its first line."""
+        self._mode(linuxcnc.MODE_MDI)  # a program that is open in AUTO mode is not opened anew
+        self._mode(linuxcnc.MODE_AUTO)
+        self._command.program_open(str(program))
+        self._command.wait_complete()
+        self._command.auto(linuxcnc.AUTO_RUN, 0)
+        self._sent = self._command.serial
+
+    def abort(self) -> None:
+        """Stop on the path and forget the rest."""
+        self._command.abort()
+        self._sent = self._command.serial
+
+    def estop(self) -> None:
+        """Go into the e-stop state: motion ends where it is, drives go off."""
+        self._command.state(linuxcnc.STATE_ESTOP)
+        self._sent = self._command.serial
+
+    def switch_on(self) -> None:
+        """Leave the e-stop state and switch the drives on, as far as the control lets us within some tenths of a second."""
+        wishes = [(linuxcnc.STATE_ESTOP_RESET, linuxcnc.STATE_ESTOP), (linuxcnc.STATE_ON, linuxcnc.STATE_ESTOP_RESET)]
+        for wish, former in wishes:
+            for _ in range(SWITCH_TRIES):  # the control looks at its e-stop input now and then only
+                self._command.state(wish)
+                self._command.wait_complete(SWITCH_WAIT_S)
+                self._poll()
+                if self._status.task_state != former:
+                    break
+                select.select([], [], [], SWITCH_WAIT_S)
+        self._sent = self._command.serial
+
+    def hold(self, *, on: bool) -> None:
+        """Hold the feed of whatever moves, or let it go."""
+        hal.set_p("abbe-feed.in1", str(int(on)))
+
+    def path_output(self, *, on: bool) -> None:
+        """Set the "path running" output."""
+        hal.set_p("abbe-path.in0", str(int(on)))
+
+    def _mode(self, mode: int) -> None:
+        self._command.mode(mode)
+        self._command.wait_complete()
+
+    # ---- compensation ------------------------------------------------------------------------------------------------------------
+
+    def load(self, bank: int, network: Network) -> bool:
+        """Set the network of a bank; True when every value reads back."""
+        wanted = list(parameters(bank, network))
+        for name, value in wanted:
+            hal.set_p(name, repr(value))
+        return all(self._get(name) == value for name, value in wanted)
+
+    def select(self, bank: int) -> bool:
+        """Let a network act; True when the switch has taken it."""
+        hal.set_p("abbe-switch.in0", str(bank))
+        return int(self._get("abbe-switch.in0")) == bank
+
+    def seen(self) -> bool:
+        """Whether a bridge has run in front of this start of the control before; says so to the next one."""
+        before = bool(self._get("abbe-seen.in0"))
+        hal.set_p("abbe-seen.in0", "1")
+        return before
+
+    def _get(self, name: str) -> float:
+        return hal.get_value(name)
+
+    def _poll(self) -> None:
+        # The status stays readable after the control's end: shared memory lasts as long as somebody looks at it.
+        if not hal.component_exists("motmod"):
+            raise ControlGone("its motion module is unloaded")
+        try:
+            self._status.poll()
+        except _LOST as error:
+            raise ControlGone(str(error) or "no status") from None

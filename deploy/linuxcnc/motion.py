@@ -1,0 +1,235 @@
+"""Moves, paths and holds of the register map, as G-code and signals of the control."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+FIFO_SIZE = 8192
+ALARM_NONE, ALARM_ESTOP = 0, 1
+_ARRIVED_MM = 1e-6
+_BEYOND_MM = 1e-9
+# Absolute, mm, mm/min, no tool offsets or cutter radius; corners blended within 1 um, and no point left out (Q0).
+_MODES = "G21 G90 G94 G17 G40 G49 G80"
+_HEADER = (_MODES, "G64 P0.001 Q0")
+
+Point = tuple[float, float, float]
+
+
+class Result(IntEnum):
+    """MOTION_RESULT and FIFO_RESULT."""
+
+    OK = 0
+    BAD_ARGUMENT = 1
+    INTERLOCK = 2
+    STROKE_LIMIT = 3
+    FIFO_FULL = 4
+    BUSY = 5
+
+
+class Hold(IntEnum):
+    """HOLD_REQUEST."""
+
+    RUN = 0
+    HOLD = 1
+    ABORT = 2
+
+
+@dataclass
+class _Pending:
+    target_mm: Point
+    is_path: bool
+    points: int
+    aborted: bool = False
+
+
+class Motion:
+    """What the bridge has asked the control to do, and how far it is.
+
+    Parameters
+    ----------
+    control : Control
+        The control (any object with its methods).
+    now_us : callable
+        Controller time in microseconds.
+    program : Path
+        File for path programs.
+    """
+
+    def __init__(self, control: Any, now_us: Callable[[], int], program: Path) -> None:
+        self._control, self._now_us, self._program = control, now_us, program
+        self.state = control.snapshot()
+        self.hold = Hold.RUN
+        self.alarm = ALARM_ESTOP if self.state.estop else ALARM_NONE
+        self.done = 0
+        """Motions finished since the start."""
+        self.path_start_us = self.path_end_us = self.in_position_us = 0
+        self.fifo: list[Point] = []
+        self._pending: _Pending | None = None
+        self._path_points = 0
+        control.hold(on=False)
+        control.path_output(on=False)
+
+    # ---- reading -----------------------------------------------------------------------------------------------------------------
+
+    @property
+    def moving(self) -> bool:
+        """A motion of ours is under way, or the axes are."""
+        return self._pending is not None or not self.state.in_position
+
+    @property
+    def path_running(self) -> bool:
+        """A path of ours is under way."""
+        return self._pending is not None and self._pending.is_path
+
+    @property
+    def program_running(self) -> bool:
+        """Somebody else's program is."""
+        return self._pending is None and self.state.interpreting
+
+    @property
+    def held(self) -> bool:
+        """The feed is held: asked for, or the door is open."""
+        return self.hold == Hold.HOLD or self.state.door_open
+
+    @property
+    def fifo_free(self) -> int:
+        """Points that still fit."""
+        running = self._pending.points - self.points_done if self.path_running and self._pending else 0
+        return FIFO_SIZE - len(self.fifo) - running
+
+    @property
+    def points_done(self) -> int:
+        """Points reached of the running or last path."""
+        if self._pending is None or not self._pending.is_path:
+            return self._path_points
+        # At rest the control still shows the line of the program before.
+        line = 0 if self.state.in_position else self.state.line
+        return min(max(line - len(_HEADER) - 2, self._path_points), self._pending.points)
+
+    def may_move(self) -> bool:
+        """Whether the interlocks of motion hold."""
+        s = self.state
+        blocked = s.estop or s.door_open or s.spindle or self.alarm != ALARM_NONE or self.program_running
+        return not blocked and s.remote and s.homed and s.drives_on
+
+    # ---- time --------------------------------------------------------------------------------------------------------------------
+
+    def tick(self) -> None:
+        """Look at the control, and see what has ended."""
+        self.state = self._control.snapshot()
+        if self.state.estop and self.alarm != ALARM_ESTOP:
+            self.alarm = ALARM_ESTOP
+            self._control.estop()  # also when the button was pressed for so short a time that the control has missed it
+        if self._pending is None:
+            return
+        if self.state.estop or not self.state.drives_on:
+            self.fifo.clear()
+            self._end(counts=False)
+            return
+        self._path_points = self.points_done if self._pending.is_path else self._path_points
+        arrived = max(abs(a - b) for a, b in zip(self.state.position_mm, self._pending.target_mm, strict=True)) < _ARRIVED_MM
+        if arrived and self.state.in_position and self.state.queue == 0 and not self.in_position_us:
+            self.in_position_us = self._now_us()
+        if self.state.ready:
+            self._path_points = self._pending.points if arrived and self._pending.is_path else self._path_points
+            self._end(counts=arrived or self._pending.aborted)
+
+    def _end(self, *, counts: bool) -> None:
+        self.in_position_us = self.in_position_us or self._now_us()
+        if self._pending is not None and self._pending.is_path:
+            self.path_end_us = self.in_position_us
+            self._control.path_output(on=False)
+        self._pending = None
+        self.done += int(counts)
+
+    # ---- commands ----------------------------------------------------------------------------------------------------------------
+
+    def move(self, target_mm: Point, feed_mm_min: float) -> Result:
+        """Go straight to a target in machine coordinates."""
+        refusal = self._refusal(feed_mm_min) or self._strokes([target_mm])
+        if refusal:
+            return refusal
+        self._begin(_Pending(target_mm, is_path=False, points=0))
+        self._control.mdi(f"{_MODES} G61 {_line(target_mm)} F{feed_mm_min:.2f}")
+        return Result.OK
+
+    def path_clear(self) -> Result:
+        """Empty the FIFO."""
+        if self._pending is not None:
+            return Result.BUSY
+        self.fifo.clear()
+        return Result.OK
+
+    def push(self, points_mm: list[Point]) -> Result:
+        """Store points. A path that runs is a program already: it cannot be extended here."""
+        if self.path_running:
+            return Result.BUSY
+        refusal = self._strokes(points_mm)
+        if not refusal and len(points_mm) > self.fifo_free:
+            return Result.FIFO_FULL
+        if not refusal:
+            self.fifo += points_mm
+        return refusal
+
+    def path_start(self, feed_mm_min: float) -> Result:
+        """Run all points in the FIFO as one program."""
+        refusal = self._refusal(feed_mm_min)
+        if refusal:
+            return refusal
+        if not self.fifo or feed_mm_min / 60.0 > self._control.fastest_mm_s:
+            return Result.BAD_ARGUMENT
+        points, self.fifo = self.fifo, []
+        text = "\n".join([*_HEADER, f"F{feed_mm_min:.2f}", *(_line(p) for p in points), "M2"])
+        self._program.write_text(text + "\n", encoding="ascii")
+        self._path_points, self.path_end_us = 0, 0
+        self._begin(_Pending(points[-1], is_path=True, points=len(points)))
+        self._control.path_output(on=True)
+        self.path_start_us = self._now_us()
+        self._control.run(self._program)
+        return Result.OK
+
+    def reset_alarm(self) -> Result:
+        """Switch on again after an e-stop that is over."""
+        if not self._control.snapshot().drives_on:
+            self._control.switch_on()
+            self.state = self._control.snapshot()
+        if self.state.estop or not self.state.drives_on:
+            return Result.INTERLOCK
+        self.alarm = ALARM_NONE
+        return Result.OK
+
+    def request_hold(self, request: Hold) -> None:
+        """Take the level of HOLD_REQUEST."""
+        self.hold = request
+        self._control.hold(on=request == Hold.HOLD)
+        if request == Hold.ABORT:
+            self.fifo.clear()
+            if self._pending is not None and not self._pending.aborted:
+                self._pending.aborted = True
+                self._control.abort()
+
+    def _begin(self, pending: _Pending) -> None:
+        self._control.complaints()
+        self.in_position_us = 0
+        self._pending = pending
+
+    def _refusal(self, feed_mm_min: float) -> Result:
+        if self._pending is not None or (not self.state.in_position and not self.program_running):
+            return Result.BUSY
+        if not self.may_move() or self.hold == Hold.ABORT:
+            return Result.INTERLOCK
+        return Result.OK if feed_mm_min > 0.0 else Result.BAD_ARGUMENT
+
+    def _strokes(self, points_mm: list[Point]) -> Result:
+        low, high = self._control.low_mm, self._control.high_mm
+        inside = all(low[n] - _BEYOND_MM <= p[n] <= high[n] + _BEYOND_MM for p in points_mm for n in range(3))
+        return Result.OK if inside else Result.STROKE_LIMIT
+
+
+def _line(point_mm: Point) -> str:
+    x, y, z = point_mm
+    return f"G53 G1 X{x:.5f} Y{y:.5f} Z{z:.5f}"
