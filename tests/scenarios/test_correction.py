@@ -30,7 +30,7 @@ from service.workflows.recover import recover
 from service.workflows.tables import table_image
 from tests.pretended import as_if_commissioned
 
-pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(600)]
 RATE_HZ = 50
 
 
@@ -67,7 +67,9 @@ async def shop(start_sims, tmp_path):
     machine = machine_from_doc(sims.ready["machine"])
     urls = DeviceUrls(sims.ready["cnc"], sims.ready["ballbar"], sims.ready["laser"], sims.ready["fixture"])
     until = dict.fromkeys(("ballbar", "laser"), date.max)
-    wavy = PushLimits(second_mm=0.02)  # four tests of the identification are left out to save time: the tables bend more than they should
+    # four tests of the identification are left out to save time: the tables bend more than they should, and the drift below has to be
+    # large beside what these runs can tell
+    wavy = PushLimits(value_mm=0.2, second_mm=0.05, change_mm=0.1)
     site = Site("sim", machine, machine_doc("sim", machine), urls, limits=wavy, calibrated_until=until)
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         async with open_session(urls) as session:
@@ -165,14 +167,14 @@ async def test_a_stop_and_a_wrong_sign_take_the_table_back_and_the_right_one_sta
         await shop.correct("june", shop.before)
 
     # the machine drifts; measured with its table and corrected again, the new table is the old one plus the change
-    shop.ask("drift", axis="X", um_per_m=60.0)
+    shop.ask("drift", axis="X", um_per_m=120.0)
     await shop.identify("july")
     before = await shop.check("july-before")
     second = await shop.correct("july", before)
     assert second.decision.keep is True
     assert second.after.worst.value_mm < 0.7 * second.before.worst.value_mm
     slope = np.polyfit(second.tables.position_mm[0], (second.tables.correction_mm[0] - first.tables.correction_mm[0])[:, 0], 1)[0]
-    assert slope == pytest.approx(-60e-6, abs=8e-6)
+    assert slope == pytest.approx(-120e-6, abs=12e-6)
 
     if not os.environ.get("ABBE_TEST_LONG"):
         return
