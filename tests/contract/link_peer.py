@@ -10,7 +10,7 @@ from drivers.links.backoff import Backoff
 from drivers.links.modbus_link import ModbusLink
 from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 
-TIMEOUT_S = 0.15
+TIMEOUT_S = 0.4
 
 
 @pytest.fixture
