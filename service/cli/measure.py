@@ -130,10 +130,12 @@ def correct(
     from service.workflows.commission import check_commissioned
     from service.workflows.correct import Correction
     from service.workflows.correct import correct as work_correct
+    from service.workflows.proposals import check_certificates
     from service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
+    check_certificates(site)
 
     said: list[str] = []
 

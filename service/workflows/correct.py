@@ -15,7 +15,7 @@ from models.compensation.sign_probe import expected_changes, probe
 from models.compensation.tables import NineTables, Predicted
 from service.clock import Clock, SystemClock
 from service.devices.session import Session
-from service.errors import TableRefused, TakenBack
+from service.errors import AbbeError, TableRefused, TakenBack
 from service.events import Progress, ProgressSink
 from service.push.operations import Verdict
 from service.sequences.campaigns import verification
@@ -293,7 +293,11 @@ async def _push_and_verify(work: _Correcting, wanted: Wanted) -> tuple[Pushed, F
     if work.after is None or work.decision is None:
         raise TakenBack(f"the table was taken back: {pushed.why}", "look at the control's convention: abbe comp commission")
     decision = work.decision if pushed.kept == work.decision.keep else Decision(pushed.kept, pushed.why)
-    await _store_verification(bench, work.verified_as, pushed, work.after, decision)
+    try:
+        await _store_verification(bench, work.verified_as, pushed, work.after, decision)
+    except AbbeError as error:  # what the control does is decided and done; only the note of it is missing
+        error.add_note(f"the table is {'kept and in force' if decision.keep else 'taken back'}: {decision.text}")
+        raise
     return pushed, work.after, decision
 
 

@@ -165,6 +165,20 @@ def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:
                 )
 
 
+def check_certificates(site: Site) -> None:
+    """Without a certificate of any instrument nothing will be pushed: said before an hour is measured for it.
+
+    Raises
+    ------
+    TableRefused
+        The machine file names no certificate.
+    """
+    if not site.calibrated_until:
+        raise TableRefused(
+            "the instruments have no calibration certificate", "name them under [calibration] in the machine file; nothing was measured"
+        )
+
+
 def login() -> str:
     """The account of whoever sits at this command line."""
     try:

@@ -122,6 +122,12 @@ def test_bad_input_is_one_line(abbe: Abbe, arguments: list[str], message: str) -
     assert message in abbe.fails(*arguments)
 
 
+def test_without_a_certificate_nothing_is_measured_for_a_table(abbe: Abbe, machine: Path) -> None:
+    said = abbe.fails("correct", machine, "june")
+    assert "certificate" in said
+    assert "[calibration]" in said
+
+
 def test_no_command_prints_the_help(abbe: Abbe) -> None:
     result = abbe()
     assert result.code == 2
