@@ -37,9 +37,6 @@ MOST_CHECKS = 400
 MOST_KNOTS = 200
 FARTHEST = 20.0
 """Nothing is said beyond so many times the length of the series."""
-JUMP_SIGMAS = 5.0
-JUMP_SHARE = 0.25
-"""A jump is more than so many standard uncertainties, and more than this share of the limit: the spread of few checks is not known."""
 
 
 @dataclass(frozen=True)
@@ -188,21 +185,6 @@ def trend(days: F1, values: F1, u: F1, limit: float | None = None) -> Trend:
     mean, bound = ewma(z)
     ahead = forecast(days[-MOST_CHECKS:], values[-MOST_CHECKS:], u[-MOST_CHECKS:], limit)
     return Trend(state, direction, began, found, z, mean, bound, high, low, ahead)
-
-
-def mean_of(values: F1, u: F1) -> tuple[float, float]:
-    """Weighted mean of figures and its standard uncertainty."""
-    weight = 1.0 / u**2
-    return float(weight @ values / weight.sum()), float(1.0 / np.sqrt(weight.sum()))
-
-
-def jumps(change: float, u_change: float, limit: float) -> bool:
-    """Whether a figure grew by more than its uncertainty explains, where fewer than `MIN_CHECKS` have not yet shown their spread.
-
-    The stated uncertainties are believed here, which the chart does not need; `JUMP_SIGMAS` and `JUMP_SHARE` leave room for what they
-    do not hold.
-    """
-    return change > JUMP_SIGMAS * u_change and change > JUMP_SHARE * limit
 
 
 def _since(side: F1, found: int) -> int:

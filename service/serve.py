@@ -1,8 +1,7 @@
 """The unattended service: what is wired to what, in which order it starts, and in which order it stops.
 
-This is the core process: devices, timetable, jobs, MQTT. It answers no HTTP; the page is a process of its own (`service.web.process`) that
-it starts, tells and hears over a channel of its own (`service.channel`). Start: store, MQTT, timetable, page. Stop, within five seconds: a
-running check is cancelled (the devices hold the motion), the page closes, the broker is told "offline", the store is closed.
+Start: store, MQTT, timetable, page. Stop, within five seconds: a running check is cancelled (the devices hold the motion), the page
+closes, the broker is told "offline", the store is closed.
 """
 
 from __future__ import annotations
@@ -14,51 +13,38 @@ import socket
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
+from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import structlog
 
 from service.audit.book import AuditBook, this_account
 from service.audit.chain import Event
-from service.channel.messages import PROTOCOL, Begin, NeedsTold, RulesTold, ScheduleTold
 from service.clock import Clock, SystemClock
-from service.core.jobs import JobBook
-from service.core.moment import Moments
-from service.core.open_ends import OpenEnds, Recover
-from service.core.rights import may_measure
-from service.core.systemd import notify
-from service.core.watch import BoardWatch, StateTeller
-from service.core.web_process import WebProcess
 from service.errors import ConfigError
+from service.events import Progress
 from service.mqtt.broker import Broker
 from service.mqtt.outbox import StoreOutbox
 from service.mqtt.publisher import Publisher
 from service.mqtt.topics import Topics
-from service.plant.gather import Gatherer
-from service.plant.opcua.setup import OpcUaSetup
-from service.scheduler.desk import AlarmDesk, Duties, Telling
 from service.scheduler.job import CheckJob
 from service.scheduler.keep import StoreLedger, StoreShelf
 from service.scheduler.loop import Scheduler, Terms
-from service.scheduler.ports import Check, JobWatcher, Readiness
+from service.scheduler.ports import Check, Doc, JobWatcher, Readiness
 from service.scheduler.ready import AlwaysReady
 from service.scheduler.slots import Schedule
-from service.scheduler.station import Station
 from service.scheduler.store import ServiceStore
 from service.scheduler.windows import Window
 from service.storage.engine import parse_url
-from service.storage.private import database_seen_by_others
+from service.users.people import People
+from service.web.app import create_app
 from service.web.board import Board
-from service.web.listening import bind, check_certificate, check_exposure
+from service.web.door import Door
+from service.web.server import bind, check_certificate, check_exposure, make_server
 from service.web.view import View
-from service.workflows.report_parts import Rules
-
-if TYPE_CHECKING:
-    from service.plant.opcua.server import OpcUaServer
 
 log = structlog.get_logger("abbe.serve")
 
@@ -103,18 +89,6 @@ class Setup:
         Under which other computers ask for the page.
     certificate, key : str
         PEM files of the page; empty: plain HTTP.
-    opcua : OpcUaSetup or None
-        Where OPC UA clients may read; checked.
-    recipes : tuple of str
-        What a person may start at any time, besides those of the timetable.
-    recover : callable, optional
-        Given the open store, returns how what an earlier end has left open is closed.
-    behind_tls : bool
-        A reverse proxy on this computer takes off the TLS.
-    rules : Rules
-        Limits, certificates and temperatures that reports add to the data.
-    duties : callable, optional
-        Given the open store, what is done about alarms; None: none are raised.
     """
 
     machine: str
@@ -132,12 +106,23 @@ class Setup:
     names: tuple[str, ...] = ()
     certificate: str = ""
     key: str = ""
-    opcua: OpcUaSetup | None = None
-    recipes: tuple[str, ...] = ()
-    recover: Callable[[ServiceStore], Recover] | None = None
-    behind_tls: bool = False
-    rules: Rules = field(default_factory=Rules)
-    duties: Callable[[ServiceStore], Duties] | None = None
+
+
+class _StateTeller:
+    """Keeps the retained state message true."""
+
+    def __init__(self, publisher: Publisher, clock: Clock) -> None:
+        self._publisher = publisher
+        self._clock = clock
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        self._publisher.set_state("measuring", at_utc, schedule=schedule.name)
+
+    def job_progress(self, progress: Progress) -> None:
+        pass  # the state is retained, so every change is a write in the broker: progress is for the page
+
+    def job_ended(self, doc: Doc | None) -> None:
+        self._publisher.set_state("online", self._clock.utc())
 
 
 class Service:
@@ -146,76 +131,32 @@ class Service:
     def __init__(self, setup: Setup, store: ServiceStore, listening: socket.socket, clock: Clock) -> None:
         self._setup = setup
         self._store = store
-        self._clock = clock
         self._listening = listening
+        self._clock = clock
         self.board = Board(setup.devices, clock)
         self._publisher = self._make_publisher()
-        self._station = Station(setup.machine, version("abbe"), store, lambda: self._scheduler.next_due(), clock)
-        watchers: list[JobWatcher] = [BoardWatch(self.board, self._changed), self._station]
+        watchers: list[JobWatcher] = [self.board]
         if self._publisher is not None:
-            watchers.append(StateTeller(self._publisher, clock))
+            watchers.append(_StateTeller(self._publisher, clock))
         topics = (setup.topics.verification, setup.topics.alarm) if self._publisher is not None else None
-        self._shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
-        book = AuditBook(store, setup.store_url)
-        desk = self._make_desk(book, watchers)
-        job = CheckJob(setup.machine, setup.check(store), self._shelf, watchers, clock, desk.checked if desk is not None else None)
-        recipes = tuple(dict.fromkeys([*setup.recipes, *(schedule.recipe for schedule in setup.schedules)]))
-        self._jobs = JobBook(job.run, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed)
-        terms = Terms(setup.maintenance, setup.ready(clock), errands=desk)
-        self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._jobs, self._shelf, clock, terms)
-        moments = Moments(self.board, self._jobs, self._scheduler.next_due, clock)
-        self._web = WebProcess(self._begin(recipes), listening, moments.now, self._jobs, clock)
-        self._opcua = self._make_opcua()
-        doc = {"host": setup.host, "port": listening.getsockname()[1]}
-        book.write(Event(this_account(), "abbe serve", setup.machine, "begun", doc))
-
-    def _begin(self, recipes: tuple[str, ...]) -> Begin:
-        setup = self._setup
+        shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
+        self._job = CheckJob(setup.machine, setup.check(store), shelf, watchers, clock)
+        terms = Terms(setup.maintenance, setup.ready(clock))
+        self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._job, shelf, clock, terms)
         broker = "" if setup.broker is None else str(setup.broker)
+        view = View(setup.machine, version("abbe"), self.board, store, self._scheduler.next_due, broker, clock)
+        book = AuditBook(store, setup.store_url)
+        book.write(Event(this_account(), "abbe serve", setup.machine, "begun", {"host": setup.host, "port": listening.getsockname()[1]}))
+        people = People(store, clock)
+        people.passwords.prepare()
         hosts = (*LOCAL, *setup.names, *(() if setup.host in EVERYWHERE else (setup.host,)))
-        return Begin(
-            "begin",
-            PROTOCOL,
-            setup.machine,
-            version("abbe"),
-            setup.store_url,
-            broker,
-            hosts,
-            setup.certificate,
-            setup.key,
-            recipes,
-            self._listening.getsockname()[1],
-            setup.behind_tls,
-            tuple(ScheduleTold(**asdict(schedule) | {"needs": NeedsTold(**asdict(schedule.needs))}) for schedule in setup.schedules),
-            RulesTold(**asdict(setup.rules)),
-        )
-
-    def _changed(self) -> None:
-        self._web.changed()
+        app = create_app(view, version=version("abbe"), hosts=hosts, door=Door(store, people, book))
+        self._server = make_server(app, setup.certificate, setup.key)
 
     def _make_publisher(self) -> Publisher | None:
-        setup, board = self._setup, self.board
-        if setup.broker is None:
+        if self._setup.broker is None:
             return None
-        outbox = StoreOutbox(self._store, setup.topics, self._clock)
-        return Publisher(setup.broker, setup.topics, outbox, self._clock, board.broker, board.messages_dropped)
-
-    def _make_opcua(self) -> OpcUaServer | None:
-        setup = self._setup
-        if setup.opcua is None:
-            return None
-        from service.plant.opcua.server import OpcUaServer  # an extra, and slow to import
-
-        broker = "" if setup.broker is None else str(setup.broker)
-        view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock)
-        return OpcUaServer(setup.opcua, Gatherer(view.status, self._store), self._clock, setup.machine, version("abbe"))
-
-    def _make_desk(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmDesk | None:
-        setup = self._setup
-        if setup.duties is None:
-            return None
-        telling = Telling(setup.topics.alarm if self._publisher is not None else None, self._posted, book, watchers)
-        return AlarmDesk(self._store, self._clock, setup.machine, setup.schedules, setup.duties(self._store), telling)
+        return Publisher(self._setup.broker, self._setup.topics, StoreOutbox(self._store), self._clock, self.board.broker)
 
     def _posted(self) -> None:
         if self._publisher is not None:
@@ -224,15 +165,11 @@ class Service:
     async def run(self, stop: asyncio.Event, *, once: bool) -> bool:
         """Work until ``stop``, or, with ``once``, until every recipe was run once; return whether all of those passed."""
         passed = True
-        if self._opcua is not None:
-            await self._opcua.prepare()
         async with asyncio.TaskGroup() as parts:
             mqtt = parts.create_task(self._publisher.run() if self._publisher is not None else stop.wait(), name="mqtt")
-            parts.create_task(self._web.run(), name="web")
-            work = parts.create_task(self._once() if once else self._timetable(parts), name="scheduler")
+            parts.create_task(self._server.serve(sockets=[self._listening]), name="web")
+            work = parts.create_task(self._once() if once else self._timetable(), name="scheduler")
             beat = parts.create_task(self._heartbeat(), name="heartbeat")
-            opcua = parts.create_task(self._opcua.run(stop) if self._opcua is not None else stop.wait(), name="opcua")
-            station = parts.create_task(self._station.run(), name="station")
             stopped = parts.create_task(stop.wait(), name="stop")
             try:
                 await asyncio.wait({work, stopped}, return_when=asyncio.FIRST_COMPLETED)
@@ -243,13 +180,12 @@ class Service:
             if work.done() and not work.cancelled() and work.exception() is None:
                 passed = work.result()
             work.cancel()
-            by_hand = parts.create_task(self._jobs.close(), name="jobs")
-            await asyncio.wait({work, by_hand}, timeout=HOLD_S)
+            await asyncio.wait({work}, timeout=HOLD_S)
             self._ask_to_end()
             await asyncio.wait({mqtt}, timeout=GOODBYE_S)
             mqtt.cancel()  # a broker that accepts connections and then says nothing would hold us up
-            for task in (beat, stopped, opcua, station):
-                task.cancel()
+            beat.cancel()
+            stopped.cancel()
         return passed
 
     def _ask_to_end(self) -> None:
@@ -258,28 +194,18 @@ class Service:
         A cancellation alone can get lost: ``asyncio.wait_for`` of Python 3.11 swallows one that comes together with what it waits for, such
         as the broker's acknowledgement, and the service would stay half dead for ever.
         """
-        self._web.stop()
+        self._server.should_exit = True
         if self._publisher is not None:
             self._publisher.stop()
 
-    async def _timetable(self, parts: asyncio.TaskGroup) -> bool:
-        self._jobs.open(self._scheduler, parts)
+    async def _timetable(self) -> bool:
         for schedule, slot in self._scheduler.next_due():
             log.info("planned", schedule=schedule.name, next_utc=slot.isoformat())
-        async with asyncio.TaskGroup() as tasks:
-            if self._setup.recover is not None:
-                recover, told = self._setup.recover(self._store), self.board.attention
-                ends = OpenEnds(recover, self._scheduler, self._shelf, told, self._clock, self._attention_changed)
-                tasks.create_task(ends.run(), name="recovery")
-            await self._scheduler.run()
+        await self._scheduler.run()
         return True
 
-    def _attention_changed(self) -> None:
-        self.board.changed()
-        self._changed()
-
     async def _once(self) -> bool:
-        states = [await self._jobs(replace(s, name=f"{s.name} (once)"), self._clock.utc()) for s in self._setup.schedules]
+        states = [await self._job(replace(s, name=f"{s.name} (once)"), self._clock.utc()) for s in self._setup.schedules]
         with suppress(TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 # Messages that are not delivered now are delivered by the next start.
@@ -332,14 +258,11 @@ async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer
     for number in (signal.SIGTERM, signal.SIGINT):
         # signal.signal rather than add_signal_handler: it works on Windows too, and the loop is woken either way.
         signal.signal(number, from_any_thread)
-    reach = partial(check_exposure, tls=bool(setup.certificate), names=setup.names, behind_tls=setup.behind_tls)
-    await asyncio.to_thread(reach, setup.host, lambda: _admins(setup.store_url))
+    await asyncio.to_thread(check_exposure, setup.host, lambda: _users(setup.store_url), tls=bool(setup.certificate))
     check_certificate(setup.certificate, setup.key)
     listening = bind(setup.host, setup.port)
     try:
         store = await asyncio.to_thread(ServiceStore.open, setup.store_url)
-        if words := database_seen_by_others(setup.store_url):
-            log.warning("database", text=words)
         try:
             host, port = listening.getsockname()[:2]
             scheme = "https" if setup.certificate else "http"
@@ -352,15 +275,27 @@ async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer
         listening.close()
 
 
-def _admins(url: str) -> int:
-    """How many admins may log in; a database that is not there yet has none, and is not made for the question."""
+def _users(url: str) -> int:
+    """How many may log in; a database that is not there yet has none, and is not made for the question."""
     parsed = parse_url(url)
     if parsed.drivername == "sqlite" and not Path(parsed.database or "").is_file():
         return 0
     with ServiceStore.open(url) as store:
-        return store.active_admins()
+        return store.active_users()
 
 
 def _cut_off() -> None:
     log.error("something did not stop in time; ending the process")
     os._exit(1)
+
+
+def notify(state: str) -> None:
+    """Tell systemd (``sd_notify``). Does nothing where nobody listens."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    if address.startswith("@"):
+        address = "\0" + address[1:]
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+        channel.connect(address)
+        channel.send(state.encode())

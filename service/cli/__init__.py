@@ -107,8 +107,8 @@ def complain(code: str, text: str) -> int:
     int
         Exit code for bad input.
     """
-    from service.secrets import mask_secrets, visible
+    from service.secrets import mask_secrets
 
     if sys.stderr is not None:  # closed: only the exit code is left
-        sys.stderr.write(f"error {code}: {visible(mask_secrets(' '.join(text.split())))}\n")
+        sys.stderr.write(f"error {code}: {mask_secrets(' '.join(text.split()))}\n")
     return BAD_INPUT

@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
+import logging
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.errors import AbbeError
-
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from service.config import Loaded
-    from service.config_timetable import AlarmSection
     from service.events import ProgressSink
-    from service.mqtt.broker import Broker
-    from service.plant.opcua.setup import OpcUaSetup
-    from service.scheduler.desk import Duties
     from service.scheduler.ports import Check, CheckResult
     from service.scheduler.slots import Schedule
     from service.scheduler.store import ServiceStore
-    from service.sequences.control import Control
-    from service.sequences.steps import CampaignPlan
     from service.serve import Setup
     from service.site import Site
-    from service.workflows.alarm_states import Alarm
-    from service.workflows.investigate import Note
-    from service.workflows.push_approved import Outcome
 
 
 def serve(
@@ -39,7 +28,6 @@ def serve(
 ) -> None:
     """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
     from service.config import load_machine
-    from service.logs import configure_logs
     from service.serve import serve as run
 
     setup = setup_of(load_machine(machine), port)
@@ -62,39 +50,30 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     AbbeError
         A schedule names no recipe, or its paths leave the machine's strokes: better now than at the first slot, at night.
     """
+    from service.mqtt.broker import parse
     from service.mqtt.topics import Topics
     from service.scheduler.ready import Ready, look_at
     from service.scheduler.timetable import schedules_of, windows_of
-    from service.sequences.check import dry_run_campaign, paced
-    from service.sequences.steps import CampaignPlan
     from service.serve import Setup
     from service.site import site_of
-    from service.workflows.at_start import recover_at_start
     from service.workflows.check import run_check
-    from service.workflows.investigate import campaign_plan
-    from service.workflows.report import rules_of
-    from service.workflows.shipped import RECIPES
 
     config = loaded.machine
     site = site_of(config)
 
     def check_on(store: ServiceStore) -> Check:
-        async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:
-            return await run_check(config, store, recipe, progress, control=control)
+        async def check(recipe: str, progress: ProgressSink) -> CheckResult:
+            return await run_check(config, store, recipe, progress)
 
         return check
 
-    plan = CampaignPlan("", ())
-    if any(entry.on_alarm == "propose" for entry in config.schedule):
-        plan = paced(campaign_plan(config.alarm.campaign, site.machine, loaded.path.resolve().parent), site.max_feed_mm_min)
-        dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     return Setup(
         machine=config.name,
         doc=site.doc,
         devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
         schedules=_measurable(schedules_of(config), site),
         store_url=loaded.database_url,
-        broker=_broker(loaded),
+        broker=None if config.mqtt.url is None else parse(config.mqtt.url),
         topics=Topics(config.mqtt.topic_prefix, config.name),
         host=config.web.host,
         port=config.web.port if port is None else port,
@@ -104,60 +83,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         names=tuple(config.web.names),
         certificate=_beside(loaded.path, config.web.certificate),
         key=_beside(loaded.path, config.web.key),
-        opcua=_opcua(loaded),
-        recipes=tuple(name for name in sorted(RECIPES) if _fits(name, site)),
-        recover=lambda store: lambda: recover_at_start(store, site),
-        behind_tls=config.web.behind_tls,
-        rules=rules_of(config),
-        duties=duties_on(config.alarm, site, plan),
     )
-
-
-def _broker(loaded: Loaded) -> Broker | None:
-    from dataclasses import replace
-
-    from service.mqtt.broker import parse
-
-    mqtt = loaded.machine.mqtt
-    if mqtt.url is None:
-        return None
-    ca, certificate, key = (_beside(loaded.path, name) for name in (mqtt.ca, mqtt.certificate, mqtt.key))
-    broker = replace(parse(mqtt.url), ca=ca, certificate=certificate, key=key)
-    broker.tls_context()  # better now than at every attempt to connect
-    return broker
-
-
-def _opcua(loaded: Loaded) -> OpcUaSetup | None:
-    from service.plant.opcua.setup import OpcUaSetup
-
-    given = loaded.machine.opcua
-    if not given.enabled:
-        return None
-    clients = tuple(_beside(loaded.path, name) for name in given.clients)
-    setup = OpcUaSetup(given.host, given.port, _beside(loaded.path, given.certificate), _beside(loaded.path, given.key), clients)
-    setup.check()
-    return setup
-
-
-def duties_on(alarm: AlarmSection, site: Site, plan: CampaignPlan, rate_hz: int = 100) -> Callable[[ServiceStore], Duties]:
-    """Return what the service does about alarms, given its store. ``plan``: the full campaign; ``rate_hz``: of verifications."""
-    from service.clock import SystemClock
-    from service.scheduler.desk import Duties
-    from service.workflows.investigate import Bench, investigate
-    from service.workflows.push_approved import push_approved
-
-    def duties(store: ServiceStore) -> Duties:
-        clock = SystemClock()
-
-        async def look_into(one: Alarm, note: Note, progress: ProgressSink) -> None:
-            await investigate(Bench(site, store, plan, clock, progress), one, note)
-
-        async def push(proposal: int, progress: ProgressSink) -> Outcome:
-            return await push_approved(site, store, proposal, clock=clock, progress=progress, rate_hz=rate_hz)
-
-        return Duties(alarm.warn_days, alarm.campaign, look_into, push if alarm.push == "approved" else None)
-
-    return duties
 
 
 def _beside(machine_file: Path, name: str) -> str:
@@ -165,23 +91,45 @@ def _beside(machine_file: Path, name: str) -> str:
     return str(machine_file.resolve().parent / name) if name else ""
 
 
-def _fits(recipe: str, site: Site) -> bool:
-    """Whether a recipe can be offered on this machine at all: its paths lie inside the strokes."""
-    try:
-        _dry_run(recipe, site)
-    except AbbeError:
-        return False
-    return True
-
-
-def _dry_run(recipe: str, site: Site) -> None:
-    from service.sequences.check import dry_run_campaign
-    from service.workflows.shipped import recipe_plan
-
-    dry_run_campaign(site.machine, recipe_plan(recipe, site.machine), site.max_feed_mm_min)
-
-
 def _measurable(schedules: tuple[Schedule, ...], site: Site) -> tuple[Schedule, ...]:
+    from service.sequences.check import dry_run_campaign
+    from service.workflows.check import recipe_plan
+
     for schedule in schedules:
-        _dry_run(schedule.recipe, site)
+        dry_run_campaign(site.machine, recipe_plan(schedule.recipe, site.machine), site.max_feed_mm_min)
     return schedules
+
+
+def configure_logs() -> None:
+    """Log to stderr: one JSON object a line for machines, readable lines in a terminal."""
+    import structlog
+
+    terminal = sys.stderr.isatty()
+    shared: list[structlog.typing.Processor] = [
+        structlog.contextvars.merge_contextvars,
+        structlog.stdlib.add_log_level,
+        structlog.stdlib.add_logger_name,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+    ]
+    structlog.configure(
+        processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
+        logger_factory=structlog.stdlib.LoggerFactory(),
+        wrapper_class=structlog.stdlib.BoundLogger,
+        cache_logger_on_first_use=True,
+    )
+    last: list[structlog.typing.Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta]
+    if terminal:
+        last.append(structlog.dev.ConsoleRenderer())
+    else:
+        last += [structlog.processors.format_exc_info, structlog.processors.JSONRenderer(ensure_ascii=False)]
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=last))
+    logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
+    # Libraries that have something to say at each request or each lost connection: we say it ourselves, once.
+    for name, level in (
+        ("mqtt", logging.CRITICAL),
+        ("uvicorn", logging.WARNING),
+        ("asyncio", logging.WARNING),
+        ("alembic", logging.WARNING),
+    ):
+        logging.getLogger(name).setLevel(level)

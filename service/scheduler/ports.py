@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, Literal, NamedTuple, Protocol
 
 from service.events import Progress, ProgressSink
 from service.scheduler.slots import Schedule
-from service.sequences.control import Control
 
 Verdict = Literal["pass", "fail", "cannot tell"]
 Doc = dict[str, Any]
@@ -63,52 +61,9 @@ class CheckResult(Protocol):
         """The verdict as one sentence."""
         ...
 
-    @property
-    def comparable(self) -> bool:
-        """Whether the figures can be put beside those of other checks."""
-        ...
 
-
-Check = Callable[[str, ProgressSink, Control], Awaitable[CheckResult]]
-"""``check(recipe, progress, control)``: opens the devices, measures, closes them. Cancelling it must leave the machine held; ``control``
-pauses, resumes, stops or aborts it."""
-
-
-class SlotState(str):
-    """What a slot ended as, with the sentence to it."""
-
-    reason: str
-
-    def __new__(cls, state: str, reason: str = "") -> Self:
-        """Make one."""
-        made = super().__new__(cls, state)
-        made.reason = reason
-        return made
-
-
-AfterCheck = Callable[[Doc, int], Awaitable[str]]
-"""``await after(doc, number)``: what a kept verification means beyond itself, as a sentence; empty: nothing."""
-
-
-@dataclass(frozen=True, slots=True)
-class Errand:
-    """Work that no slot asks for: it has the machine alone, as a check, and starts on a schedule's terms.
-
-    ``work``: what is done; None: the schedule's check, under ``name``. ``begun``: told when it has the machine.
-    """
-
-    name: str
-    schedule: Schedule
-    work: Callable[[], Awaitable[None]] | None = None
-    begun: Callable[[], None] | None = None
-
-
-class Errands(Protocol):
-    """Who knows what else is to be done."""
-
-    async def due(self) -> Errand | None:
-        """Return what may start now, or None."""
-        ...
+Check = Callable[[str, ProgressSink], Awaitable[CheckResult]]
+"""``check(recipe, progress)``: opens the devices, measures, closes them. Cancelling it must leave the machine held."""
 
 
 class OpenSlot(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from alembic import command
@@ -13,7 +12,6 @@ from sqlalchemy import Connection, Engine
 
 from service.errors import StoreError
 from service.secrets import mask_secrets
-from service.storage.private import private_file
 
 _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after the other
 
@@ -27,11 +25,6 @@ def head_revision() -> str:
         Alembic revision id.
     """
     return str(ScriptDirectory.from_config(_config()).get_current_head())
-
-
-def known_revisions() -> frozenset[str]:
-    """Every schema revision that this program can bring up to date."""
-    return frozenset(entry.revision for entry in ScriptDirectory.from_config(_config()).walk_revisions())
 
 
 def current_revision(engine: Engine) -> str | None:
@@ -70,7 +63,7 @@ def upgrade(engine: Engine, target: str = "head") -> None:
     before = current_revision(engine)
     if before == script.get_current_head() and target == "head":
         return
-    _require_known(engine, before)
+    _require_known(engine, script, before)
     if before is not None:
         _backup(engine, before)
     with engine.begin() as connection:
@@ -101,8 +94,9 @@ def _config(connection: Connection | None = None) -> Config:
     return config
 
 
-def _require_known(engine: Engine, revision: str | None) -> None:
-    if revision is not None and revision not in known_revisions():
+def _require_known(engine: Engine, script: ScriptDirectory, revision: str | None) -> None:
+    known = {entry.revision for entry in script.walk_revisions()}
+    if revision is not None and revision not in known:
         raise StoreError(
             f"database {mask_secrets(str(engine.url))} has schema {revision}, which this version of Abbe does not know",
             "use the newer Abbe that wrote it, or another database",
@@ -122,7 +116,6 @@ def _backup(engine: Engine, revision: str) -> None:
     copy = Path(f"{database}.before-{revision}")
     if copy.exists():
         return
-    os.close(private_file(copy))  # VACUUM INTO takes an empty file, and leaves it its rights
     raw = engine.raw_connection()  # VACUUM must stand outside of any transaction, also of those that the engine begins
     try:
         raw.cursor().execute("VACUUM INTO ?", (str(copy),))

@@ -20,7 +20,7 @@ RUNNING = "running"
 RELEASED = "released"
 """Claimed and not started by a service that ended: the next one takes it."""
 
-SLOT_COLUMNS = (slots.c.id, slots.c.schedule, slots.c.slot_utc, slots.c.state, slots.c.reason, slots.c.claimed_utc, slots.c.finished_utc)
+_COLUMNS = (slots.c.id, slots.c.schedule, slots.c.slot_utc, slots.c.state, slots.c.reason, slots.c.claimed_utc, slots.c.finished_utc)
 
 
 class SlotStore(StoreBase):
@@ -98,21 +98,21 @@ class SlotStore(StoreBase):
         list of SlotRecord
             As they were found, in order of time; they belong to this process now.
         """
-        query = select(*SLOT_COLUMNS, slots.c.owner_host, slots.c.owner_pid, slots.c.owner_start)
+        query = select(*_COLUMNS, slots.c.owner_host, slots.c.owner_pid, slots.c.owner_start)
         query = query.where(slots.c.schedule == schedule, slots.c.finished_utc.is_(None)).order_by(slots.c.slot_utc)
         if not self._read(lambda connection: connection.execute(query).all()):
             return []
 
         def work(connection: Connection) -> list[SlotRecord]:
             me = _owner(this_process())
-            return [slot_record(row) for row in connection.execute(query).all() if _is_nobodys(row) and _taken(connection, row, me)]
+            return [_record(row) for row in connection.execute(query).all() if _is_nobodys(row) and _taken(connection, row, me)]
 
         return self._write(work)
 
     def slots_of(self, schedule: str, limit: int = 100) -> list[SlotRecord]:
         """List the latest slots of a schedule, newest first."""
-        query = select(*SLOT_COLUMNS).where(slots.c.schedule == schedule).order_by(slots.c.slot_utc.desc()).limit(limit)
-        return [slot_record(row) for row in self._read(lambda connection: connection.execute(query).all())]
+        query = select(*_COLUMNS).where(slots.c.schedule == schedule).order_by(slots.c.slot_utc.desc()).limit(limit)
+        return [_record(row) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def _mark(self, schedule: str, slot_utc: datetime | str, values: dict[str, object]) -> None:
         key = _slot(slot_utc)
@@ -139,8 +139,7 @@ def _taken(connection: Connection, row: Row[*tuple[Any, ...]], me: dict[str, obj
     return connection.execute(statement).rowcount == 1
 
 
-def slot_record(row: Row[*tuple[Any, ...]]) -> SlotRecord:
-    """Return a row of `SLOT_COLUMNS` as a record."""
+def _record(row: Row[*tuple[Any, ...]]) -> SlotRecord:
     return SlotRecord(row.id, row.schedule, row.slot_utc, row.state, row.reason or "", row.claimed_utc, row.finished_utc)
 
 

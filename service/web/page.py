@@ -10,8 +10,7 @@ from zoneinfo import ZoneInfo
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.web import language, words
-from service.web.frame import current, template_words
+from service.web import words
 from service.web.schemas import Status, Verification
 from service.web.trend import Point, trend_svg
 
@@ -31,17 +30,13 @@ def environment() -> Environment:
         loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     env.filters["number"] = words.number
-    env.filters["span"] = lambda seconds: language.span(current().lang, seconds)
-    # Pictures come from our own SVG writer, which has escaped every text; escaping again would show the reader the tags.
-    env.filters["picture"] = Markup
-    env.globals |= template_words()
+    env.filters["span"] = words.span
     return env
 
 
 def render(env: Environment, status: Status, past: Sequence[Verification]) -> str:
     """Return the page."""
     zone: tzinfo = ZoneInfo(status.next_due[0].timezone) if status.next_due else UTC
-    lang = current().lang
     return env.get_template("page.html").render(
         status=status,
         past=past,
@@ -51,11 +46,9 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
         trends=trends(past, zone),
         marks=MARKS,
         zone=zone,
-        machine=status.machine,
-        name=lambda key: language.figure(lang, key),
+        name=words.figure_name,
         stamp=lambda moment: words.stamp(moment, zone),
-        ago=lambda moment: language.ago(lang, moment, status.now_utc),
-        due_words=lambda one: language.due(lang, one.due_utc, status.now_utc),
+        ago=lambda moment: words.ago(moment, status.now_utc),
     )
 
 
@@ -69,7 +62,7 @@ def trends(past: Sequence[Verification], zone: tzinfo) -> list[Markup]:
     """Return a plot for each figure."""
     plots = []
     for key in figures(past):
-        name, unit = language.figure(current().lang, key)
+        name, unit = words.figure_name(key)
         points = [
             Point(check.started_utc, value, check.uncertainties.get(key) or 0.0, check.limits.get(key), figure_verdict(check, key))
             for check in past

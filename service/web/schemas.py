@@ -57,8 +57,6 @@ class Job(_Answer):
     schedule: str
     recipe: str
     since_utc: datetime
-    id: str = ""
-    state: str = "running"
     stage: str = ""
     message: str = ""
     done: float = 0.0
@@ -84,28 +82,10 @@ class Mqtt(_Answer):
     broker: str = ""
     connected: bool = False
     waiting: int = 0
-    dropped: int = 0
-
-
-class Alarm(_Answer):
-    """An alarm that is active, or that nobody has acknowledged. ``signals``: figures behind it; ``outcome``: what was done so far."""
-
-    alarm: int
-    state: Literal["raised", "acknowledged", "cleared"]
-    recipe: str
-    schedule: str
-    text: str
-    signals: list[dict[str, str | float | None]]
-    raised_utc: datetime
-    acknowledged_by: str = ""
-    cleared_utc: datetime | None = None
-    outcome: str = ""
-    proposal: int | None = None
 
 
 class Status(_Answer):
-    """Everything the page shows. ``revision`` changes when more than the progress of a running check has changed; ``attention``: what needs
-    a person now."""
+    """Everything the page shows. ``revision`` changes when more than the progress of a running check has changed."""
 
     machine: str
     version: str
@@ -115,9 +95,7 @@ class Status(_Answer):
     devices: list[Device]
     next_due: list[Due]
     mqtt: Mqtt
-    alarms: Annotated[list[Alarm], Field(default_factory=list)]
     last: list[Verification]
-    attention: Annotated[list[str], Field(default_factory=list)]
 
 
 class Verifications(_Answer):

@@ -10,11 +10,10 @@ from zoneinfo import ZoneInfo
 
 from service.clock import Clock
 from service.scheduler.slots import Schedule, cron_in_words
-from service.storage.records import AlarmEntryRecord, VerificationRecord
+from service.storage.records import VerificationRecord
 from service.web import words
-from service.web.schemas import Alarm, Device, Due, Job, Mqtt, Status, Verification
-from service.workflows.alarm_states import folded, is_open
-from service.workflows.alarms import alarm_doc
+from service.web.board import Board
+from service.web.schemas import Due, Mqtt, Status, Verification
 
 
 class Archive(Protocol):
@@ -24,46 +23,8 @@ class Archive(Protocol):
         """Return the latest checks, newest first."""
         ...
 
-    def alarm_entries(self, machine: str) -> list[AlarmEntryRecord]:
-        """Return everything about a machine's alarms."""
-        ...
-
     def waiting_messages(self) -> int:
         """Return how many messages wait for the broker."""
-        ...
-
-
-class Standing(Protocol):
-    """How things stand now. All of it raises CoreSilent while nobody knows."""
-
-    @property
-    def devices(self) -> list[Device]:
-        """The devices, and when they were last heard of."""
-        ...
-
-    @property
-    def job(self) -> Job | None:
-        """The check that runs."""
-        ...
-
-    @property
-    def changes(self) -> int:
-        """Grows when more than the progress of a check has changed."""
-        ...
-
-    @property
-    def mqtt_connected(self) -> bool:
-        """Whether the broker is there."""
-        ...
-
-    @property
-    def mqtt_dropped(self) -> int:
-        """Alarms that were dropped because too many waited for the broker."""
-        ...
-
-    @property
-    def attention(self) -> list[str]:
-        """What needs a person now."""
         ...
 
 
@@ -76,7 +37,7 @@ class View:
         Name of the machine.
     version : str
         Version of this program.
-    board : Standing
+    board : Board
         The moment.
     archive : Archive
         The past.
@@ -92,7 +53,7 @@ class View:
         self,
         machine: str,
         version: str,
-        board: Standing,
+        board: Board,
         archive: Archive,
         next_due: Callable[[], Sequence[tuple[Schedule, datetime]]],
         broker: str,
@@ -126,33 +87,24 @@ class View:
             for row in rows
         ]
 
-    async def ready(self) -> None:
-        """Return if the store can be read and the core has said lately how things stand; else raise what is wrong."""
-        await self.verifications(1)
-        _ = self._board.changes
-
     async def status(self) -> Status:
         """Return everything the page shows."""
         last = await self.verifications(10)
         mqtt = Mqtt(configured=False)
         if self._broker:
             waiting = await asyncio.to_thread(self._archive.waiting_messages)
-            board = self._board
-            mqtt = Mqtt(configured=True, broker=self._broker, connected=board.mqtt_connected, waiting=waiting, dropped=board.mqtt_dropped)
+            mqtt = Mqtt(configured=True, broker=self._broker, connected=self._board.mqtt_connected, waiting=waiting)
         now = self._clock.utc()
-        entries = await asyncio.to_thread(self._archive.alarm_entries, self._machine)
         return Status(
             machine=self._machine,
             version=self._version,
             now_utc=now,
-            revision=f"{last[0].id if last else 0}.{self._board.changes}.{len(entries)}",
+            revision=f"{last[0].id if last else 0}.{self._board.changes}",
             job=self._board.job,
             devices=self._board.devices,
             next_due=[_due(schedule, slot, now) for schedule, slot in self._next_due()],
             mqtt=mqtt,
-            alarms=[Alarm.model_validate(alarm_doc(one)) for one in reversed(folded(entries)) if is_open(one)],
             last=last,
-            attention=self._board.attention,
         )
 
 

@@ -30,6 +30,7 @@ from service.workflows.proposal_checks import Held, hold
 from service.workflows.proposal_doc import load
 from service.workflows.proposals import (
     Made,
+    by_whom,
     check_before_runs,
     check_same_table,
     check_temperature,
@@ -86,7 +87,6 @@ class _Bench:
     rate_hz: int
     progress: ProgressSink
     clock: Clock
-    attended: bool = True
 
 
 async def correct(
@@ -140,7 +140,6 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
     rate_hz: int = 100,
     progress: ProgressSink,
     clock: Clock | None = None,
-    attended: bool = True,
 ) -> Correction:
     """Push a stored proposal: everything that was checked when it was made is checked again, then as `correct`.
 
@@ -150,8 +149,6 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
         Of the proposal.
     before : list of dict
         Verification runs measured with the present table, as ``abbe-run/1``.
-    attended : bool
-        A person orders it. Else the limits of unattended pushes hold as well, and a person's approval is needed in any case.
 
     Raises
     ------
@@ -163,12 +160,12 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
     await recover(session.controller, store, site)
     clock = clock or SystemClock()
     proposed = await asyncio.to_thread(load, store, number)
-    against = (await hold(session.controller, store, site, number, proposed, clock, attended=attended)).reasons()
+    against = (await hold(session.controller, store, site, number, proposed, clock)).reasons()
     if against:
         raise TableRefused("; ".join(against), "nothing was written")
     progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
     made = Made(number, proposed, await solved_again(store, site, proposed.campaign))
-    return await _push(_Bench(session, store, site, rate_hz, progress, clock, attended), made, before)
+    return await _push(_Bench(session, store, site, rate_hz, progress, clock), made, before)
 
 
 async def reasons_now(session: Session, store: Store, site: Site, number: int, clock: Clock | None = None) -> list[str]:
@@ -205,8 +202,8 @@ async def _push(bench: _Bench, made: Made, before: list[dict[str, Any]]) -> Corr
     session, store, proposed = bench.session, bench.store, made.proposed
     site = replace(bench.site, watching=replace(bench.site.watching, suspending=Suspending()))
     bench = replace(bench, site=site)
-    await check_level(session.controller, store, site, attended=bench.attended)
-    held = await hold(session.controller, store, site, made.number, proposed, bench.clock, attended=bench.attended)
+    await check_level(session.controller, store, site)
+    held = await hold(session.controller, store, site, made.number, proposed, bench.clock)
     against = held.reasons()
     if against:
         raise TableRefused("; ".join(against), "nothing was written")
@@ -253,10 +250,7 @@ class _Correcting:
     def reasons(self) -> list[str]:
         """Everything against it; asked again by the machine of the push, with what the controller says of itself by then."""
         drift = [] if self.drift_mm is not None else [UNSEEN]
-        # Decisions are read anew: a person may have rejected it while the ball-bar was read.
-        number, store = self.held.number, self.bench.store
-        now = replace(self.held, rejections=tuple(store.rejections(number)), approvals=tuple(store.approvals(number)))
-        return [*now.reasons(self.drift_mm), *drift]
+        return [*self.held.reasons(self.drift_mm), *drift]
 
     async def probe(self) -> Verdict:
         """Sign, axis and unit of this table, physically; the bar is taken out afterwards, for the verification mounts its own."""
@@ -287,8 +281,8 @@ async def _push_and_verify(work: _Correcting, wanted: Wanted) -> tuple[Pushed, F
     if against:
         raise TableRefused("; ".join(against), "nothing was written")
     await check_commissioned(bench.session.controller, bench.store, bench.site)
-    questions = Questions(work.reasons, work.held.by, work.probe, work.verify, work.held.approval(bench.clock))
-    work.pushing = pushing = Pushing(bench.session.controller, bench.store, bench.site, attended=bench.attended)
+    questions = Questions(work.reasons, by_whom(), work.probe, work.verify, work.held.approval(bench.clock))
+    work.pushing = pushing = Pushing(bench.session.controller, bench.store, bench.site)
     if work.bar is None:
         pushed = await pushing.bring(wanted, questions)
     else:

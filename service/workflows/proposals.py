@@ -10,7 +10,6 @@ import asyncio
 import getpass
 import os
 import secrets
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -90,25 +89,13 @@ async def gather(controller: Controller, store: Store, site: Site, campaign: str
     return Gathered(record, records, runs, base, await controller.table_format())
 
 
-async def make(
-    store: Store,
-    site: Site,
-    gathered: Gathered,
-    *,
-    clock: Clock | None = None,
-    progress: ProgressSink,
-    agree: Callable[[Predicted], None] = lambda _: None,
-) -> Made:
-    """Solve, and store what follows as a proposal, with every reason that speaks against it now.
-
-    ``agree``: sees what is promised; what it raises is raised, and nothing is stored.
-    """
+async def make(store: Store, site: Site, gathered: Gathered, *, clock: Clock | None = None, progress: ProgressSink) -> Made:
+    """Solve, and store what follows as a proposal, with every reason that speaks against it now."""
     clock = clock or SystemClock()
     progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
     name, base, form = gathered.campaign.name, gathered.base, gathered.form
     known = await asyncio.to_thread(stored_without, store, name)
     proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, form.lsb_nm)
-    agree(proposal.predicted)
     doc = solution_doc(proposal.solved) | known.doc | {"machine": site.doc}
     solution_id = await store.write(store.add_solution, gathered.campaign.id, "joint", [r.id for r in gathered.records], doc)
     promise = Promise(proposal.tables, proposal.change, proposal.predicted, None, *_ends_s(gathered.records))

@@ -32,7 +32,6 @@ from service.storage.owner import this_process
 from service.storage.store import Store
 from service.workflows.base_table import Base
 from service.workflows.proved_levels import standing
-from service.workflows.push_history import push_log
 from service.workflows.tables import table_image
 
 STILL_ACTIVE = "the unverified table is STILL ACTIVE"
@@ -346,3 +345,14 @@ def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
 def pushes_here(store: Store, machine: str) -> bool:
     """Whether this process is pushing into a machine now."""
     return (str(store.url), machine) in _under_way
+
+
+def push_log(journal: Journal) -> tuple[str, ...]:
+    """Every transition of a push as a line for people."""
+    lines = []
+    for entry in journal:
+        words = [str(entry.doc[key]) for key in ("why", "pending", "again", "approved_by", "probe", "verify") if entry.doc.get(key)]
+        if entry.state is State.SNAPSHOT:
+            words = [f"bank {entry.doc['base_bank']}, CRC {entry.doc['base_crc']:08X}; to come: CRC {entry.doc['crc']:08X}"]
+        lines.append(": ".join([str(entry.state), *words]) + f" ({entry.utc})")
+    return tuple(lines)

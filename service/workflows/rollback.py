@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from drivers.api import Controller
 from drivers.cnc.tables import crc32
-from service.errors import TableMismatch, TableRefused
+from service.errors import StoreError, TableMismatch, TableRefused
 from service.push.book import read_entries
-from service.push.entries import Entry, Journal, facts
+from service.push.entries import Entry, Journal, JournalBroken, check_chain, facts
 from service.push.operations import Verdict
 from service.push.states import TERMINAL, State
 from service.site import Site
@@ -22,10 +22,11 @@ from service.storage.store import Store
 from service.workflows.base_table import Base, read_base
 from service.workflows.commission import check_commissioned
 from service.workflows.proposals import by_whom
-from service.workflows.push_history import KIND, pushes_of
 from service.workflows.pushing import Pushed, Pushing, Questions, WantedAgain
 from service.workflows.recover import recover
 from service.workflows.unverified import unverified_crcs
+
+KIND = "rollback"
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +102,22 @@ async def rollback(controller: Controller, store: Store, site: Site, to: int | N
 
 def _rollbacks(store: Store) -> frozenset[int]:
     return frozenset(t.id for t in store.tables() if t.doc.get("kind") == KIND)
+
+
+def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
+    """Journals of all pushes of a machine, by number.
+
+    Raises
+    ------
+    StoreError
+        The chain is broken: an entry was changed, removed or swapped.
+    """
+    try:
+        check_chain(entries)
+    except JournalBroken as error:
+        raise StoreError(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
+    numbers = sorted({e.push for e in entries})
+    return {n: tuple(e for e in entries if e.push == n) for n in numbers}
 
 
 def _base(journal: Journal, how: str) -> Known:

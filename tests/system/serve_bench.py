@@ -54,10 +54,6 @@ class Process:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
-    @property
-    def pid(self) -> int:
-        return self._child.pid
-
     def _read(self) -> None:
         assert self._child.stdout is not None
         for line in self._child.stdout:
@@ -116,9 +112,8 @@ class Process:
 class Broker:
     """A real Mosquitto that keeps its subscribers' sessions on disk, on a port that stays the same."""
 
-    def __init__(self, folder: Path, *tls: str) -> None:
-        """``tls``: lines of a second, encrypted listener."""
-        self.port, self.tls_port = free_port(), free_port()
+    def __init__(self, folder: Path) -> None:
+        self.port = free_port()
         self._program = require("mosquitto", "/usr/sbin/mosquitto")
         self._config = folder / "mosquitto.conf"
         data = folder / "broker"
@@ -126,7 +121,6 @@ class Broker:
         self._config.write_text(
             f"listener {self.port} 127.0.0.1\nallow_anonymous true\nuser root\n"
             f"persistence true\npersistence_location {data}/\nautosave_on_changes true\nautosave_interval 1\n"
-            + "\n".join([f"listener {self.tls_port} 127.0.0.1", *tls, ""] if tls else [])
         )
         self.process = self.start()
 
@@ -139,12 +133,12 @@ class Broker:
         self.process.expect("running")
         return self.process
 
-    def subscriber(self, name: str = "receiver") -> Process:
+    def subscriber(self) -> Process:
         """Return a real client with a session of its own: what is published while it reconnects is kept for it."""
         program = require("mosquitto_sub")
         at = ("-h", "127.0.0.1", "-p", str(self.port))
-        receiver = Process(program, *at, "-q", "1", "-c", "-i", name, "-t", "plant/#", "-F", "MSG %t %p")
-        self.process.expect(f"Sending SUBACK to {name}")
+        receiver = Process(program, *at, "-q", "1", "-c", "-i", "receiver", "-t", "plant/#", "-F", "MSG %t %p")
+        self.process.expect("Sending SUBACK to receiver")
         return receiver
 
 

@@ -1,1 +1,0 @@
-"""The narrow way between the two processes of the service: messages with types, and how they travel."""
