@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from models.arrays import F1
+from models.probability import f_limit, normal_below, normal_limit, t_above
 
 CUSUM_K = 0.5
 """Half the smallest shift worth finding, in standard deviations of a check."""
@@ -37,6 +37,9 @@ MOST_CHECKS = 400
 MOST_KNOTS = 200
 FARTHEST = 20.0
 """Nothing is said beyond so many times the length of the series."""
+JUMP_SIGMAS = 5.0
+JUMP_SHARE = 0.25
+"""A jump is more than so many standard uncertainties, and more than this share of the limit: the spread of few checks is not known."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ def _normal(r: F1, scale: F1, dof: F1) -> F1:
     """The standard normal variable that is as improbable as a Student one."""
     with np.errstate(divide="ignore", invalid="ignore"):
         size = np.where(scale > 0, np.abs(r) / scale, np.where(r == 0, 0.0, np.inf))
-    found = np.minimum(stats.norm.isf(stats.t.sf(size, dof)), Z_MAX)
+    found = np.minimum(normal_limit(t_above(size, dof)), Z_MAX)
     return np.asarray(np.copysign(found, r), dtype=np.float64)
 
 
@@ -143,8 +146,8 @@ def _one_sided(shift: float, k: float, h: float, states: int) -> float:
     width = 2 * h / (2 * states - 1)
     middle = np.arange(states) * width
     step = middle[None, :] - middle[:, None] + k - shift
-    move = stats.norm.cdf(step + width / 2) - stats.norm.cdf(step - width / 2)
-    move[:, 0] = stats.norm.cdf(step[:, 0] + width / 2)
+    move = normal_below(step + width / 2) - normal_below(step - width / 2)
+    move[:, 0] = normal_below(step[:, 0] + width / 2)
     return float(np.linalg.solve(np.eye(states) - move, np.ones(states))[0])
 
 
@@ -187,6 +190,21 @@ def trend(days: F1, values: F1, u: F1, limit: float | None = None) -> Trend:
     return Trend(state, direction, began, found, z, mean, bound, high, low, ahead)
 
 
+def mean_of(values: F1, u: F1) -> tuple[float, float]:
+    """Weighted mean of figures and its standard uncertainty."""
+    weight = 1.0 / u**2
+    return float(weight @ values / weight.sum()), float(1.0 / np.sqrt(weight.sum()))
+
+
+def jumps(change: float, u_change: float, limit: float) -> bool:
+    """Whether a figure grew by more than its uncertainty explains, where fewer than `MIN_CHECKS` have not yet shown their spread.
+
+    The stated uncertainties are believed here, which the chart does not need; `JUMP_SIGMAS` and `JUMP_SHARE` leave room for what they
+    do not hold.
+    """
+    return change > JUMP_SIGMAS * u_change and change > JUMP_SHARE * limit
+
+
 def _since(side: F1, found: int) -> int:
     """The check after the last one at which the sum was nothing: where the change most probably began."""
     zero = np.flatnonzero(side[: found + 1] == 0)
@@ -225,14 +243,14 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
     slope = float(sums.slope()[best])
     told = (slope, float(np.sqrt(scale2 * sums.w / (sums.w * sums.rr[best] - sums.r[best] ** 2))))
     flat = sums.yy - sums.y**2 / sums.w
-    if (flat - left[best]) / (2 * scale2) <= stats.f.isf(SIGNIFICANCE, 2, n - 3):
+    if (flat - left[best]) / (2 * scale2) <= f_limit(SIGNIFICANCE, 2, n - 3):
         return Forecast(np.nan, np.nan, np.nan, "not known: the slope is not significant", *told)
     if slope < 0:
         return Forecast(np.nan, np.nan, np.nan, "moves away from the limit", *told)
     reached = max(float(sums.knots[best] - sums.level()[best] / slope), 0.0)
     span = float(days[-1] - days[0])
     ahead = np.concatenate([[0.0], span * np.geomspace(1e-3, FARTHEST, 600)])
-    inside = np.flatnonzero(sums.left_if(ahead) - left[best] <= scale2 * stats.f.isf(1 - level, 1, n - 3))
+    inside = np.flatnonzero(sums.left_if(ahead) - left[best] <= scale2 * f_limit(1 - level, 1, n - 3))
     if reached == 0.0 and not len(inside):
         return Forecast(0.0, 0.0, 0.0, "", *told)
     if reached > ahead[-1] or not len(inside) or inside[-1] == len(ahead) - 1:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg
 
 from models.arrays import F1, F2
 from models.discovery.answer import Agreement, Unjudged
@@ -14,6 +14,7 @@ from models.discovery.case import CaseRun
 from models.discovery.noise import lone, unscaled
 from models.discovery.prediction import Solved, free_columns, left_over
 from models.discovery.scene import Scene
+from models.probability import f_above
 
 LAGS = 10
 """Memory that is left in whitened noise is looked for over so many readings: the memory usual for instruments (`noise.MEMORY`) has faded to
@@ -152,4 +153,4 @@ def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float)
     if freedom < 1.0:
         return None
     ratio = float(y @ y - b @ solution[:, 0]) / (freedom * noise.variance)
-    return float(np.sqrt(max(ratio, 0.0))), float(stats.f.sf(ratio, freedom / spread, noise.freedom / spread))
+    return float(np.sqrt(max(ratio, 0.0))), float(f_above(ratio, freedom / spread, noise.freedom / spread))

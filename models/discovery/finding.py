@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from models.arrays import F1
 from models.discovery.agreement import agreements
@@ -26,6 +25,7 @@ from models.discovery.unseen import unseen
 from models.discovery.variance import VarianceFinding
 from models.discovery.where import locate
 from models.discovery.where_signal import where_of_signal
+from models.probability import chi2_above
 
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
 """A name with less evidence than this share of another's, at the same readings, is what the other's formula leaves of its true form."""
@@ -143,7 +143,7 @@ def _verdict(named: float, unnamed: float) -> Verdict:
 
 def _p_value(found: Sequence[Found], loud: Sequence[VarianceFinding]) -> float:
     """Bound on how often noise alone would give the strongest finding: chi-square of its parameters times how many starts were compared."""
-    bounds: list[float] = [STARTS * float(stats.chi2.sf(f.gain, 2 + len(f.pick.effect.shape) + len(f.pick.forms))) for f in found]
+    bounds: list[float] = [STARTS * float(chi2_above(f.gain, 2 + len(f.pick.effect.shape) + len(f.pick.forms))) for f in found]
     bounds += [float(np.exp(-f.evidence)) for f in loud]
     return min(1.0, *bounds) if bounds else 1.0
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from models.arrays import F1
 from models.discovery.noise import Colour
 from models.effects.path import Path
+from models.probability import chi2_above
 
 HERTZ = (2.0, 75.0)
 PADDING = 4
@@ -92,7 +93,7 @@ def _harmonics(spectra: list[_Spectrum], f: float) -> float:
             if s.energy[i] > 0:
                 total += float(2.0 * s.size[i] ** 2 / s.energy[i])
                 freedom += 2
-    return float(stats.chi2.sf(total, freedom)) if freedom else 1.0
+    return float(chi2_above(total, freedom)) if freedom else 1.0
 
 
 def _spectrum(axis: int, path: Path, rest: F1, sigma_mm: float, colour: Colour | None) -> _Spectrum | None:

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy import stats
 
 from models.arrays import F1
 from models.discovery.answer import Significance, Where
 from models.discovery.where_signal import where_of_signal
 from models.effects.path import Path
 from models.machine import AXES
+from models.probability import chi2_above, normal_above
 
 BLOCKS = 12
 """Readings of a run are summed in so many blocks, of one size."""
@@ -164,7 +164,7 @@ def _weighted_p(weight: F1, square: F1) -> float:
     if weight.sum() <= 0:
         return 1.0
     scale, freedom = float(weight @ weight / weight.sum()), float(weight.sum() ** 2 / (weight @ weight))
-    return float(stats.chi2.sf(weight @ square / (scale * ROOM), freedom)) if freedom >= 2.0 else 1.0
+    return float(chi2_above(weight @ square / (scale * ROOM), freedom)) if freedom >= 2.0 else 1.0
 
 
 def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_Group]:
@@ -175,7 +175,7 @@ def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_G
         e = r - r.mean()
         rho = np.array([e[k:] @ e[:-k] for k in range(1, LAGS + 1)]) / max(float(e @ e), 1e-300)
         q = p.n * (p.n + 2.0) * float(np.sum(rho**2 / (p.n - np.arange(1, LAGS + 1))))
-        yield _Group("run", p.label + NEIGHBOURS, q / LAGS, float(stats.chi2.sf(q / ROOM**2, LAGS)))
+        yield _Group("run", p.label + NEIGHBOURS, q / LAGS, float(chi2_above(q / ROOM**2, LAGS)))
 
 
 def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
@@ -186,7 +186,7 @@ def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
     sign = np.concatenate([p.at.sign * p.look for p in paths])
     for a, axis in enumerate(AXES):
         z = _score(sign[:, a], rows)
-        yield _Group("axis", axis + DIFFER, z, float(2.0 * stats.norm.sf(abs(z) / np.sqrt(ROOM))))
+        yield _Group("axis", axis + DIFFER, z, float(2.0 * normal_above(abs(z) / np.sqrt(ROOM))))
 
 
 def _temperature(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
@@ -197,7 +197,7 @@ def _temperature(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
             continue
         moved = [np.concatenate([p.look[:, a] * (p.at.q_mm[:, a] - p.machine.centre_mm[a]) for p in paths]) for a in range(3)]
         z = max((_score((value - value.mean()) * m, rows) for m in moved), key=abs)
-        yield _Group("temperature", sensor, z, min(1.0, float(6.0 * stats.norm.sf(abs(z) / np.sqrt(ROOM)))))
+        yield _Group("temperature", sensor, z, min(1.0, float(6.0 * normal_above(abs(z) / np.sqrt(ROOM)))))
 
 
 def _score(column: F1, rows: _Rows) -> float:

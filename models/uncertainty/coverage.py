@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from numpy.typing import NDArray
 
-from models.arrays import F1, F2
+from models.arrays import F1, F2, F3
+from models.probability import chi2_quantile, t_quantile
 
 PROBABILITY = 0.95
+_FLAT, _NOTHING = 1e-12, 1e-24
+"""Variances below this share of the largest, and below this one (of lengths in mm), are rounding."""
 
 
 def effective_dof(variances: F2, dof: F1) -> F1:
@@ -34,13 +37,13 @@ def effective_dof(variances: F2, dof: F1) -> F1:
 def coverage_factor(dof: F1, probability: float = PROBABILITY) -> F1:
     """Coverage factor k: the two-sided quantile of Student's t; 1.96 for 95 % and many degrees of freedom."""
     _checked_probability(probability)
-    return np.asarray(stats.t.ppf(0.5 * (1.0 + probability), np.maximum(dof, 1.0)))
+    return t_quantile(0.5 * (1.0 + probability), np.maximum(dof, 1.0))
 
 
 def vector_factor(components: int = 3, probability: float = PROBABILITY) -> float:
     """Factor of the ellipsoid that holds a whole vector of normal components, e.g. 2.80 for three and 95 % (GUM-S2 6.5.2)."""
     _checked_probability(probability)
-    return float(np.sqrt(stats.chi2.ppf(probability, components)))
+    return float(np.sqrt(chi2_quantile(probability, components)))
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,27 @@ class Interval:
     def width(self) -> F1:
         """High minus low."""
         return np.asarray(self.high - self.low)
+
+
+def apart_from_zero(vectors: F2, covariance: F3, probability: float = PROBABILITY) -> NDArray[np.bool_]:
+    """Whether the ellipsoid that holds each vector with this probability leaves out zero: noise alone does so in 5 % of all cases.
+
+    Parameters
+    ----------
+    vectors : array, shape (n, c)
+        Estimates, e.g. deviations in mm.
+    covariance : array, shape (n, c, c)
+        Of each; it may be flat in some directions. Where it is not finite, nothing is known.
+
+    Returns
+    -------
+    array of bool, shape (n,)
+    """
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    variances, axes = np.linalg.eigh(np.where(finite[:, None, None], covariance, 0.0))
+    variances = np.maximum(variances, np.maximum(_FLAT * variances[:, -1:], _NOTHING))
+    along = np.einsum("nij,ni->nj", axes, vectors)
+    return np.asarray(finite & ((along**2 / variances).sum(axis=1) > vector_factor(vectors.shape[1], probability) ** 2))
 
 
 def symmetric_interval(samples: F2, probability: float = PROBABILITY) -> Interval:

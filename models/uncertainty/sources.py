@@ -9,6 +9,7 @@ not know.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy import linalg
@@ -36,6 +37,9 @@ WORDS = {
     "estimated_sizes": "noise and typical sizes are themselves estimated",
 }
 """Every source of a budget in the user's words."""
+
+FROM_READINGS = frozenset({"bar_noise", "laser_noise", "estimated_sizes"})
+"""Sources whose size the campaign's own readings gave: type A evaluation (GUM 4.2)."""
 
 
 LASER_SCALE = "laser_scale"
@@ -67,6 +71,11 @@ class Source:
     dof: float = float("inf")
     scatter_mm: float = 0.0
     less: F2 | None = None
+
+    @property
+    def evaluation(self) -> Literal["A", "B"]:
+        """How its size was found: A from readings (of the campaign, or repeats with so many degrees of freedom), B stated or assumed."""
+        return "A" if self.name in FROM_READINGS or (self.name == "repeatability" and np.isfinite(self.dof)) else "B"
 
 
 @dataclass(frozen=True)

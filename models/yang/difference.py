@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import stats
 
 from models.arrays import F1, F2
+from models.probability import t_quantile
 
 Model = Callable[[F2], F2]
 """Positions (n, 3), mm, to errors (n, 3), mm."""
@@ -69,7 +69,7 @@ def confidence_interval(
             raise ValueError("confidence interval: the printed factor 1.96 holds for a level of 0.95 only")
         factor = PRINTED_NORMAL
     elif law == "student":
-        factor = float(stats.t.ppf(0.5 + 0.5 * level, free))
+        factor = float(t_quantile(0.5 + 0.5 * level, free))
     else:
         raise ValueError(f"confidence interval: law {law!r} must be 'student' or 'normal'")
     half = factor * np.asarray(sd, dtype=np.float64) / np.sqrt(n)

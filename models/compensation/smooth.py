@@ -1,0 +1,43 @@
+"""The smooth part of nine tables: what a solver of smooth error motions can find again of a correction that is in force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.polynomial import Legendre
+
+from models.arrays import F1, F2
+from models.compensation.tables import NineTables
+
+WITHIN_MM = 5e-4
+"""A table that no polynomial of these orders meets within this at every position is of another kind: pitch errors, or made by hand."""
+ORDERS = range(2, 13)
+
+
+def smooth_of(tables: NineTables) -> Callable[[F2], F2] | None:
+    """Polynomials through nine tables: corrections at commanded positions (n, 3), mm, shape (n, 3); None where there are none such.
+
+    Of each table the lowest order of 2 to 12 that meets it within 0.5 µm at its positions. What is left out is what interpolation,
+    rounding and cut ends have added to it: no error of a machine looks like that, and a solver takes it for motions of high order.
+    """
+    found = [[_meets(tables.position_mm[a], tables.correction_mm[a][:, i]) for i in range(3)] for a in range(3)]
+    if any(one is None for row in found for one in row):
+        return None
+    whole = [[one for one in row if one is not None] for row in found]
+
+    def correction_mm(axes_mm: F2) -> F2:
+        inside = [np.clip(axes_mm[:, a], tables.position_mm[a][0], tables.position_mm[a][-1]) for a in range(3)]
+        return np.stack([sum((whole[a][i](inside[a]) for a in range(3)), np.zeros(len(axes_mm))) for i in range(3)], axis=1)
+
+    return correction_mm
+
+
+def _meets(position_mm: F1, correction_mm: F1) -> Legendre | None:
+    for order in ORDERS:
+        if order >= position_mm.size - 1:
+            return None
+        one = Legendre.fit(position_mm, correction_mm, order)
+        if float(np.abs(one(position_mm) - correction_mm).max()) <= WITHIN_MM:
+            return one
+    return None

@@ -1,0 +1,77 @@
+"""What a table in force did to the readings of a run, and what of that no table could take back: the lost motion's part of it.
+
+A table moves the drives away from the command. Where its corrections change while an axis is told to rest, the drive moves by a micrometre
+or two, turns round where no command does, and stays within the lost motion: the axis does not follow, or only partly. For a solver that is
+told of commands alone that is an error of a few micrometres which no smooth error motion explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.geometry.chain import travel_sign
+
+LEAD_IN_MM = 1.0
+"""A run is approached in the direction of its first motion, farther than any lost motion."""
+
+
+@dataclass(frozen=True)
+class InForce:
+    """A table that was in force while runs were measured.
+
+    Attributes
+    ----------
+    correction : callable
+        What it added at commanded positions (n, 3), mm, shape (n, 3).
+    lost_mm : array, shape (3,), or None
+        Lost motion of X, Y, Z as well as it is known. None: nothing is known of it; every axis is taken to have followed.
+    """
+
+    correction: Callable[[F2], F2]
+    lost_mm: F1 | None = None
+
+    def bar_mm(self, axes_mm: F2, centre_mm: F1) -> F1:
+        """What it added to the readings of a ball-bar at successive commands about a cup that the spindle put down, shape (n,), mm.
+
+        From which side the axes came to the cup is part of its offset and not counted.
+        """
+        away = axes_mm - centre_mm
+        look = away / np.linalg.norm(away, axis=1, keepdims=True)
+        return np.asarray(np.sum(look * (self.moved_mm(axes_mm) - self.correction(centre_mm[None])), axis=1))
+
+    def laser_mm(self, axes_mm: F2, beam: F1) -> F1:
+        """What it added to the readings of a laser at successive commands, zeroed at the first, shape (n,), mm."""
+        moved = self.moved_mm(axes_mm)
+        return np.asarray((moved - moved[0]) @ beam)
+
+    def moved_mm(self, axes_mm: F2) -> F2:
+        """How much farther the axes stood because of it, at successive commands, shape (n, 3), mm.
+
+        Its correction, less what the lost motion kept of it: against an axis that stands on the side from which it was commanded last.
+        """
+        added = self.correction(axes_mm)
+        if self.lost_mm is None:
+            return added
+        sign = travel_sign(axes_mm)
+        lead = axes_mm[:1] - LEAD_IN_MM * sign[:1]
+        before, driven = (lead + self.correction(lead))[0], axes_mm + added
+        moved = added.copy()
+        for a in np.flatnonzero(self.lost_mm > 0.0):
+            half = 0.5 * float(self.lost_mm[a])
+            start = float(before[a]) if sign[0, a] else float(driven[0, a])  # an axis that is never told to move came from nowhere known
+            moved[:, a] -= half * (_play(driven[:, a], start, half) - sign[:, a])
+        return moved
+
+
+def _play(drive_mm: F1, before_mm: float, half_mm: float) -> F1:
+    """The play operator: (drive - axis) / half, -1 to 1, for an axis that followed a long move from ``before_mm`` to the first position."""
+    axis = float(drive_mm[0]) - half_mm * float(np.sign(drive_mm[0] - before_mm))
+    out = []
+    for drive in drive_mm.tolist():
+        axis = min(max(axis, drive - half_mm), drive + half_mm)
+        out.append((drive - axis) / half_mm)
+    return np.array(out)

@@ -1,0 +1,126 @@
+"""The deviation of a machine over its volume as one solution knows it: whole, or the part that chosen error motions make, with covariance.
+
+It needs no solution at hand but what a store keeps of it: terms, coefficients and their covariance from all sources.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.arrays import F1, F2, F3
+from models.geometry.bases import Term
+from models.machine import Machine
+from models.uncertainty.frame import field, volume_frame
+
+
+@dataclass(frozen=True)
+class KnownField:
+    """What is known of a machine's error motions.
+
+    Parameters
+    ----------
+    machine : Machine
+        Nominal geometry.
+    terms : tuple of Term
+        Terms of the error motions.
+    coefficients : array, shape (P,)
+        Their values, mm or rad.
+    covariance : array, shape (P, P)
+        Their covariance from all sources.
+    scatter_mm : float
+        Standard deviation that a single approach of a point adds per component.
+    """
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    coefficients: F1
+    covariance: F2
+    scatter_mm: float = 0.0
+
+    def index(self, names: Iterable[str]) -> list[int]:
+        """Places of the terms of motions (``"EXX"``) and of single parameters (``"EXX.1"``), in order.
+
+        Raises
+        ------
+        ValueError
+            The solution has no such motion or parameter.
+        """
+        wanted = set(names)
+        known = {t.motion for t in self.terms} | {t.name for t in self.terms}
+        strange = sorted(wanted - known)
+        if strange:
+            raise ValueError(f"the solution has no motion or parameter {', '.join(strange)}")
+        return [k for k, t in enumerate(self.terms) if t.motion in wanted or t.name in wanted]
+
+    def per_unit(self, points_mm: F2) -> F3:
+        """Deviation per unit of each coefficient, best-fit rigid motion over the strokes removed, shape (m, 3, P)."""
+        return field(self.machine, self.terms, points_mm, None, volume_frame(self.machine))
+
+    def part(self, motions: Iterable[str]) -> KnownField:
+        """Only some motions, with what is known of them; ValueError for one that is not there."""
+        at = self.index(motions)
+        terms = tuple(self.terms[k] for k in at)
+        return KnownField(self.machine, terms, self.coefficients[at], self.covariance[np.ix_(at, at)], self.scatter_mm)
+
+    def estimate_of(self, names: Iterable[str]) -> F1:
+        """The coefficients with all but those of these motions and parameters set to zero, shape (P,); ValueError as of `index`."""
+        at = self.index(names)
+        out = np.zeros_like(self.coefficients)
+        out[at] = self.coefficients[at]
+        return out
+
+    def linear(self, values: Mapping[str, float]) -> F1:
+        """Coefficients of scales (``EXX``, mm/mm) and squareness (``C0Y``, rad) of these values and nothing else, shape (P,).
+
+        Raises
+        ------
+        ValueError
+            The solution has no such parameter.
+        """
+        out = np.zeros_like(self.coefficients)
+        for name, value in values.items():
+            scale = name[0] == "E"
+            [at] = self.index([f"{name}.1" if scale else name])
+            # The function of Legendre order 1 is twice the share of the stroke (`models.geometry.bases.term_values`).
+            out[at] = value * self.machine.length_mm["XYZ".index(name[2])] / 2.0 if scale else value
+        return out
+
+    def root(self) -> F2:
+        """Factor R of the nearest covariance without negative variances, R R^T, shape (P, P): for draws."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """Deviation at m points, best-fit rigid motion removed: shape (m, 3), mm, and its covariance, shape (m, 3, 3), mm²."""
+
+    points_mm: F2
+    deviation_mm: F2
+    covariance_mm2: F3
+
+
+def field_map(known: KnownField, points_mm: F2, motions: Iterable[str] | None = None) -> FieldMap:
+    """Deviation at commanded positions, mean of both directions of motion, as `models.uncertainty.prediction` has it.
+
+    Parameters
+    ----------
+    known : KnownField
+    points_mm : array, shape (m, 3)
+    motions : iterable of str, optional
+        Only what these motions make together; None: all of them.
+
+    Raises
+    ------
+    ValueError
+        The solution has no such motion.
+    """
+    chosen = known if motions is None else known.part(motions)
+    d = chosen.per_unit(points_mm)
+    m, _, p = d.shape
+    spread = (d.reshape(3 * m, p) @ chosen.covariance).reshape(m, 3, p)
+    covariance = spread @ np.swapaxes(d, 1, 2) + known.scatter_mm**2 * np.eye(3)
+    return FieldMap(points_mm, d @ chosen.coefficients, np.asarray(covariance))

@@ -1,0 +1,141 @@
+"""What would be left if a part of a solution's errors were corrected, with all that the solution does not know of them and the rest.
+
+A correction takes off what the solution says, not what is: its uncertainty stays in the machine. With coefficients theta of the truth,
+estimate t and a correction c made from the estimate, theta - c is normal about t - c with the whole covariance of the solution. Every
+figure is taken from draws of it (GUM Supplement 1), because the largest error, the range of a diagonal and an rms are no linear functions,
+and near zero their linear uncertainty is wrong. Before and after come from the same draws, so their difference has its own uncertainty. A
+figure that is never negative is expected larger than that of the mean map alone: the unknown part adds to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from models.arrays import F1, F2, F3
+from models.paths.helix import helix_points
+from models.paths.lines import DIAGONALS, diagonal_ends, straight_line
+from models.uncertainty.known_field import KnownField
+from models.volumetric import volume_grid
+
+DRAWS = 600
+"""So many draws know a standard uncertainty to 3 %."""
+SEED = 20_261_122
+Kind = Literal["rms", "largest", "range"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of the deviation.
+
+    ``per_unit``: what it is made of, per unit of each coefficient, shape (m, k, P) with k components a place. ``kind``: root mean square
+    or largest length over the places, or range of the (one) component.
+    """
+
+    name: str
+    kind: Kind
+    per_unit: F3
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A figure before and after, and what is gained: mean over the draws and standard uncertainty, mm."""
+
+    name: str
+    before_mm: float
+    u_before_mm: float
+    after_mm: float
+    u_after_mm: float
+    gain_mm: float
+    u_gain_mm: float
+
+
+def volume_figures(known: KnownField, nodes: int = 6) -> list[Figure]:
+    """Volumetric error: rms and largest length over an even grid of the strokes, best-fit rigid motion removed."""
+    d = known.per_unit(volume_grid(known.machine.stroke_mm, nodes))
+    return [Figure("volume_rms", "rms", d), Figure("volume_max", "largest", d)]
+
+
+def expected_rms(known: KnownField, nodes: int) -> tuple[float, float]:
+    """Rms length of the deviation over an even grid as it is expected, unknown part included, and its standard uncertainty, mm.
+
+    The square is a quadratic form of a normal vector, so both have a closed form; the same as the first of `volume_figures` by draws.
+    """
+    d = known.per_unit(volume_grid(known.machine.stroke_mm, nodes))
+    flat = d.reshape(-1, d.shape[2])
+    g = flat.T @ flat / len(d)
+    spread, pull = g @ known.covariance, g @ known.coefficients
+    square = float(known.coefficients @ pull + np.trace(spread))
+    variance = 4.0 * float(pull @ known.covariance @ pull) + 2.0 * float(np.sum(spread * spread.T))
+    if square <= 0.0:
+        return 0.0, 0.0
+    u = float(np.sqrt(max(variance, 0.0) / square)) / 2.0
+    return float(np.sqrt(max(square - u * u, 0.0))), u
+
+
+def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions: int = 11) -> list[Figure]:
+    """Range of the deviation along each of the four body diagonals, so far from the ends of the strokes (ISO 230-6 style)."""
+    box = known.machine.stroke_mm + np.array([clearance_mm, -clearance_mm])
+    out = []
+    for name in DIAGONALS:
+        start, end = diagonal_ends(box, name)
+        along = (end - start) / np.linalg.norm(end - start)
+        d = known.per_unit(straight_line(start, end, positions, back=False))
+        out.append(Figure(f"diagonal_{name}", "range", np.einsum("i,mip->mp", along, d)[:, None, :]))
+    return out
+
+
+def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: float = 3.0, positions: int = 180) -> Figure:
+    """Rms reading of a ball-bar along the helix about a cup, centre and length of the bar fitted away."""
+    at = helix_points(centre_mm, radius_mm, turns=turns, n=positions, law="area", axis=2)
+    n = (at - centre_mm) / radius_mm
+    reading = np.einsum("mi,mip->mp", n, known.per_unit(at))
+    free = np.concatenate([n, np.ones((len(n), 1))], axis=1)
+    left = reading - free @ np.linalg.lstsq(free, reading, rcond=None)[0]
+    return Figure("helix_rms", "rms", left[:, None, :])
+
+
+def what_if(known: KnownField, taken_off: F1, figures: Sequence[Figure], *, draws: int = DRAWS, seed: int = SEED) -> list[Outcome]:
+    """Figures as the machine is, and as it would be with a part of what the solution says corrected.
+
+    Parameters
+    ----------
+    known : KnownField
+        The solution.
+    taken_off : array, shape (P,)
+        Coefficients of the correction: the estimate of some motions (`KnownField.estimate_of`), mean linear errors (`KnownField.linear`).
+    figures : sequence of Figure
+        What to ask.
+    draws, seed : int
+        Monte Carlo trials; equal seeds give equal numbers.
+    """
+    root = known.root()
+    truth = known.coefficients[:, None] + root @ np.random.default_rng(seed).standard_normal((root.shape[1], draws))
+    return [_outcome(f, truth, truth - taken_off[:, None]) for f in figures]
+
+
+def _outcome(figure: Figure, before: F2, after: F2) -> Outcome:
+    first, last = _sizes(figure, before), _sizes(figure, after)
+    gain = first - last
+    means = [float(v.mean()) for v in (first, last, gain)]
+    spreads = [float(v.std(ddof=1)) for v in (first, last, gain)]
+    return Outcome(figure.name, means[0], spreads[0], means[1], spreads[1], means[2], spreads[2])
+
+
+def _sizes(figure: Figure, coefficients: F2) -> F1:
+    """The figure for each column of coefficients, shape (draws,)."""
+    m, k, p = figure.per_unit.shape
+    values = (figure.per_unit.reshape(m * k, p) @ coefficients).reshape(m, k, -1)
+    if figure.kind == "range":
+        return np.asarray(np.ptp(values[:, 0], axis=0))
+    square = np.sum(values**2, axis=1)
+    return np.asarray(np.sqrt(square.mean(axis=0) if figure.kind == "rms" else square.max(axis=0)))
+
+
+def check_figures(known: KnownField, cup: tuple[F1, float] | None = None) -> list[Figure]:
+    """Everything that a check measures and a map shows: volume, body diagonals, helix about ``cup`` (centre, radius) where there is one."""
+    out = [*volume_figures(known), *diagonal_figures(known)]
+    return out if cup is None else [*out, helix_figure(known, *cup)]
