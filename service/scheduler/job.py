@@ -12,8 +12,9 @@ from service.clock import Clock
 from service.errors import AbbeError
 from service.events import Progress
 from service.scheduler import record
-from service.scheduler.ports import Check, Doc, JobWatcher, Shelf
+from service.scheduler.ports import AfterCheck, Check, Doc, JobWatcher, Shelf, SlotState
 from service.scheduler.slots import Schedule
+from service.sequences.control import Control
 
 log = structlog.get_logger("abbe.check")
 
@@ -30,40 +31,50 @@ class CheckJob:
     machine : str
         Name of the machine, for the documents.
     check : callable
-        ``await check(recipe, progress)``.
+        ``await check(recipe, progress, control)``.
     shelf : Shelf
         Keeps the documents.
     watchers : sequence of JobWatcher
         Told of start, progress and end.
     clock : Clock
         Times of failed checks.
+    after : callable, optional
+        Told of every verification that was kept.
     """
 
-    def __init__(self, machine: str, check: Check, shelf: Shelf, watchers: Sequence[JobWatcher], clock: Clock) -> None:
+    def __init__(
+        self, machine: str, check: Check, shelf: Shelf, watchers: Sequence[JobWatcher], clock: Clock, after: AfterCheck | None = None
+    ) -> None:
         self._machine = machine
         self._check = check
         self._shelf = shelf
         self._watchers = tuple(watchers)
         self._clock = clock
+        self._after = after
 
     async def __call__(self, schedule: Schedule, slot_utc: datetime) -> str:
         """Run the check of one slot; return the slot's state."""
+        return (await self.run(schedule, slot_utc, Control()))[0]
+
+    async def run(self, schedule: Schedule, slot_utc: datetime, control: Control) -> tuple[str, int]:
+        """Run the check of one slot under somebody's control; return the slot's state and the number of the verification."""
         doc: Doc | None = None
         for watcher in self._watchers:
             watcher.job_started(schedule, self._clock.utc())
         try:
-            doc = await self._run(record.Occasion(self._machine, schedule, slot_utc))
+            doc = await self._run(record.Occasion(self._machine, schedule, slot_utc), control)
             number = await self._shelf.keep(doc)
+            meant = "" if self._after is None else await self._after(doc, number)
         finally:
             for watcher in self._watchers:
                 watcher.job_ended(doc)
         log.info("check done", schedule=schedule.name, verification=number, verdict=doc["verdict"], text=doc["text"])
-        return f"done: {doc['verdict']}"
+        return SlotState(f"done: {doc['verdict']}", meant), number
 
-    async def _run(self, occasion: record.Occasion) -> Doc:
+    async def _run(self, occasion: record.Occasion, control: Control) -> Doc:
         started_utc, started_s = self._clock.utc(), self._clock.monotonic_s()
         try:
-            return record.found(occasion, await self._check(occasion.schedule.recipe, self._progress))
+            return record.found(occasion, await self._check(occasion.schedule.recipe, self._progress, control))
         except FAILURES as failure:
             cause: Exception = failure
         except ExceptionGroup as group:

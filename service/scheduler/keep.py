@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from datetime import datetime
 from typing import ParamSpec, TypeVar
 
@@ -25,22 +25,30 @@ PAUSES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 """A minute altogether. A measurement takes minutes of machine time; it is not thrown away because of a backup run."""
 
 
-class _Patient:
+class Patient:
+    """Writes, and reads, again and again while the database does not take it."""
+
     def __init__(self, store: ServiceStore, clock: Clock) -> None:
         self._store = store
         self._clock = clock
 
     async def _write(self, fn: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._again(lambda: self._store.write(fn, *args, **kwargs))
+
+    async def _read(self, fn: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._again(lambda: asyncio.to_thread(fn, *args, **kwargs))
+
+    async def _again(self, once: Callable[[], Awaitable[T]]) -> T:
         for pause_s in PAUSES_S:
             try:
-                return await self._store.write(fn, *args, **kwargs)
+                return await once()
             except StoreError as trouble:
                 log.warning("store does not take this now; trying again", cause=trouble.detail, pause_s=pause_s)
                 await self._clock.sleep(pause_s)
-        return await self._store.write(fn, *args, **kwargs)
+        return await once()
 
 
-class StoreLedger(_Patient):
+class StoreLedger(Patient):
     """Slots in the store. Each key names the machine: one database may serve several services."""
 
     def __init__(self, store: ServiceStore, clock: Clock, machine: str) -> None:
@@ -76,7 +84,7 @@ class StoreLedger(_Patient):
         return f"{self._machine}/{schedule}"
 
 
-class StoreShelf(_Patient):
+class StoreShelf(Patient):
     """Verifications and messages in the store.
 
     Parameters

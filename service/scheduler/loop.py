@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from typing import Protocol
 
@@ -16,7 +16,7 @@ import structlog
 
 from service.clock import Clock
 from service.scheduler import outcomes
-from service.scheduler.ports import Doc, Ledger, Readiness
+from service.scheduler.ports import Carry, Doc, Errand, Errands, Ledger, Readiness, SlotState, carried_alone
 from service.scheduler.ready import AlwaysReady
 from service.scheduler.slots import Schedule, next_slot, previous_slot, slots_after
 from service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
@@ -58,12 +58,18 @@ class Terms:
         The longest wait: how soon a changed wall clock is noticed.
     recheck_s : float
         The longest wait while a slot waits for its preconditions.
+    errands : Errands, optional
+        What is to be done beside the timetable; slots go first.
+    carry : callable, optional
+        Does the work of errands; default: where nobody can steer it.
     """
 
     maintenance: Sequence[Window] = ()
     ready: Readiness = field(default_factory=AlwaysReady)
     poll_s: float = 30.0
     recheck_s: float = 30.0
+    errands: Errands | None = None
+    carry: Carry = carried_alone
 
 
 class Scheduler:
@@ -124,10 +130,23 @@ class Scheduler:
                     for schedule in self._schedules:
                         await self._deal_with_due(schedule)
                     await self._start_what_may(tasks)
+                    await self._start_errand(tasks)
                     await self._wait()
         finally:
             for waiting in self._waiting:
                 await self._ledger.release(waiting.schedule.name, waiting.slot)
+
+    def take(self, name: str) -> str:
+        """Take the machine for a check that is not of the timetable; return what runs instead, or nothing. `give_back` it."""
+        if self._running is None:
+            self._running = name
+            return ""
+        return self._running
+
+    def give_back(self) -> None:
+        """The machine is free again: what waits for it may start."""
+        self._running = None
+        self._ended.set()
 
     def _move_cursor(self, schedule: Schedule, to: datetime) -> None:
         self._cursor[schedule.name] = to
@@ -204,6 +223,8 @@ class Scheduler:
         for waiting in sorted(self._waiting, key=lambda one: one.slot):
             now, until = self._clock.utc(), waiting.until
             hindrance = await self._hindrance(waiting.schedule)
+            if hindrance is None and self._running is not None:  # taken while the devices were asked
+                hindrance = busy(self._running)
             if until is not None and (now > until or (hindrance is not None and now >= until)):
                 hindrance = hindrance or waiting.hindrance
                 self._waiting.remove(waiting)
@@ -217,9 +238,9 @@ class Scheduler:
                     waiting.told = True
                     await self._tell(*outcomes.still_waits(waiting, hindrance))
             else:
+                self._running = waiting.schedule.name  # before anything is awaited: nobody else takes the machine now
                 await self._ledger.begin(waiting.schedule.name, waiting.slot)
                 self._waiting.remove(waiting)
-                self._running = waiting.schedule.name
                 tasks.create_task(self._run_job(waiting.schedule, waiting.slot), name=f"check {waiting.schedule.name}")
 
     async def _hindrance(self, schedule: Schedule) -> Hindrance | None:
@@ -232,15 +253,40 @@ class Scheduler:
         lack = await self._terms.ready.lack(schedule)
         return not_ready(lack) if lack else None
 
+    async def _start_errand(self, tasks: asyncio.TaskGroup) -> None:
+        """Start what no slot asks for, on the terms of its schedule."""
+        if self._terms.errands is None or self._running is not None:
+            return
+        errand = await self._terms.errands.due()
+        if errand is None or await self._hindrance(errand.schedule) is not None or self._running is not None:
+            return  # the last: a person took the machine while the devices were asked
+        self._running = errand.name
+        if errand.begun is not None:
+            errand.begun()
+        tasks.create_task(self._run_errand(errand), name=errand.name)
+
+    async def _run_errand(self, errand: Errand) -> None:
+        try:
+            if errand.work is not None:
+                await self._terms.carry(errand)
+            else:
+                await self._job(replace(errand.schedule, name=errand.name), self._clock.utc())
+        finally:
+            self.give_back()
+            log.info("errand done", errand=errand.name)
+
     async def _run_job(self, schedule: Schedule, slot: datetime) -> None:
-        state = "interrupted"
+        ended = outcomes.stopped(schedule.name, slot)
         try:
             state = await self._job(schedule, slot)
+            ended = outcomes.Outcome(state, "", state.reason if isinstance(state, SlotState) else "")
+        except Exception:
+            ended = outcomes.broken_off(schedule.name, slot)  # a defect: the service ends with it, and nobody has stopped it
+            raise
         finally:
-            self._running = None
-            self._ended.set()
-            await self._ledger.finish(schedule.name, slot, state, "the service was stopped" if state == "interrupted" else "")
-            log.info("slot done", schedule=schedule.name, slot=slot.isoformat(), state=state)
+            self.give_back()
+            await self._end(schedule, slot, ended, tell=bool(ended.code))
+            log.info("slot done", schedule=schedule.name, slot=slot.isoformat(), state=ended.state)
 
     async def _wait(self) -> None:
         """Sleep to the next slot, or to the next look at the clock, and notice if somebody set the clock meanwhile."""

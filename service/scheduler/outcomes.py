@@ -63,6 +63,11 @@ def broken_off(name: str, slot: datetime) -> Outcome:
     return Outcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service ended while it ran")
 
 
+def stopped(name: str, slot: datetime) -> Outcome:
+    """The service was stopped while it was measured: said at once, or nobody would miss it before the next start."""
+    return Outcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service was stopped while it ran")
+
+
 def whole_span(name: str, first: datetime, last: datetime) -> Outcome:
     """Too many slots to write each of them down."""
     return Outcome(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, Self
 
 from service.events import Progress, ProgressSink
 from service.scheduler.slots import Schedule
+from service.sequences.control import Control
 
 Verdict = Literal["pass", "fail", "cannot tell"]
+JobKind = Literal["check", "campaign", "investigation", "push", "rollback"]
 Doc = dict[str, Any]
 
 
@@ -61,9 +64,69 @@ class CheckResult(Protocol):
         """The verdict as one sentence."""
         ...
 
+    @property
+    def comparable(self) -> bool:
+        """Whether the figures can be put beside those of other checks."""
+        ...
 
-Check = Callable[[str, ProgressSink], Awaitable[CheckResult]]
-"""``check(recipe, progress)``: opens the devices, measures, closes them. Cancelling it must leave the machine held."""
+
+Check = Callable[[str, ProgressSink, Control], Awaitable[CheckResult]]
+"""``check(recipe, progress, control)``: opens the devices, measures, closes them. Cancelling it must leave the machine held; ``control``
+pauses, resumes, stops or aborts it."""
+
+
+class SlotState(str):
+    """What a slot or a job ended as, with the sentence to it, and the numbers of a solution and a proposal that it has left."""
+
+    reason: str
+    solution: int | None
+    proposal: int | None
+
+    def __new__(cls, state: str, reason: str = "", solution: int | None = None, proposal: int | None = None) -> Self:
+        """Make one."""
+        made = super().__new__(cls, state)
+        made.reason, made.solution, made.proposal = reason, solution, proposal
+        return made
+
+
+AfterCheck = Callable[[Doc, int], Awaitable[str]]
+"""``await after(doc, number)``: what a kept verification means beyond itself, as a sentence; empty: nothing."""
+
+
+Work = Callable[[Control], Awaitable[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Errand:
+    """Work that no slot asks for: it has the machine alone, as a check, and starts on a schedule's terms.
+
+    ``work``: what is done under somebody's control, and how it ended; None: the schedule's check, under ``name``. ``kind``: what it is to
+    people. ``begun``: told when it has the machine.
+    """
+
+    name: str
+    schedule: Schedule
+    work: Work | None = None
+    kind: JobKind = "check"
+    begun: Callable[[], None] | None = None
+
+
+Carry = Callable[[Errand], Awaitable[str]]
+"""``await carry(errand)``: does an errand's work so that people can see and steer it; returns how it ended."""
+
+
+async def carried_alone(errand: Errand) -> str:
+    """Do an errand's work where nobody can steer it."""
+    assert errand.work is not None
+    return await errand.work(Control())
+
+
+class Errands(Protocol):
+    """Who knows what else is to be done."""
+
+    async def due(self) -> Errand | None:
+        """Return what may start now, or None."""
+        ...
 
 
 class OpenSlot(NamedTuple):

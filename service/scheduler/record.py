@@ -40,6 +40,7 @@ def found(occasion: Occasion, result: CheckResult) -> Doc:
         "campaign": result.campaign,
         "runs": list(result.run_labels),
         "text": result.text,
+        "comparable": bool(result.comparable),
         "cause": None,
     }
 

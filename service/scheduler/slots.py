@@ -69,6 +69,8 @@ class Schedule:
         Missed slots: ``skip`` records each with its reason; ``once`` does so too, and runs once for all of them.
     needs : Needs
         Preconditions.
+    on_alarm : str
+        ``propose``: what an alarm of this schedule's recipe asks for is measured and proposed; ``none``.
     """
 
     name: str
@@ -80,6 +82,7 @@ class Schedule:
     first_utc: datetime = FIRST_UTC
     catch_up: Literal["skip", "once"] = "skip"
     needs: Needs = Needs()
+    on_alarm: str = "none"
 
 
 def checked(schedule: Schedule) -> Schedule:

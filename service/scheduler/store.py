@@ -6,11 +6,12 @@ import json
 from collections.abc import Sequence
 from datetime import datetime
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
 
-from service.storage.records import Doc, VerificationRecord
+from service.storage.records import Doc, SlotRecord, VerificationRecord
 from service.storage.store import Store
 from service.storage.store_campaigns import new_id
+from service.storage.store_slots import SLOT_COLUMNS, slot_record
 from service.storage.tables import campaigns, machines, outbox, slots, verifications
 
 
@@ -75,7 +76,39 @@ class ServiceStore(Store):
         query = query.order_by(verifications.c.id.desc()).limit(limit)
         return [VerificationRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
 
+    def slots_not_run(self, machine: str, limit: int = 20) -> list[SlotRecord]:
+        """Return the latest slots of a machine that were missed, skipped or interrupted, newest first.
+
+        Parameters
+        ----------
+        machine : str
+            Name of the machine.
+        limit : int
+            At most so many.
+        """
+        states = [slots.c.state.startswith(word) for word in ("missed", "skipped", "interrupted")]
+        query = select(*SLOT_COLUMNS).where(_timetable_of(machine), or_(*states))
+        rows = self._read(lambda connection: connection.execute(query.order_by(slots.c.id.desc()).limit(limit)).all())
+        return [slot_record(row) for row in rows]
+
+    def verdict_counts(self, machine: str) -> dict[str, int]:
+        """Return how many checks of a machine ended with each verdict, over its whole history."""
+        query = select(verifications.c.verdict, func.count()).join(machines, machines.c.id == verifications.c.machine_id)
+        query = query.where(machines.c.name == machine).group_by(verifications.c.verdict)
+        return {str(verdict): int(count) for verdict, count in self._read(lambda connection: connection.execute(query).all())}
+
+    def slot_counts(self, machine: str) -> dict[str, int]:
+        """Return how many slots of a machine's timetables stand at each state."""
+        query = select(slots.c.state, func.count()).where(_timetable_of(machine)).group_by(slots.c.state)
+        return {str(state): int(count) for state, count in self._read(lambda connection: connection.execute(query).all())}
+
     def waiting_messages(self) -> int:
         """Return how many messages wait for the broker."""
         query = select(func.count()).select_from(outbox).where(outbox.c.sent_utc.is_(None))
         return int(self._read(lambda connection: connection.execute(query).scalar_one()))
+
+
+def _timetable_of(machine: str) -> ColumnElement[bool]:
+    """Slots of a machine. Not by LIKE: SQLite's takes mill-7 and MILL-7 for the same machine."""
+    prefix = f"{machine}/"
+    return func.substr(slots.c.schedule, 1, len(prefix)) == prefix

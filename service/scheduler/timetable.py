@@ -34,6 +34,7 @@ def _schedule(entry: ScheduleEntry) -> Schedule:
         first_utc=FIRST_UTC if entry.first is None else entry.first.astimezone(UTC),
         catch_up=entry.catch_up,
         needs=Needs(needs.idle, needs.warm_min, needs.air, needs.operator),
+        on_alarm=entry.on_alarm,
     )
 
 

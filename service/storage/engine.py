@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from sqlalchemy.pool import StaticPool
 
 from service.errors import StoreError
 from service.secrets import mask_secrets
+from service.storage.private import private_file
 
 DEFAULT_URL = "sqlite:///abbe.sqlite3"
 BUSY_TIMEOUT_MS = 5000
@@ -195,11 +197,22 @@ def _check_file(parsed: URL) -> None:
         with path.open("rb") as file:
             head = file.read(len(_SQLITE_MAGIC))
     except FileNotFoundError:
+        _make_private(path)
         return
     except OSError as err:
         raise StoreError(f"database {path} cannot be read: {err.strerror}", "check its access rights") from None
     if head not in {b"", _SQLITE_MAGIC}:
         raise StoreError(f"{path} is not a SQLite database", "give the file that `abbe` made, or a new name")
+
+
+def _make_private(path: Path) -> None:
+    """An empty file for its owner only, before SQLite makes one for everybody; its journals get the same rights."""
+    try:
+        os.close(private_file(path))
+    except FileExistsError:
+        return  # another process was first
+    except OSError as err:
+        raise StoreError(f"database {path} cannot be made: {err.strerror}", "check that the folder may be written") from None
 
 
 def _set_pragmas(connection: sqlite3.Connection, _record: object) -> None:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+UNKNOWN = "?"
+"""Since when a process runs that lives, where nobody can tell. Where a process says it of itself, pids must do."""
 _START_TIME_FIELD = 22 - 3
 """Field 22 of /proc/PID/stat, counted after the command name (field 2), which may itself hold blanks."""
 
@@ -43,7 +45,8 @@ class Owner:
         """
         if self.host != platform.node():
             return False
-        return process_start(self.pid) != self.start
+        now = process_start(self.pid)
+        return now not in (self.start, UNKNOWN)
 
 
 def process_start(pid: int) -> str:
@@ -57,12 +60,12 @@ def process_start(pid: int) -> str:
     Returns
     -------
     str
-        ``"boot_id/ticks"``; empty if there is no such process (or no /proc and the process lives: then pids must do).
+        ``"boot_id/ticks"``; empty if there is no such process; `UNKNOWN` if it lives and /proc does not tell since when.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "" if Path("/proc/self/stat").exists() else _without_proc(pid)
+    except OSError:  # none such, no /proc, or one that hides the processes of other accounts
+        return _without_proc(pid)
     fields = stat.rpartition(")")[2].split()
     if fields[0] in {"Z", "X"}:  # killed and not yet collected by its parent: it writes nothing any more
         return ""
@@ -91,11 +94,11 @@ def _boot_id() -> str:
 
 def _without_proc(pid: int) -> str:
     if os.name == "nt":  # os.kill would terminate the process there
-        return "?"
+        return UNKNOWN
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return ""
     except PermissionError:
         pass
-    return "?"
+    return UNKNOWN

@@ -227,6 +227,19 @@ class NewVersion:
 
 
 @dataclass(frozen=True, slots=True)
+class AlarmEntryRecord:
+    """One line of what became of a machine's alarm. Never changed; ``alarm`` counts from 1 for each machine, ``seq`` from 0."""
+
+    id: int
+    machine: str
+    alarm: int
+    seq: int
+    kind: str
+    doc: Doc
+    utc: str
+
+
+@dataclass(frozen=True, slots=True)
 class SlotRecord:
     """One slot of a schedule and what became of it. ``reason``: the sentence to ``state``; ``finished_utc``: None while it is open."""
 
@@ -237,6 +250,16 @@ class SlotRecord:
     reason: str
     claimed_utc: str
     finished_utc: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class StationRecord:
+    """What the service of a machine said of itself last."""
+
+    machine: str
+    doc: Doc
+    seen_utc: str
+    owner: Owner
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,14 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, select
 
 from service.storage.records import Doc, ImportedRun
+from service.storage.store_alarms import AlarmStore
 from service.storage.store_audit import AuditStore
 from service.storage.store_campaigns import insert_campaign, machine_id_of
 from service.storage.store_checkpoints import CheckpointStore
+from service.storage.store_decisions import DecisionStore
 from service.storage.store_discoveries import DiscoveryStore
+from service.storage.store_health import HealthStore
+from service.storage.store_pages import PageStore
 from service.storage.store_people import PeopleStore
 from service.storage.store_proposals import ProposalStore
 from service.storage.store_push import PushStore
@@ -18,11 +22,26 @@ from service.storage.store_queues import QueueStore
 from service.storage.store_results import ResultStore
 from service.storage.store_runs import RunStore, insert_imported
 from service.storage.store_slots import SlotStore
+from service.storage.store_stations import StationStore
 from service.storage.tables import identity
 
 
 class Store(
-    RunStore, CheckpointStore, ResultStore, DiscoveryStore, ProposalStore, PushStore, QueueStore, SlotStore, PeopleStore, AuditStore
+    RunStore,
+    CheckpointStore,
+    ResultStore,
+    DiscoveryStore,
+    ProposalStore,
+    PushStore,
+    QueueStore,
+    SlotStore,
+    StationStore,
+    AlarmStore,
+    PeopleStore,
+    AuditStore,
+    DecisionStore,
+    PageStore,
+    HealthStore,
 ):
     """A database of machines, campaigns, runs, results, model books and queues.
 

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 from sqlalchemy import Connection, insert, select, text
 
+from service.errors import StoreError
 from service.storage.base import StoreBase
 from service.storage.records import Doc
 from service.storage.tables_people import audit
@@ -44,6 +45,23 @@ class AuditStore(StoreBase):
             return record
 
         return self._write(work)
+
+    def can_write(self) -> None:
+        """Make sure that something can be written now; writes nothing.
+
+        Raises
+        ------
+        StoreError
+            It cannot: read-only, locked by another process, gone.
+        """
+        # Of SQLite BEGIN IMMEDIATE asks for all that a write needs; a server says itself whether it takes writes.
+        read_only = text("SELECT current_setting('transaction_read_only')")
+
+        def work(connection: Connection) -> None:
+            if self._engine.dialect.name == "postgresql" and connection.execute(read_only).scalar_one() == "on":
+                raise StoreError(f"database {self.url} takes no writes", "use the server that does")
+
+        self._write(work)
 
     def audit(self, last: int | None = None) -> list[AuditRecord]:
         """Read the audit, oldest first; only the ``last`` records if given."""

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+from typing import Any
 
-from sqlalchemy import Connection, Insert, insert, select
+from sqlalchemy import Connection, Insert, Select, insert, select
 
 from service.errors import StoreError
 from service.storage.base import StoreBase
 from service.storage.records import CampaignRecord, Doc, MachineRecord
 from service.storage.tables import campaigns, machines
+
+MOST_DIGITS = 10
+"""A number with more is no number of a row."""
 
 
 def doc_hash(doc: Doc) -> str:
@@ -126,11 +130,13 @@ class CampaignStore(StoreBase):
         StoreError
             If there is none.
         """
-        found = next((one for one in self.campaigns() if one.name == name_or_id), None)
-        found = found or next((one for one in self.campaigns() if str(one.id) == str(name_or_id)), None)
-        if found is None:
-            raise StoreError(f"no campaign {name_or_id!r} in {self.url}", "`abbe runs` lists what there is")
-        return found
+        text = str(name_or_id)
+        wanted = [campaigns.c.name == name_or_id] if isinstance(name_or_id, str) else []
+        wanted += [campaigns.c.id == int(text)] if text.isdecimal() and len(text) < MOST_DIGITS else []
+        for query in (select(campaigns).where(condition) for condition in wanted):
+            if found := self._campaigns(query):
+                return found[0]
+        raise StoreError(f"no campaign {name_or_id!r} in {self.url}", "`abbe runs` lists what there is")
 
     def campaigns(self) -> list[CampaignRecord]:
         """List all campaigns, oldest first.
@@ -140,10 +146,10 @@ class CampaignStore(StoreBase):
         list of CampaignRecord
             The records.
         """
-        return [
-            CampaignRecord(*row)
-            for row in self._read(lambda connection: connection.execute(select(campaigns).order_by(campaigns.c.id)).all())
-        ]
+        return self._campaigns(select(campaigns).order_by(campaigns.c.id))
+
+    def _campaigns(self, query: Select[tuple[Any, ...]]) -> list[CampaignRecord]:
+        return [CampaignRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
 
 
 def machine_id_of(connection: Connection, name: str, doc: Doc, now: str) -> int:

@@ -81,9 +81,10 @@ class PeopleStore(StoreBase):
         row = self._read(lambda connection: connection.execute(select(users).where(users.c.name == name)).first())
         return None if row is None else UserRecord(*row)
 
-    def active_users(self) -> int:
-        """Count who may log in."""
-        query = select(func.count()).select_from(users).where(users.c.disabled_utc.is_(None))
+    def active_admins(self) -> int:
+        """Count the admins who may log in: not disabled, and with the hash of a password."""
+        query = select(func.count()).select_from(users)
+        query = query.where(users.c.disabled_utc.is_(None), users.c.role == "admin", users.c.password.like("$argon2%"))
         return int(self._read(lambda connection: connection.execute(query).scalar_one()))
 
     def change_user(self, user_id: int, keep_session: bool = False, **values: Any) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, func, insert, select
 
 from service.errors import StoreError
 from service.storage.base import StoreBase
@@ -49,4 +49,10 @@ class PushStore(StoreBase):
     def push_entries(self, machine: str) -> list[PushEntryRecord]:
         """Read the journal of all pushes of a machine from its beginning."""
         query = select(push_entries).where(push_entries.c.machine == machine).order_by(push_entries.c.id)
+        return [PushEntryRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
+
+    def last_push(self, machine: str) -> list[PushEntryRecord]:
+        """Read the journal of the last push of a machine; empty if there was none."""
+        latest = select(func.max(push_entries.c.push)).where(push_entries.c.machine == machine).scalar_subquery()
+        query = select(push_entries).where(push_entries.c.machine == machine, push_entries.c.push == latest).order_by(push_entries.c.id)
         return [PushEntryRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]

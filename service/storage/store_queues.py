@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from sqlalchemy import insert, select, update
+from collections.abc import Callable, Sequence
+
+from sqlalchemy import Connection, delete, func, insert, select, update
 
 from service.storage.base import StoreBase
 from service.storage.records import OutboxRecord
@@ -11,7 +13,7 @@ from service.storage.tables import outbox
 
 
 class QueueStore(StoreBase):
-    """Messages for the broker: none is forgotten."""
+    """Messages for the broker, kept until it has them."""
 
     def outbox_add(self, topic: str, payload: bytes | str) -> int:
         """Put a message into the outbox; it stays until it is sent.
@@ -58,3 +60,62 @@ class QueueStore(StoreBase):
         """
         statement = update(outbox).where(outbox.c.id == message_id, outbox.c.sent_utc.is_(None)).values(sent_utc=self._now())
         self._write(lambda connection: connection.execute(statement).rowcount)
+
+    def outbox_prune(self, keep: int, at_most: int = 1000) -> int:
+        """Forget messages that the broker has, oldest first.
+
+        Parameters
+        ----------
+        keep : int
+            So many of them stay, at least one: a database that numbers by "largest so far plus one" would use a number again.
+        at_most : int
+            So many are forgotten in one transaction; call again while it returns as many.
+
+        Returns
+        -------
+        int
+            How many were forgotten.
+        """
+        sent = select(outbox.c.id).where(outbox.c.sent_utc.is_not(None))
+        newest = sent.order_by(outbox.c.id.desc()).limit(max(keep, 1))
+        old = sent.where(outbox.c.id < select(func.min(newest.subquery().c.id)).scalar_subquery()).order_by(outbox.c.id).limit(at_most)
+        return int(self._write(lambda connection: connection.execute(delete(outbox).where(outbox.c.id.in_(old))).rowcount))
+
+    def outbox_shed(
+        self, topics: Sequence[str], most: int, down_to: int, notice: Callable[[int, str, str], tuple[str, bytes]] | None = None
+    ) -> int:
+        """Drop the oldest waiting messages of some topics when too many wait; messages of all other topics stay, however many.
+
+        Parameters
+        ----------
+        topics : sequence of str
+            What may be dropped.
+        most : int
+            More than so many waiting messages of these topics are too many.
+        down_to : int
+            So many, the newest, stay then; at least one.
+        notice : callable, optional
+            Given how many are dropped and when the oldest and the newest of them were made, returns topic and payload of a message that
+            says so. It is queued in the same transaction: nothing is lost in silence.
+
+        Returns
+        -------
+        int
+            How many were dropped.
+        """
+        waiting = (outbox.c.sent_utc.is_(None), outbox.c.topic.in_(topics))
+
+        def work(connection: Connection) -> int:
+            count = int(connection.execute(select(func.count()).where(*waiting)).scalar_one())
+            if count <= most:
+                return 0
+            kept = connection.execute(select(outbox.c.id).where(*waiting).order_by(outbox.c.id.desc()).limit(max(down_to, 1))).scalars()
+            gone = (*waiting, outbox.c.id < min(kept))
+            span = connection.execute(select(func.min(outbox.c.created_utc), func.max(outbox.c.created_utc)).where(*gone)).one()
+            dropped = int(connection.execute(delete(outbox).where(*gone)).rowcount)
+            if notice is not None:
+                topic, payload = notice(dropped, *span)
+                connection.execute(insert(outbox).values(topic=topic, payload=payload, created_utc=self._now()))
+            return dropped
+
+        return self._write(work)

@@ -51,6 +51,11 @@ class ResultStore(StoreBase):
             query = query.where(solutions.c.campaign_id == campaign_id)
         return [SolutionRecord(*row) for row in self._all(query)]
 
+    def latest_solutions(self, kind: str, limit: int) -> list[SolutionRecord]:
+        """List the newest solutions of a kind, newest first: each may be half a megabyte."""
+        query = select(solutions).where(solutions.c.kind == kind).order_by(solutions.c.id.desc()).limit(limit)
+        return [SolutionRecord(*row) for row in self._all(query)]
+
     def add_table(self, machine_id: int, solution_id: int | None, image: bytes, crc: int, doc: Doc) -> int:
         """Store a compensation table.
 

@@ -142,6 +142,21 @@ class RunStore(ChunkStore):
             query = query.where(runs.c.campaign_id == self.campaign(campaign).id)
         return self._select(query)
 
+    def latest_runs(self, limit: int, *, campaign: str = "", test: str = "", status: str = "") -> list[RunRecord]:
+        """List the newest runs, newest first, however many there are.
+
+        Parameters
+        ----------
+        limit : int
+            At most so many.
+        campaign, test, status : str
+            Only of this campaign, of this test, with this written status; empty: all.
+        """
+        query = _runs_query().order_by(None).order_by(runs.c.id.desc()).limit(limit)
+        for column, wanted in ((campaigns.c.name, campaign), (runs.c.test, test), (runs.c.status, status)):
+            query = query.where(column == wanted) if wanted else query
+        return self._select(query)
+
     def run(self, id_or_label: int | str) -> RunRecord:
         """Find a run.
 
@@ -171,6 +186,10 @@ class RunStore(ChunkStore):
             names = ", ".join(f"{one.campaign}/{one.label}" for one in found)
             raise StoreError(f"run {text!r} exists more than once", f"write one of {names}")
         return found[0]
+
+    def run_numbered(self, run_id: int) -> RunRecord | None:
+        """The run of a number, None if there is none."""
+        return next(iter(self._select(_runs_query().where(runs.c.id == run_id))), None)
 
     def chunks(self, run_id: int, channel: str | None = None) -> list[ChunkRecord]:
         """Read a run's samples and check that they are as they were written.

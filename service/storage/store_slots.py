@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
@@ -20,7 +21,7 @@ RUNNING = "running"
 RELEASED = "released"
 """Claimed and not started by a service that ended: the next one takes it."""
 
-_COLUMNS = (slots.c.id, slots.c.schedule, slots.c.slot_utc, slots.c.state, slots.c.reason, slots.c.claimed_utc, slots.c.finished_utc)
+SLOT_COLUMNS = (slots.c.id, slots.c.schedule, slots.c.slot_utc, slots.c.state, slots.c.reason, slots.c.claimed_utc, slots.c.finished_utc)
 
 
 class SlotStore(StoreBase):
@@ -98,21 +99,27 @@ class SlotStore(StoreBase):
         list of SlotRecord
             As they were found, in order of time; they belong to this process now.
         """
-        query = select(*_COLUMNS, slots.c.owner_host, slots.c.owner_pid, slots.c.owner_start)
+        query = select(*SLOT_COLUMNS, slots.c.owner_host, slots.c.owner_pid, slots.c.owner_start)
         query = query.where(slots.c.schedule == schedule, slots.c.finished_utc.is_(None)).order_by(slots.c.slot_utc)
         if not self._read(lambda connection: connection.execute(query).all()):
             return []
 
         def work(connection: Connection) -> list[SlotRecord]:
             me = _owner(this_process())
-            return [_record(row) for row in connection.execute(query).all() if _is_nobodys(row) and _taken(connection, row, me)]
+            return [slot_record(row) for row in connection.execute(query).all() if _is_nobodys(row) and _taken(connection, row, me)]
 
         return self._write(work)
 
     def slots_of(self, schedule: str, limit: int = 100) -> list[SlotRecord]:
         """List the latest slots of a schedule, newest first."""
-        query = select(*_COLUMNS).where(slots.c.schedule == schedule).order_by(slots.c.slot_utc.desc()).limit(limit)
-        return [_record(row) for row in self._read(lambda connection: connection.execute(query).all())]
+        query = select(*SLOT_COLUMNS).where(slots.c.schedule == schedule).order_by(slots.c.slot_utc.desc()).limit(limit)
+        return [slot_record(row) for row in self._read(lambda connection: connection.execute(query).all())]
+
+    def newest_slot(self, schedules: Sequence[str]) -> str:
+        """Return number and state of the slot of these schedules that was taken last, as one word; empty: none was."""
+        query = select(slots.c.id, slots.c.state).where(slots.c.schedule.in_(schedules)).order_by(slots.c.id.desc()).limit(1)
+        found = self._read(lambda connection: connection.execute(query).first())
+        return "" if found is None else f"{found.id}-{found.state}"
 
     def _mark(self, schedule: str, slot_utc: datetime | str, values: dict[str, object]) -> None:
         key = _slot(slot_utc)
@@ -139,7 +146,8 @@ def _taken(connection: Connection, row: Row[*tuple[Any, ...]], me: dict[str, obj
     return connection.execute(statement).rowcount == 1
 
 
-def _record(row: Row[*tuple[Any, ...]]) -> SlotRecord:
+def slot_record(row: Row[*tuple[Any, ...]]) -> SlotRecord:
+    """Return a row of `SLOT_COLUMNS` as a record."""
     return SlotRecord(row.id, row.schedule, row.slot_utc, row.state, row.reason or "", row.claimed_utc, row.finished_utc)
 
 

@@ -217,6 +217,19 @@ approvals = Table(
     Index(None, "proposal_id"),
 )
 
+alarm_entries = Table(
+    "alarm_entries",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine", String(200), nullable=False),
+    Column("alarm", Integer, nullable=False),
+    Column("seq", Integer, nullable=False),
+    Column("kind", String(30), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("utc", String(32), nullable=False),
+    UniqueConstraint("machine", "alarm", "seq"),
+)
+
 slots = Table(
     "slots",
     metadata,
@@ -231,6 +244,19 @@ slots = Table(
     Column("owner_pid", Integer),
     Column("owner_start", String(80)),
     UniqueConstraint("schedule", "slot_utc"),
+)
+
+stations = Table(
+    "stations",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("machine", String(200), nullable=False),
+    Column("doc", JSON, nullable=False),
+    Column("seen_utc", String(32), nullable=False),
+    Column("owner_host", String(255), nullable=False),
+    Column("owner_pid", Integer, nullable=False),
+    Column("owner_start", String(80), nullable=False),
+    UniqueConstraint("machine"),
 )
 
 outbox = Table(

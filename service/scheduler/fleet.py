@@ -1,0 +1,198 @@
+"""All machines of a database at a glance: what each does, what its last check found, what is next, and which limit comes first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from datetime import datetime
+from typing import Any
+
+from service.scheduler.station import SILENT_AFTER
+from service.scheduler.store import ServiceStore
+from service.storage.records import StationRecord, VerificationRecord
+from service.workflows.trend_table import FigureTrend, trends
+
+CHECKS = 400
+"""So many checks of each machine are looked at for its trend, which uses no more (`models.trend.MOST_CHECKS`)."""
+NOT_RUNNING = "not running"
+NO_SERVICE = "no service"
+HEADINGS = ("machine", "state", "last check (UTC)", "verdict", "figures ± U (k = 2)", "next due (UTC)", "days until limit (95 %)")
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure of a check: value, expanded uncertainty (k = 2) and limit, in the unit at the end of its name; None: not known."""
+
+    name: str
+    value: float
+    expanded: float | None
+    limit: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """Where one machine stands: what its service does, and what its last check found.
+
+    Parameters
+    ----------
+    machine : str
+        Name.
+    state : str
+        ``measuring``, ``waiting``, ``not running`` (its service ended, or was not heard for minutes), ``no service`` (never was one).
+    heard_utc : str
+        When its service said something last; empty without one.
+    check_utc, verdict : str
+        The last check; empty without one.
+    figures : tuple of Figure
+        Those of the last check that are judged, in its order.
+    next_due_utc, next_recipe : str
+        What its service will do next; empty if it does not run or has no timetable.
+    """
+
+    machine: str
+    state: str
+    heard_utc: str = ""
+    check_utc: str = ""
+    verdict: str = ""
+    figures: tuple[Figure, ...] = ()
+    next_due_utc: str = ""
+    next_recipe: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MachineLine(Stand):
+    """What is known of one machine: where it stands, and what its checks say of the days ahead.
+
+    Parameters
+    ----------
+    drifting : tuple of str
+        Figures that drift.
+    limit_figure : str
+        The figure that reaches its limit first; empty if that is known of none.
+    limit_days : tuple of float or None
+        Days until then, and the 95 % interval.
+    """
+
+    drifting: tuple[str, ...] = ()
+    limit_figure: str = ""
+    limit_days: tuple[float, float, float] | None = None
+
+
+def stands(store: ServiceStore, now: datetime) -> list[Stand]:
+    """Where every machine of a database stands, by name. Only its last check is read, so that it costs the same after years.
+
+    Parameters
+    ----------
+    store : ServiceStore
+        SQLite or PostgreSQL; many services may write to it.
+    now : datetime
+        With time zone.
+    """
+    said = store.stations()
+    return [_stand(name, said.get(name), store.verifications_of(name, limit=1), now) for name in store.machine_names()]
+
+
+def fleet(store: ServiceStore, now: datetime) -> list[MachineLine]:
+    """One line for each machine of a database, by name, with the trends of its figures; parameters as for `stands`."""
+    said = store.stations()
+    return [_line(name, said.get(name), store.verifications_of(name, limit=CHECKS), now) for name in store.machine_names()]
+
+
+def _line(name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
+    found = trends(checks)
+    soonest = min((one for one in found if not one.trend.forecast.reason), key=lambda one: one.trend.forecast.days, default=None)
+    stand = _stand(name, said, checks, now)
+    return MachineLine(
+        **{one.name: getattr(stand, one.name) for one in fields(stand)},
+        drifting=tuple(one.figure for one in found if one.trend.state == "drifting"),
+        limit_figure="" if soonest is None else soonest.figure,
+        limit_days=None if soonest is None else _days(soonest),
+    )
+
+
+def _stand(name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> Stand:
+    """``checks``: newest first."""
+    state = state_of(said, now)
+    due = said.doc.get("due", []) if said is not None and state not in {NOT_RUNNING, NO_SERVICE} else []
+    first: dict[str, str] = min(due, key=lambda one: datetime.fromisoformat(one["due_utc"]), default={})
+    last = checks[0] if checks else None
+    return Stand(
+        machine=name,
+        state=state,
+        heard_utc=said.seen_utc if said is not None else "",
+        check_utc="" if last is None else str(last.doc.get("started_utc") or last.utc),
+        verdict="" if last is None else last.verdict,
+        figures=() if last is None else figures_of(last.doc),
+        next_due_utc=first.get("due_utc", ""),
+        next_recipe=first.get("recipe", ""),
+    )
+
+
+def state_of(said: StationRecord | None, now: datetime) -> str:
+    """What a machine's service does, as far as it can be known from what it said last."""
+    if said is None:
+        return NO_SERVICE
+    if said.owner.is_gone() or now - datetime.fromisoformat(said.seen_utc) > SILENT_AFTER:
+        return NOT_RUNNING
+    return str(said.doc.get("state", NOT_RUNNING))
+
+
+def figures_of(doc: Mapping[str, Any]) -> tuple[Figure, ...]:
+    """The figures of a check that are judged; of a check that could not be completed there are none."""
+    values, expanded = doc.get("values", {}), doc.get("uncertainties", {})
+    judged = {name: limit for name, limit in doc.get("limits", {}).items() if values.get(name) is not None}
+    return tuple(Figure(name, values[name], expanded.get(name), limit) for name, limit in judged.items())
+
+
+def _days(one: FigureTrend) -> tuple[float, float, float]:
+    ahead = one.trend.forecast
+    return (ahead.days, ahead.low, ahead.high)
+
+
+def row(line: MachineLine) -> tuple[str, ...]:
+    """Return the cells of `HEADINGS`."""
+    figures = ", ".join(_words(one) for one in line.figures)
+    state = line.state if line.state != NOT_RUNNING else f"{NOT_RUNNING}, last heard {_minute(line.heard_utc)}"
+    due = f"{_minute(line.next_due_utc)} {line.next_recipe}" if line.next_due_utc else ""
+    return (line.machine, state, _minute(line.check_utc), line.verdict, figures, due, _limit_words(line))
+
+
+def _words(one: Figure) -> str:
+    expanded = "" if one.expanded is None else f" ± {one.expanded:.1f}"
+    limit = "" if one.limit is None else f" (limit {one.limit:g})"
+    return f"{one.name} {one.value:.1f}{expanded}{limit}"
+
+
+def _limit_words(line: MachineLine) -> str:
+    if line.limit_days is None:
+        return "not known" if line.figures else ""
+    days, low, high = (f"{v:.1f}" if v < 10 else f"{v:.0f}" for v in line.limit_days)
+    return f"{days} ({low} to {high}) {line.limit_figure}"
+
+
+def _minute(utc: str) -> str:
+    return utc[:16].replace("T", " ")
+
+
+def as_doc(lines: Sequence[MachineLine]) -> dict[str, Any]:
+    """Return everything as JSON value; what is not known is null or empty."""
+    return {"schema": 1, "machines": [_doc(one) for one in lines]}
+
+
+def _doc(one: MachineLine) -> dict[str, Any]:
+    days = None if one.limit_days is None else [v if math.isfinite(v) else None for v in one.limit_days]
+    return {
+        "machine": one.machine,
+        "state": one.state,
+        "heard_utc": one.heard_utc or None,
+        "check_utc": one.check_utc or None,
+        "verdict": one.verdict or None,
+        "figures": [{"name": f.name, "value": f.value, "expanded_uncertainty": f.expanded, "limit": f.limit} for f in one.figures],
+        "next_due_utc": one.next_due_utc or None,
+        "next_recipe": one.next_recipe or None,
+        "drifting": list(one.drifting),
+        "limit_figure": one.limit_figure or None,
+        "days_until_limit": None if days is None else days[0],
+        "days_until_limit_95": None if days is None else days[1:],
+    }

@@ -1,0 +1,114 @@
+"""What a backup consists of: a folder with the database, what the database does not have yet, the audit's files, and a list of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.audit.book import heads_in
+from service.audit.chain import faults
+from service.errors import BackupRefused
+from service.storage.copying import rows_of
+from service.storage.store_audit import AuditRecord
+
+FORMAT = "abbe-backup/1"
+LIST = "backup.json"
+DATABASE = "abbe.sqlite3"
+CAPTURE = "capture"
+KEY = "audit-key"
+HEADS = "audit-head"
+MACHINE = "machine.toml"
+COUNTED = ("machines", "campaigns", "runs", "chunks", "solutions", "verifications", "proposals", "audit")
+_PIECE = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Backup:
+    """A backup whose files are those that were written. ``doc``: its list."""
+
+    folder: Path
+    doc: dict[str, Any]
+
+    @property
+    def database(self) -> Path:
+        """The copied database."""
+        return self.folder / DATABASE
+
+    @property
+    def segments(self) -> list[Path]:
+        """What the capture had not given to the database, or had set aside."""
+        return sorted((self.folder / CAPTURE).glob("run-*"))
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file. Raises OSError."""
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            found.update(piece)
+    return found.hexdigest()
+
+
+def listed(folder: Path) -> dict[str, dict[str, Any]]:
+    """Every file below a folder but the list: its size and digest, by its path in the folder. Raises OSError."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / LIST)
+    return {path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": digest_of(path)} for path in files}
+
+
+def read_backup(folder: Path) -> Backup:
+    """Find a backup and compare each of its files with the list.
+
+    Raises
+    ------
+    BackupRefused
+        It is none, of a newer version, or a file is missing, too many or not as it was written: which one.
+    """
+    try:
+        doc = json.loads((folder / LIST).read_text(encoding="utf-8"))
+        if doc.get("format") != FORMAT:
+            raise BackupRefused(f"{folder} is a backup of the format {doc.get('format')!r}", f"this version of Abbe reads {FORMAT}")
+        wanted, found = doc["files"], listed(folder)
+        wrong = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+    except FileNotFoundError:
+        raise BackupRefused(f"{folder} is no backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
+    except OSError as err:
+        raise BackupRefused(f"{folder} cannot be read: {err.strerror}", "look at its rights and at the disk") from None
+    except (ValueError, AttributeError, KeyError) as err:
+        raise BackupRefused(f"{folder / LIST} is damaged: {err}", "take another backup") from None
+    if wrong:
+        how = "missing" if wrong[0] not in found else "not of this backup" if wrong[0] not in wanted else "not as it was written"
+        raise BackupRefused(f"{folder / wrong[0]} is {how}", "take another backup")
+    return Backup(folder, doc)
+
+
+def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, list[str]]:
+    """Number of records in the audit of a copied database, and everything that is wrong with them.
+
+    Without a key nothing is said about seals; then the second is empty.
+
+    Raises
+    ------
+    StoreError, AuditBroken, OSError
+        A file cannot be read.
+    """
+    if not rows_of(database, "SELECT 1 FROM sqlite_master WHERE name = 'audit'"):
+        return 0, []  # of a version before the audit
+    records = _records(database)
+    if key is None or not records:
+        return len(records), []
+    return len(records), faults(records, heads_in(heads), key.read_bytes())
+
+
+def _records(database: Path) -> Sequence[AuditRecord]:
+    query = "SELECT id, utc, who, action, target, outcome, doc, prev, digest, key, mac FROM audit ORDER BY id"
+    return [AuditRecord(*(*row[:6], json.loads(row[6]), *row[7:])) for row in rows_of(database, query)]
+
+
+def counts(database: Path) -> dict[str, int]:
+    """How many rows a copied database has in the tables that people ask for."""
+    there = {str(row[0]) for row in rows_of(database, "SELECT name FROM sqlite_master WHERE type = 'table'")}
+    return {name: int(rows_of(database, f"SELECT count(*) FROM {name}")[0][0]) for name in COUNTED if name in there}  # noqa: S608 - our own names

@@ -1,0 +1,351 @@
+BEGIN TRANSACTION;
+CREATE TABLE alarm_entries (
+	id INTEGER NOT NULL, 
+	machine VARCHAR(200) NOT NULL, 
+	alarm INTEGER NOT NULL, 
+	seq INTEGER NOT NULL, 
+	kind VARCHAR(30) NOT NULL, 
+	doc JSON NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_alarm_entries PRIMARY KEY (id), 
+	CONSTRAINT uq_alarm_entries_machine UNIQUE (machine, alarm, seq)
+);
+INSERT INTO "alarm_entries" VALUES(1,'VMC-1 ü''',1,0,'raised','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+INSERT INTO "alarm_entries" VALUES(2,'VMC-1 ü''',1,1,'raised','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE alembic_version (
+	version_num VARCHAR(32) NOT NULL, 
+	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
+);
+INSERT INTO "alembic_version" VALUES('0012');
+CREATE TABLE api_tokens (
+	id INTEGER NOT NULL, 
+	user_id INTEGER NOT NULL, 
+	name VARCHAR(100) NOT NULL, 
+	prefix VARCHAR(16) NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	scopes JSON NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	expires_utc VARCHAR(32) NOT NULL, 
+	revoked_utc VARCHAR(32), 
+	CONSTRAINT pk_api_tokens PRIMARY KEY (id), 
+	CONSTRAINT fk_api_tokens_user_id FOREIGN KEY(user_id) REFERENCES users (id), 
+	CONSTRAINT uq_api_tokens_prefix UNIQUE (prefix), 
+	CONSTRAINT uq_api_tokens_user_id UNIQUE (user_id, name)
+);
+INSERT INTO "api_tokens" VALUES(1,1,'scada','abbe_1','6666666666666666666666666666666666666666666666666666666666666666','["read"]','2026-11-21T03:34:05.123456Z','2099-01-01T00:00:00Z',NULL);
+CREATE TABLE approvals (
+	id INTEGER NOT NULL, 
+	proposal_id INTEGER NOT NULL, 
+	name VARCHAR(200) NOT NULL, 
+	login VARCHAR(200) NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	expiry VARCHAR(40) NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_approvals PRIMARY KEY (id), 
+	CONSTRAINT fk_approvals_proposal_id FOREIGN KEY(proposal_id) REFERENCES proposals (id)
+);
+INSERT INTO "approvals" VALUES(1,1,'Anna ü','anna','dddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddd','2099-01-01T00:00:00Z','2026-11-21T03:34:05.123456Z');
+CREATE TABLE audit (
+	id INTEGER NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	who VARCHAR(200) NOT NULL, 
+	action VARCHAR(200) NOT NULL, 
+	target TEXT NOT NULL, 
+	outcome VARCHAR(200) NOT NULL, 
+	doc JSON NOT NULL, 
+	prev VARCHAR(64) NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	"key" VARCHAR(16) NOT NULL, 
+	mac VARCHAR(64) NOT NULL, 
+	CONSTRAINT pk_audit PRIMARY KEY (id), 
+	CONSTRAINT uq_audit_prev UNIQUE (prev)
+);
+INSERT INTO "audit" VALUES(1,'2026-11-21T03:34:05.123456+00:00','anna','table.push','VMC-1 ü''','done','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','','1111111111111111111111111111111111111111111111111111111111111111','kkkkkkkkkkkkkkkk','mmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmm');
+INSERT INTO "audit" VALUES(2,'2026-11-21T03:34:05.123456+00:00','anna','table.push','VMC-1 ü''','done','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','1111111111111111111111111111111111111111111111111111111111111111','2222222222222222222222222222222222222222222222222222222222222222','kkkkkkkkkkkkkkkk','mmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmm');
+CREATE TABLE campaigns (
+	id INTEGER NOT NULL, 
+	machine_id INTEGER NOT NULL, 
+	name VARCHAR(200) NOT NULL, 
+	doc JSON NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_campaigns PRIMARY KEY (id), 
+	CONSTRAINT fk_campaigns_machine_id FOREIGN KEY(machine_id) REFERENCES machines (id), 
+	CONSTRAINT uq_campaigns_name UNIQUE (name)
+);
+INSERT INTO "campaigns" VALUES(1,1,'june','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE checkpoints (
+	id INTEGER NOT NULL, 
+	campaign_id INTEGER NOT NULL, 
+	seq INTEGER NOT NULL, 
+	kind VARCHAR(30) NOT NULL, 
+	doc JSON NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_checkpoints PRIMARY KEY (id), 
+	CONSTRAINT fk_checkpoints_campaign_id FOREIGN KEY(campaign_id) REFERENCES campaigns (id), 
+	CONSTRAINT uq_checkpoints_campaign_id UNIQUE (campaign_id, seq)
+);
+INSERT INTO "checkpoints" VALUES(1,1,0,'begun','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+INSERT INTO "checkpoints" VALUES(2,1,1,'begun','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE chunks (
+	id INTEGER NOT NULL, 
+	run_id INTEGER NOT NULL, 
+	channel VARCHAR(40) NOT NULL, 
+	seq INTEGER NOT NULL, 
+	n INTEGER NOT NULL, 
+	codec VARCHAR(20) NOT NULL, 
+	crc32 BIGINT NOT NULL, 
+	payload BLOB NOT NULL, 
+	first_host_s FLOAT NOT NULL, 
+	last_host_s FLOAT NOT NULL, 
+	first_device_us BIGINT NOT NULL, 
+	last_device_us BIGINT NOT NULL, 
+	CONSTRAINT pk_chunks PRIMARY KEY (id), 
+	CONSTRAINT fk_chunks_run_id FOREIGN KEY(run_id) REFERENCES runs (id), 
+	CONSTRAINT uq_chunks_run_id UNIQUE (run_id, channel, seq)
+);
+INSERT INTO "chunks" VALUES(1,1,'bar',0,32,'raw',688229491,X'000102030405060708090A0B0C0D0E0F101112131415161718191A1B1C1D1E1F202122232425262728292A2B2C2D2E2F303132333435363738393A3B3C3D3E3F404142434445464748494A4B4C4D4E4F505152535455565758595A5B5C5D5E5F606162636465666768696A6B6C6D6E6F707172737475767778797A7B7C7D7E7F808182838485868788898A8B8C8D8E8F909192939495969798999A9B9C9D9E9FA0A1A2A3A4A5A6A7A8A9AAABACADAEAFB0B1B2B3B4B5B6B7B8B9BABBBCBDBEBFC0C1C2C3C4C5C6C7C8C9CACBCCCDCECFD0D1D2D3D4D5D6D7D8D9DADBDCDDDEDFE0E1E2E3E4E5E6E7E8E9EAEBECEDEEEFF0F1F2F3F4F5F6F7F8F9FAFBFCFDFEFF',0.1,0.2,1099511627776,1099511627785);
+INSERT INTO "chunks" VALUES(2,1,'bar',1,32,'raw',476132726,X'000102030405060708090A0B0C0D0E0F101112131415161718191A1B1C1D1E1F202122232425262728292A2B2C2D2E2F303132333435363738393A3B3C3D3E3F404142434445464748494A4B4C4D4E4F505152535455565758595A5B5C5D5E5F606162636465666768696A6B6C6D6E6F707172737475767778797A7B7C7D7E7F808182838485868788898A8B8C8D8E8F909192939495969798999A9B9C9D9E9FA0A1A2A3A4A5A6A7A8A9AAABACADAEAFB0B1B2B3B4B5B6B7B8B9BABBBCBDBEBFC0C1C2C3C4C5C6C7C8C9CACBCCCDCECFD0D1D2D3D4D5D6D7D8D9DADBDCDDDEDFE0E1E2E3E4E5E6E7E8E9EAEBECEDEEEFF0F1F2F3F4F5F6F7F8F9FAFBFCFDFEFF000102030405060708090A0B0C0D0E0F101112131415161718191A1B1C1D1E1F202122232425262728292A2B2C2D2E2F303132333435363738393A3B3C3D3E3F404142434445464748494A4B4C4D4E4F505152535455565758595A5B5C5D5E5F606162636465666768696A6B6C6D6E6F707172737475767778797A7B7C7D7E7F808182838485868788898A8B8C8D8E8F909192939495969798999A9B9C9D9E9FA0A1A2A3A4A5A6A7A8A9AAABACADAEAFB0B1B2B3B4B5B6B7B8B9BABBBCBDBEBFC0C1C2C3C4C5C6C7C8C9CACBCCCDCECFD0D1D2D3D4D5D6D7D8D9DADBDCDDDEDFE0E1E2E3E4E5E6E7E8E9EAEBECEDEEEFF0F1F2F3F4F5F6F7F8F9FAFBFCFDFEFF',0.1,1.2,1099511627777,1099511627785);
+CREATE TABLE discoveries (
+	id INTEGER NOT NULL, 
+	campaign_id INTEGER NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	doc JSON NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_discoveries PRIMARY KEY (id), 
+	CONSTRAINT fk_discoveries_campaign_id FOREIGN KEY(campaign_id) REFERENCES campaigns (id)
+);
+INSERT INTO "discoveries" VALUES(1,1,'abababababababababababababababababababababababababababababababab','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE discovery_steps (
+	id INTEGER NOT NULL, 
+	discovery_id INTEGER NOT NULL, 
+	seq INTEGER NOT NULL, 
+	state VARCHAR(30) NOT NULL, 
+	doc JSON NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_discovery_steps PRIMARY KEY (id), 
+	CONSTRAINT fk_discovery_steps_discovery_id FOREIGN KEY(discovery_id) REFERENCES discoveries (id), 
+	CONSTRAINT uq_discovery_steps_discovery_id UNIQUE (discovery_id, seq)
+);
+INSERT INTO "discovery_steps" VALUES(1,1,0,'BEGUN','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+INSERT INTO "discovery_steps" VALUES(2,1,1,'NAMED','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE identity (
+	id INTEGER NOT NULL, 
+	uid VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_identity PRIMARY KEY (id)
+);
+INSERT INTO "identity" VALUES(1,'7b988ba95eb94a8495a2fa6cf21e7138');
+CREATE TABLE machine_models (
+	id INTEGER NOT NULL, 
+	machine VARCHAR(200) NOT NULL, 
+	version INTEGER NOT NULL, 
+	discovery_id INTEGER, 
+	doc JSON NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_machine_models PRIMARY KEY (id), 
+	CONSTRAINT fk_machine_models_discovery_id FOREIGN KEY(discovery_id) REFERENCES discoveries (id), 
+	CONSTRAINT uq_machine_models_machine UNIQUE (machine, version)
+);
+INSERT INTO "machine_models" VALUES(1,'VMC-1 ü''',1,1,'{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+INSERT INTO "machine_models" VALUES(2,'VMC-1 ü''',2,1,'{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE machines (
+	id INTEGER NOT NULL, 
+	name VARCHAR(200) NOT NULL, 
+	doc JSON NOT NULL, 
+	doc_hash VARCHAR(64) NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_machines PRIMARY KEY (id), 
+	CONSTRAINT uq_machines_name UNIQUE (name, doc_hash)
+);
+INSERT INTO "machines" VALUES(1,'VMC-1 ü''','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','30169858a32ee8bb28b1a24b7e474f90dfab15e5c2b0e89e124ebb124542e994','2026-11-21T03:34:05.123456Z');
+CREATE TABLE outbox (
+	id INTEGER NOT NULL, 
+	topic VARCHAR(500) NOT NULL, 
+	payload BLOB NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	sent_utc VARCHAR(32), 
+	CONSTRAINT pk_outbox PRIMARY KEY (id)
+);
+INSERT INTO "outbox" VALUES(1,'plant/abbe/state',X'7B225C75303062356D223A20302E312C20226C697374223A205B6E756C6C2C2031652D30372C202D302E305D2C202274657874223A20225C7530306663275C225C6E5C5C205C7535646535222C20226C61726765223A20393030373139393235343734303939337D','2026-11-21T03:34:05.123456Z','2026-11-21T03:34:05.123456Z');
+INSERT INTO "outbox" VALUES(2,'plant/abbe/alarm',X'3FB999999999999A','2026-11-21T03:34:05.123456Z',NULL);
+CREATE TABLE proposals (
+	id INTEGER NOT NULL, 
+	machine VARCHAR(200) NOT NULL, 
+	solution_id INTEGER NOT NULL, 
+	doc JSON NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_proposals PRIMARY KEY (id), 
+	CONSTRAINT fk_proposals_solution_id FOREIGN KEY(solution_id) REFERENCES solutions (id)
+);
+INSERT INTO "proposals" VALUES(1,'VMC-1 ü''',1,'{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','dddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddd','2026-11-21T03:34:05.123456Z');
+CREATE TABLE push_entries (
+	id INTEGER NOT NULL, 
+	machine VARCHAR(200) NOT NULL, 
+	push INTEGER NOT NULL, 
+	seq INTEGER NOT NULL, 
+	state VARCHAR(30) NOT NULL, 
+	doc JSON NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	prev VARCHAR(64) NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	CONSTRAINT pk_push_entries PRIMARY KEY (id), 
+	CONSTRAINT uq_push_entries_machine UNIQUE (machine, prev)
+);
+INSERT INTO "push_entries" VALUES(1,'VMC-1 ü''',1,0,'SNAPSHOT','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456+00:00','','1111111111111111111111111111111111111111111111111111111111111111');
+INSERT INTO "push_entries" VALUES(2,'VMC-1 ü''',1,1,'SNAPSHOT','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456+00:00','1111111111111111111111111111111111111111111111111111111111111111','2222222222222222222222222222222222222222222222222222222222222222');
+CREATE TABLE pushes (
+	id INTEGER NOT NULL, 
+	machine_id INTEGER NOT NULL, 
+	table_id INTEGER NOT NULL, 
+	state VARCHAR(30) NOT NULL, 
+	doc JSON NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	updated_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_pushes PRIMARY KEY (id), 
+	CONSTRAINT fk_pushes_machine_id FOREIGN KEY(machine_id) REFERENCES machines (id), 
+	CONSTRAINT fk_pushes_table_id FOREIGN KEY(table_id) REFERENCES tables (id)
+);
+INSERT INTO "pushes" VALUES(1,1,1,'KEEP','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z','2026-11-21T03:34:05.123456Z');
+CREATE TABLE rejections (
+	id INTEGER NOT NULL, 
+	proposal_id INTEGER NOT NULL, 
+	name VARCHAR(200) NOT NULL, 
+	login VARCHAR(200) NOT NULL, 
+	reason TEXT NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_rejections PRIMARY KEY (id), 
+	CONSTRAINT fk_rejections_proposal_id FOREIGN KEY(proposal_id) REFERENCES proposals (id)
+);
+INSERT INTO "rejections" VALUES(1,1,'Bert','bert','too large ü','2026-11-21T03:34:05.123456Z');
+CREATE TABLE replies (
+	id INTEGER NOT NULL, 
+	who VARCHAR(200) NOT NULL, 
+	"key" VARCHAR(100) NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	status INTEGER, 
+	body TEXT, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_replies PRIMARY KEY (id), 
+	CONSTRAINT uq_replies_who UNIQUE (who, "key")
+);
+INSERT INTO "replies" VALUES(1,'anna','order-4711','7777777777777777777777777777777777777777777777777777777777777777',202,'{"\u00b5m": 0.1, "list": [null, 1e-07, -0.0], "text": "\u00fc''\"\n\\ \u5de5", "large": 9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE runs (
+	id INTEGER NOT NULL, 
+	campaign_id INTEGER NOT NULL, 
+	label VARCHAR(100) NOT NULL, 
+	test VARCHAR(40) NOT NULL, 
+	role VARCHAR(20) NOT NULL, 
+	status VARCHAR(20) NOT NULL, 
+	reason TEXT NOT NULL, 
+	start_doc JSON NOT NULL, 
+	end_doc JSON, 
+	started_utc VARCHAR(32) NOT NULL, 
+	ended_utc VARCHAR(32), 
+	owner_host VARCHAR(255) NOT NULL, 
+	owner_pid INTEGER NOT NULL, 
+	owner_start VARCHAR(80) NOT NULL, 
+	CONSTRAINT pk_runs PRIMARY KEY (id), 
+	CONSTRAINT fk_runs_campaign_id FOREIGN KEY(campaign_id) REFERENCES campaigns (id), 
+	CONSTRAINT uq_runs_campaign_id UNIQUE (campaign_id, label)
+);
+INSERT INTO "runs" VALUES(1,1,'r1','helix','fit','complete','','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z','2026-11-21T03:34:05.123456Z','vm',852,'af4569a6-3467-4c95-a877-9313cf97f9e6/173104');
+INSERT INTO "runs" VALUES(2,1,'r2','helix','verify','running','','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}',NULL,'2026-11-21T03:34:05.123456Z',NULL,'vm',852,'af4569a6-3467-4c95-a877-9313cf97f9e6/173104');
+CREATE TABLE sessions (
+	id INTEGER NOT NULL, 
+	user_id INTEGER NOT NULL, 
+	digest VARCHAR(64) NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	seen_utc VARCHAR(32) NOT NULL, 
+	ended_utc VARCHAR(32), 
+	CONSTRAINT pk_sessions PRIMARY KEY (id), 
+	CONSTRAINT fk_sessions_user_id FOREIGN KEY(user_id) REFERENCES users (id), 
+	CONSTRAINT uq_sessions_digest UNIQUE (digest)
+);
+INSERT INTO "sessions" VALUES(1,1,'5555555555555555555555555555555555555555555555555555555555555555','2026-11-21T03:34:05.123456Z','2026-11-21T03:34:05.123456Z',NULL);
+CREATE TABLE slots (
+	id INTEGER NOT NULL, 
+	schedule VARCHAR(200) NOT NULL, 
+	slot_utc VARCHAR(32) NOT NULL, 
+	state VARCHAR(30) NOT NULL, 
+	claimed_utc VARCHAR(32) NOT NULL, 
+	finished_utc VARCHAR(32), reason TEXT, owner_host VARCHAR(255), owner_pid INTEGER, owner_start VARCHAR(80), 
+	CONSTRAINT pk_slots PRIMARY KEY (id), 
+	CONSTRAINT uq_slots_schedule UNIQUE (schedule, slot_utc)
+);
+INSERT INTO "slots" VALUES(1,'weekly','2026-11-20T05:00:00.000000Z','done','2026-11-21T03:34:05.123456Z','2026-11-21T03:34:05.123456Z','','vm',852,'af4569a6-3467-4c95-a877-9313cf97f9e6/173104');
+INSERT INTO "slots" VALUES(2,'weekly','2026-11-27T05:00:00.000000Z','claimed','2026-11-21T03:34:05.123456Z',NULL,NULL,'vm',852,'af4569a6-3467-4c95-a877-9313cf97f9e6/173104');
+CREATE TABLE solutions (
+	id INTEGER NOT NULL, 
+	campaign_id INTEGER NOT NULL, 
+	kind VARCHAR(40) NOT NULL, 
+	run_ids JSON NOT NULL, 
+	doc JSON NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_solutions PRIMARY KEY (id), 
+	CONSTRAINT fk_solutions_campaign_id FOREIGN KEY(campaign_id) REFERENCES campaigns (id)
+);
+INSERT INTO "solutions" VALUES(1,1,'joint','[1]','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE stations (
+	id INTEGER NOT NULL, 
+	machine VARCHAR(200) NOT NULL, 
+	doc JSON NOT NULL, 
+	seen_utc VARCHAR(32) NOT NULL, 
+	owner_host VARCHAR(255) NOT NULL, 
+	owner_pid INTEGER NOT NULL, 
+	owner_start VARCHAR(80) NOT NULL, 
+	CONSTRAINT pk_stations PRIMARY KEY (id), 
+	CONSTRAINT uq_stations_machine UNIQUE (machine)
+);
+INSERT INTO "stations" VALUES(1,'VMC-1 ü''','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z','vm',852,'af4569a6-3467-4c95-a877-9313cf97f9e6/173104');
+CREATE TABLE tables (
+	id INTEGER NOT NULL, 
+	machine_id INTEGER NOT NULL, 
+	solution_id INTEGER, 
+	image BLOB NOT NULL, 
+	crc BIGINT NOT NULL, 
+	doc JSON NOT NULL, 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_tables PRIMARY KEY (id), 
+	CONSTRAINT fk_tables_machine_id FOREIGN KEY(machine_id) REFERENCES machines (id), 
+	CONSTRAINT fk_tables_solution_id FOREIGN KEY(solution_id) REFERENCES solutions (id)
+);
+INSERT INTO "tables" VALUES(1,1,1,X'000102030405060708090A0B0C0D0E0F101112131415161718191A1B1C1D1E1F202122232425262728292A2B2C2D2E2F303132333435363738393A3B3C3D3E3F404142434445464748494A4B4C4D4E4F505152535455565758595A5B5C5D5E5F606162636465666768696A6B6C6D6E6F707172737475767778797A7B7C7D7E7F808182838485868788898A8B8C8D8E8F909192939495969798999A9B9C9D9E9FA0A1A2A3A4A5A6A7A8A9AAABACADAEAFB0B1B2B3B4B5B6B7B8B9BABBBCBDBEBFC0C1C2C3C4C5C6C7C8C9CACBCCCDCECFD0D1D2D3D4D5D6D7D8D9DADBDCDDDEDFE0E1E2E3E4E5E6E7E8E9EAEBECEDEEEFF0F1F2F3F4F5F6F7F8F9FAFBFCFDFEFF',4294967295,'{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE TABLE users (
+	id INTEGER NOT NULL, 
+	name VARCHAR(100) NOT NULL, 
+	role VARCHAR(20) NOT NULL, 
+	password VARCHAR(200) NOT NULL, 
+	disabled_utc VARCHAR(32), 
+	created_utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_users PRIMARY KEY (id), 
+	CONSTRAINT uq_users_name UNIQUE (name)
+);
+INSERT INTO "users" VALUES(1,'anna','admin','$argon2id$v=19$m=8,t=1,p=1$c2FsdA$aGFzaA',NULL,'2026-11-21T03:34:05.123456Z');
+CREATE TABLE verifications (
+	id INTEGER NOT NULL, 
+	machine_id INTEGER NOT NULL, 
+	campaign_id INTEGER, 
+	verdict VARCHAR(30) NOT NULL, 
+	doc JSON NOT NULL, 
+	utc VARCHAR(32) NOT NULL, 
+	CONSTRAINT pk_verifications PRIMARY KEY (id), 
+	CONSTRAINT fk_verifications_campaign_id FOREIGN KEY(campaign_id) REFERENCES campaigns (id), 
+	CONSTRAINT fk_verifications_machine_id FOREIGN KEY(machine_id) REFERENCES machines (id)
+);
+INSERT INTO "verifications" VALUES(1,1,1,'cannot tell','{"µm":0.1,"list":[null,1e-07,-0.0],"text":"ü''\"\n\\ 工","large":9007199254740993}','2026-11-21T03:34:05.123456Z');
+CREATE INDEX ix_outbox_sent_utc ON outbox (sent_utc);
+CREATE INDEX ix_solutions_campaign_id ON solutions (campaign_id);
+CREATE INDEX ix_verifications_machine_id ON verifications (machine_id);
+CREATE INDEX ix_tables_machine_id ON tables (machine_id);
+CREATE INDEX ix_pushes_machine_id ON pushes (machine_id);
+CREATE INDEX ix_discoveries_campaign_id ON discoveries (campaign_id);
+CREATE INDEX ix_proposals_machine ON proposals (machine);
+CREATE INDEX ix_approvals_proposal_id ON approvals (proposal_id);
+CREATE INDEX ix_sessions_user_id ON sessions (user_id);
+CREATE TRIGGER audit_no_update BEFORE UPDATE ON audit BEGIN SELECT RAISE(ABORT, 'the audit only grows'); END;
+CREATE TRIGGER audit_no_delete BEFORE DELETE ON audit BEGIN SELECT RAISE(ABORT, 'the audit only grows'); END;
+CREATE TRIGGER audit_no_replace BEFORE INSERT ON audit
+WHEN NEW.id <> (SELECT COALESCE(MAX(id), 0) + 1 FROM audit) OR EXISTS (SELECT 1 FROM audit WHERE prev = NEW.prev)
+BEGIN SELECT RAISE(ABORT, 'the audit only grows'); END;
+CREATE INDEX ix_rejections_proposal_id ON rejections (proposal_id);
+COMMIT;
