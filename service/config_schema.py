@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from drivers.errors import DriverError
 from drivers.links import urls
-from service.config_timetable import ScheduleEntry, Section, WindowEntry
+from service.config_timetable import AlarmSection, ScheduleEntry, Section, WindowEntry
 from service.errors import AbbeError
 from service.mqtt.broker import parse as parse_broker
 from service.runs.machine_object import Chain, Interval, Point
@@ -107,6 +107,9 @@ class Limits(Section):
     table_step_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(
         default=20.0, description="largest change between neighbouring grid points"
     )
+    table_walk_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
+        default=50.0, description="largest change of a correction over 30 days by pushes that nobody attends ([alarm] push)"
+    )
     measurement_age_h: Annotated[float, Field(gt=0.0, le=8760.0)] = Field(
         default=72.0, description="a table is only written from runs that are not older"
     )
@@ -172,6 +175,21 @@ class Mqtt(Section):
         default=None, description="mqtt://[user:password@]host:1883; absent: nothing is published"
     )
     topic_prefix: str = Field(default="abbe", pattern=r"^[^+#\s/][^+#\s]*$", description="first part of every topic")
+    ca: str = Field(
+        default="",
+        description="authority that signed the broker's certificate, PEM file (relative to the machine file's folder); empty: those that "
+        "this computer trusts",
+    )
+    certificate: str = Field(default="", description="our certificate, PEM file, if the broker asks for one")
+    key: str = Field(default="", description="private key of our certificate, PEM file")
+
+    @model_validator(mode="after")
+    def _encrypted(self) -> Self:
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("certificate and key belong together, expected both or none")
+        if (self.ca or self.certificate) and not (self.url or "").startswith("mqtts:"):
+            raise ValueError("ca and certificate are for an encrypted connection, expected url = mqtts://host:8883")
+        return self
 
 
 class Web(Section):
@@ -188,6 +206,38 @@ class Web(Section):
     )
     certificate: str = Field(default="", description="TLS certificate, PEM file (relative to the machine file's folder); empty: plain HTTP")
     key: str = Field(default="", description="private key of the certificate, PEM file")
+    behind_tls: bool = Field(
+        default=False,
+        description="a reverse proxy on this computer takes off the TLS, keeps Host and appends to X-Forwarded-For, its name is in names",
+    )
+
+    @model_validator(mode="after")
+    def _both(self) -> Self:
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("certificate and key belong together, expected both or none")
+        if self.behind_tls and not self.names:
+            raise ValueError("behind_tls needs the proxy's name in names, under which browsers ask for the page")
+        return self
+
+
+class OpcUa(Section):
+    """An OPC UA server that shows the machine to the plant. Nothing can be written through it."""
+
+    enabled: bool = Field(default=False, description="needs the extra: pip install 'abbe[opcua]'")
+    host: str = Field(
+        default="127.0.0.1",
+        min_length=1,
+        description="address to listen on; other than this computer's own only with certificate, key and clients",
+    )
+    port: int = Field(default=4840, ge=0, le=65535, description="0: any free port")
+    certificate: str = Field(
+        default="", description="of this server, PEM file (relative to the machine file's folder); empty: not encrypted"
+    )
+    key: str = Field(default="", description="private key of the certificate, PEM file")
+    clients: list[str] = Field(
+        default_factory=list,
+        description="certificates of the programs that may read, PEM or DER files; without any: every program on this computer",
+    )
 
     @model_validator(mode="after")
     def _both(self) -> Self:
@@ -227,7 +277,9 @@ class MachineFile(Section):
     verify: Verify = Verify()
     mqtt: Mqtt = Mqtt()
     web: Web = Web()
+    opcua: OpcUa = OpcUa()
     signatures: Signatures = Signatures()
+    alarm: AlarmSection = AlarmSection()
     schedule: list[ScheduleEntry] = Field(default_factory=list)
     maintenance: list[WindowEntry] = Field(default_factory=list, description="windows in which no scheduled check starts")
     staffed: list[WindowEntry] = Field(default_factory=list, description="when an operator is at the machine")

@@ -74,6 +74,11 @@ class ScheduleEntry(Section):
         default="skip", description="missed slots: skip: recorded, the machine is not moved; once: recorded, and one run for all of them"
     )
     needs: NeedsEntry = NeedsEntry()
+    on_alarm: Literal["none", "propose"] = Field(
+        default="none",
+        description="propose: when a check raises an alarm, [alarm] campaign is measured, solved and searched by itself, and tables are "
+        "proposed, which wait for approval",
+    )
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -82,6 +87,24 @@ class ScheduleEntry(Section):
         if self.first is not None and self.every_h is None:
             raise ValueError("expected every_h = ... beside first = ...: a cron expression is not counted from anywhere")
         return self
+
+
+class AlarmSection(Section):
+    """When scheduled checks raise an alarm beside their limits, and what may follow by itself."""
+
+    warn_days: float = Field(
+        default=14.0, ge=0.0, le=3650.0, description="alarm when a limit may be reached within so many days (lower end, 95 %); 0: never"
+    )
+    campaign: str = Field(
+        default="identification", min_length=1, description="what on_alarm measures: identification, or a recipe FILE.toml beside this file"
+    )
+    push: Literal["never", "approved"] = Field(
+        default="never",
+        description="approved: a proposal that a person has approved is pushed by the service when the machine is idle, and verified",
+    )
+    watch_table: bool = Field(
+        default=True, description="look every 10 s whether somebody else put another compensation table into force, and raise an alarm"
+    )
 
 
 class WindowEntry(Section):

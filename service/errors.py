@@ -40,6 +40,24 @@ class StoreError(AbbeError):
     code = "STO-001"
 
 
+class NotStored(AbbeError):
+    """The database holds nothing under the number or name that was asked for."""
+
+    code = "STO-002"
+
+
+class Unusable(AbbeError):
+    """What is stored cannot be shown as it was asked for: it is not complete enough, damaged, or of another kind."""
+
+    code = "STO-003"
+
+
+class BackupRefused(AbbeError):
+    """A backup cannot be made there, is damaged, or cannot be brought back over what is there. Nothing was changed."""
+
+    code = "STO-004"
+
+
 class StrokeError(AbbeError):
     """A planned path leaves the machine's strokes. Raised by the dry run, before anything moves."""
 
@@ -178,6 +196,12 @@ class StretchDiffers(SetupDisturbed):
     code = "SEQ-009"
 
 
+class MachineInUse(UnsafeToMove):
+    """Another process has the machine, or is in the middle of a push into it. Nothing is wrong: it waits until that has ended."""
+
+    code = "SEQ-010"
+
+
 class NotObservable(AbbeError):
     """The data cannot carry the claim that was asked for."""
 
@@ -314,3 +338,27 @@ class KeyRefused(AbbeError):
     """A key cannot be read, is no Ed25519 key, or would overwrite another."""
 
     code = "SIG-002"
+
+
+class ChannelBroken(AbbeError):
+    """What came over the channel between the processes of the service is none of its messages. The process at the other end is ended."""
+
+    code = "SRV-001"
+
+
+class CoreSilent(AbbeError):
+    """The core of the service does not answer its web process. What runs on the machine is not known to the page."""
+
+    code = "SRV-002"
+
+
+class KeyReused(AbbeError):
+    """An Idempotency-Key came with another request than the first time. Nothing was done; a new request needs a new key."""
+
+    code = "API-001"
+
+
+class KeyInUse(AbbeError):
+    """The request of this Idempotency-Key is still being worked on, or was not answered. Ask again after a minute."""
+
+    code = "API-002"

@@ -1,7 +1,8 @@
 """The unattended service: what is wired to what, in which order it starts, and in which order it stops.
 
-Start: store, MQTT, timetable, page. Stop, within five seconds: a running check is cancelled (the devices hold the motion), the page
-closes, the broker is told "offline", the store is closed.
+This is the core process: devices, timetable, jobs, MQTT. It answers no HTTP; the page is a process of its own (`service.web.process`) that
+it starts, tells and hears over a channel of its own (`service.channel`). Start: store, MQTT, timetable, page. Stop, within five seconds: a
+running check is cancelled (the devices hold the motion), the page closes, the broker is told "offline", the store is closed.
 """
 
 from __future__ import annotations
@@ -11,118 +12,66 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import asdict, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import structlog
 
 from service.audit.book import AuditBook, this_account
 from service.audit.chain import Event
+from service.channel.messages import PROTOCOL, Begin, NeedsTold, RulesTold, ScheduleTold
 from service.clock import Clock, SystemClock
+from service.core.campaigns import Campaigns
+from service.core.cut_off import LastWords, cut_off_now, leave_now
+from service.core.jobs import JobBook
+from service.core.moment import Moments
+from service.core.open_ends import OpenEnds
+from service.core.orders import Ground, Hands, Orders
+from service.core.rights import may, may_measure
+from service.core.setup import Setup
+from service.core.systemd import notify
+from service.core.table_watch import TableWatch
+from service.core.watch import BoardWatch, StateTeller
+from service.core.web_process import WebProcess
 from service.errors import ConfigError
-from service.events import Progress
-from service.mqtt.broker import Broker
 from service.mqtt.outbox import StoreOutbox
 from service.mqtt.publisher import Publisher
-from service.mqtt.topics import Topics
+from service.plant.gather import Gatherer
+from service.scheduler.desk import AlarmDesk, Telling
 from service.scheduler.job import CheckJob
 from service.scheduler.keep import StoreLedger, StoreShelf
 from service.scheduler.loop import Scheduler, Terms
-from service.scheduler.ports import Check, Doc, JobWatcher, Readiness
-from service.scheduler.ready import AlwaysReady
-from service.scheduler.slots import Schedule
+from service.scheduler.ports import JobWatcher
+from service.scheduler.station import Station
 from service.scheduler.store import ServiceStore
-from service.scheduler.windows import Window
 from service.storage.engine import parse_url
-from service.users.people import People
-from service.web.app import create_app
+from service.storage.private import database_seen_by_others
+from service.users.roles import Permission
 from service.web.board import Board
-from service.web.door import Door
-from service.web.server import bind, check_certificate, check_exposure, make_server
+from service.web.listening import bind, check_certificate, check_exposure
 from service.web.view import View
+from service.workflows.at_start import push_is_open
+from service.workflows.push_word import open_push
+from service.workflows.shipped import parted
+
+if TYPE_CHECKING:
+    from service.plant.opcua.server import OpcUaServer
 
 log = structlog.get_logger("abbe.serve")
 
 STOP_S = 4.5
 """Promised are 5 s from the signal to the end of the process; what hangs after this is cut off. The store survives that."""
+LEAVE_S = 0.3
+"""So long a thread that still computes is waited for once all is closed."""
 HOLD_S = 2.5
 GOODBYE_S = 1.2
 FLUSH_S = 5.0
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - compared with, not listened on
-
-
-@dataclass(frozen=True, slots=True)
-class Setup:
-    """What the service is to do, taken from the machine file.
-
-    Parameters
-    ----------
-    machine : str
-        Name of the machine.
-    doc : dict
-        Its description as the store keeps it.
-    devices : mapping of str to str
-        Role and URL.
-    schedules : tuple of Schedule
-        The timetable.
-    store_url : str
-        Where everything is kept.
-    broker : Broker or None
-        Where everything is told.
-    topics : Topics
-        Under which names.
-    host, port : str, int
-        Where the page is.
-    check : callable
-        Given the open store, returns ``check(recipe, progress)``.
-    maintenance : tuple of Window
-        Nothing starts by itself in these.
-    ready : callable
-        Given the clock, returns who knows the preconditions.
-    names : tuple of str
-        Under which other computers ask for the page.
-    certificate, key : str
-        PEM files of the page; empty: plain HTTP.
-    """
-
-    machine: str
-    doc: dict[str, Any]
-    devices: Mapping[str, str]
-    schedules: tuple[Schedule, ...]
-    store_url: str
-    broker: Broker | None
-    topics: Topics
-    host: str
-    port: int
-    check: Callable[[ServiceStore], Check]
-    maintenance: tuple[Window, ...] = ()
-    ready: Callable[[Clock], Readiness] = lambda _: AlwaysReady()
-    names: tuple[str, ...] = ()
-    certificate: str = ""
-    key: str = ""
-
-
-class _StateTeller:
-    """Keeps the retained state message true."""
-
-    def __init__(self, publisher: Publisher, clock: Clock) -> None:
-        self._publisher = publisher
-        self._clock = clock
-
-    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
-        self._publisher.set_state("measuring", at_utc, schedule=schedule.name)
-
-    def job_progress(self, progress: Progress) -> None:
-        pass  # the state is retained, so every change is a write in the broker: progress is for the page
-
-    def job_ended(self, doc: Doc | None) -> None:
-        self._publisher.set_state("online", self._clock.utc())
 
 
 class Service:
@@ -131,32 +80,88 @@ class Service:
     def __init__(self, setup: Setup, store: ServiceStore, listening: socket.socket, clock: Clock) -> None:
         self._setup = setup
         self._store = store
-        self._listening = listening
         self._clock = clock
+        self._listening = listening
         self.board = Board(setup.devices, clock)
         self._publisher = self._make_publisher()
-        watchers: list[JobWatcher] = [self.board]
+        self._station = Station(setup.machine, version("abbe"), store, lambda: self._scheduler.next_due(), clock)
+        watchers: list[JobWatcher] = [BoardWatch(self.board, self._changed), self._station]
         if self._publisher is not None:
-            watchers.append(_StateTeller(self._publisher, clock))
+            watchers.append(StateTeller(self._publisher, clock))
         topics = (setup.topics.verification, setup.topics.alarm) if self._publisher is not None else None
-        shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
-        self._job = CheckJob(setup.machine, setup.check(store), shelf, watchers, clock)
-        terms = Terms(setup.maintenance, setup.ready(clock))
-        self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._job, shelf, clock, terms)
-        broker = "" if setup.broker is None else str(setup.broker)
-        view = View(setup.machine, version("abbe"), self.board, store, self._scheduler.next_due, broker, clock)
+        self._shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
         book = AuditBook(store, setup.store_url)
-        book.write(Event(this_account(), "abbe serve", setup.machine, "begun", {"host": setup.host, "port": listening.getsockname()[1]}))
-        people = People(store, clock)
-        people.passwords.prepare()
+        desk = self._make_desk(book, watchers)
+        job = CheckJob(setup.machine, setup.check(store), self._shelf, watchers, clock, desk.checked if desk is not None else None)
+        recipes = tuple(dict.fromkeys([*setup.recipes, *(parted(schedule.recipe)[0] for schedule in setup.schedules)]))
+        self._jobs = JobBook(job.run, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed)
+        if setup.campaign is not None:
+            campaigns = Campaigns(setup.machine, setup.campaigns, setup.campaign(store), book, watchers)
+            self._jobs.full = campaigns.full(lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE))
+        terms = Terms(setup.maintenance, setup.ready(clock), errands=desk, carry=self._jobs.errand)
+        self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._jobs, self._shelf, clock, terms)
+        moments = Moments(self.board, self._jobs, self._scheduler.next_due, clock)
+        orders = self._make_orders(book, watchers)
+        begin = self._begin((*recipes, *self._jobs.full.names))
+        self._web = WebProcess(begin, listening, moments.now, self._jobs, clock, setup.live, orders)
+        self._opcua = self._make_opcua()
+        doc = {"host": setup.host, "port": listening.getsockname()[1]}
+        book.write(Event(this_account(), "abbe serve", setup.machine, "begun", doc))
+
+    def _begin(self, recipes: tuple[str, ...]) -> Begin:
+        setup = self._setup
+        broker = "" if setup.broker is None else str(setup.broker)
         hosts = (*LOCAL, *setup.names, *(() if setup.host in EVERYWHERE else (setup.host,)))
-        app = create_app(view, version=version("abbe"), hosts=hosts, door=Door(store, people, book))
-        self._server = make_server(app, setup.certificate, setup.key)
+        return Begin(
+            "begin",
+            PROTOCOL,
+            setup.machine,
+            version("abbe"),
+            setup.store_url,
+            broker,
+            hosts,
+            setup.certificate,
+            setup.key,
+            recipes,
+            self._listening.getsockname()[1],
+            setup.behind_tls,
+            tuple(ScheduleTold(**asdict(schedule) | {"needs": NeedsTold(**asdict(schedule.needs))}) for schedule in setup.schedules),
+            RulesTold(**asdict(setup.rules)),
+            setup.told,
+            self._jobs.full.names,
+        )
+
+    def _changed(self) -> None:
+        self._web.changed()
 
     def _make_publisher(self) -> Publisher | None:
-        if self._setup.broker is None:
+        setup, board = self._setup, self.board
+        if setup.broker is None:
             return None
-        return Publisher(self._setup.broker, self._setup.topics, StoreOutbox(self._store), self._clock, self.board.broker)
+        outbox = StoreOutbox(self._store, setup.topics, self._clock)
+        return Publisher(setup.broker, setup.topics, outbox, self._clock, board.broker, board.messages_dropped)
+
+    def _make_opcua(self) -> OpcUaServer | None:
+        setup = self._setup
+        if setup.opcua is None:
+            return None
+        from service.plant.opcua.server import OpcUaServer  # an extra, and slow to import
+
+        broker = "" if setup.broker is None else str(setup.broker)
+        view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock)
+        return OpcUaServer(setup.opcua, Gatherer(view.status, self._store), self._clock, setup.machine, version("abbe"))
+
+    def _make_desk(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmDesk | None:
+        setup = self._setup
+        if setup.duties is None:
+            return None
+        telling = Telling(setup.topics.alarm if self._publisher is not None else None, self._posted, book, watchers)
+        return AlarmDesk(self._store, self._clock, setup.machine, setup.schedules, setup.duties(self._store), telling)
+
+    def _make_orders(self, book: AuditBook, watchers: list[JobWatcher]) -> Orders:
+        setup, store = self._setup, self._store
+        ground = Ground(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, watchers)
+        return Orders(store, self._clock, self._jobs, ground, Hands() if setup.hands is None else setup.hands(store))
 
     def _posted(self) -> None:
         if self._publisher is not None:
@@ -165,11 +170,15 @@ class Service:
     async def run(self, stop: asyncio.Event, *, once: bool) -> bool:
         """Work until ``stop``, or, with ``once``, until every recipe was run once; return whether all of those passed."""
         passed = True
+        if self._opcua is not None:
+            await self._opcua.prepare()
         async with asyncio.TaskGroup() as parts:
             mqtt = parts.create_task(self._publisher.run() if self._publisher is not None else stop.wait(), name="mqtt")
-            parts.create_task(self._server.serve(sockets=[self._listening]), name="web")
-            work = parts.create_task(self._once() if once else self._timetable(), name="scheduler")
+            parts.create_task(self._web.run(), name="web")
+            work = parts.create_task(self._once() if once else self._timetable(parts), name="scheduler")
             beat = parts.create_task(self._heartbeat(), name="heartbeat")
+            opcua = parts.create_task(self._opcua.run(stop) if self._opcua is not None else stop.wait(), name="opcua")
+            station = parts.create_task(self._station.run(), name="station")
             stopped = parts.create_task(stop.wait(), name="stop")
             try:
                 await asyncio.wait({work, stopped}, return_when=asyncio.FIRST_COMPLETED)
@@ -180,12 +189,13 @@ class Service:
             if work.done() and not work.cancelled() and work.exception() is None:
                 passed = work.result()
             work.cancel()
-            await asyncio.wait({work}, timeout=HOLD_S)
+            by_hand = parts.create_task(self._jobs.close(), name="jobs")
+            await asyncio.wait({work, by_hand}, timeout=HOLD_S)
             self._ask_to_end()
             await asyncio.wait({mqtt}, timeout=GOODBYE_S)
             mqtt.cancel()  # a broker that accepts connections and then says nothing would hold us up
-            beat.cancel()
-            stopped.cancel()
+            for task in (beat, stopped, opcua, station):
+                task.cancel()
         return passed
 
     def _ask_to_end(self) -> None:
@@ -194,18 +204,32 @@ class Service:
         A cancellation alone can get lost: ``asyncio.wait_for`` of Python 3.11 swallows one that comes together with what it waits for, such
         as the broker's acknowledgement, and the service would stay half dead for ever.
         """
-        self._server.should_exit = True
+        self._web.stop()
         if self._publisher is not None:
             self._publisher.stop()
 
-    async def _timetable(self) -> bool:
+    async def _timetable(self, parts: asyncio.TaskGroup) -> bool:
+        self._jobs.open(self._scheduler, parts)
         for schedule, slot in self._scheduler.next_due():
             log.info("planned", schedule=schedule.name, next_utc=slot.isoformat())
-        await self._scheduler.run()
+        async with asyncio.TaskGroup() as tasks:
+            if self._setup.recover is not None:
+                recover, told = self._setup.recover(self._store), self.board.attention
+                is_open = partial(push_is_open, self._store, self._setup.machine)
+                ends = OpenEnds(recover, is_open, self._scheduler, self._shelf, told, self._clock, self._attention_changed)
+                tasks.create_task(ends.run(), name="recovery")
+            if self._setup.table is not None:
+                look, told = self._setup.table(self._store), self.board.attention
+                tasks.create_task(TableWatch(look, self._shelf, told, self._clock, self._attention_changed).run(), name="table")
+            await self._scheduler.run()
         return True
 
+    def _attention_changed(self) -> None:
+        self.board.changed()
+        self._changed()
+
     async def _once(self) -> bool:
-        states = [await self._job(replace(s, name=f"{s.name} (once)"), self._clock.utc()) for s in self._setup.schedules]
+        states = [await self._jobs(replace(s, name=f"{s.name} (once)"), self._clock.utc()) for s in self._setup.schedules]
         with suppress(TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 # Messages that are not delivered now are delivered by the next start.
@@ -232,16 +256,22 @@ def serve(setup: Setup, *, once: bool = False, clock: Clock | None = None) -> in
     """
     if once and not setup.schedules:
         raise ConfigError("there is no [[schedule]] whose recipe could be run once", "add one to the machine file")
-    cut_off = threading.Timer(STOP_S, _cut_off)
+    words: list[LastWords] = []
+    cut_off = threading.Timer(STOP_S, cut_off_now, [words])
     cut_off.daemon = True
     # Selector, also on Windows: the MQTT client works with no other loop there.
     with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
-        passed = runner.run(_main(setup, once, clock or SystemClock(), cut_off))
+        passed = runner.run(_main(setup, once, clock or SystemClock(), cut_off, words))
+        # Devices and store are closed. A thread that still solves or searches has nothing that could be lost.
+        leave = threading.Timer(LEAVE_S, leave_now, [0 if passed else 1])
+        leave.daemon = True
+        leave.start()
+    leave.cancel()
     cut_off.cancel()
     return 0 if passed else 1
 
 
-async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer) -> bool:
+async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer, last_words: list[LastWords]) -> bool:
     stop = asyncio.Event()
 
     def on_signal(name: str) -> None:
@@ -258,15 +288,19 @@ async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer
     for number in (signal.SIGTERM, signal.SIGINT):
         # signal.signal rather than add_signal_handler: it works on Windows too, and the loop is woken either way.
         signal.signal(number, from_any_thread)
-    await asyncio.to_thread(check_exposure, setup.host, lambda: _users(setup.store_url), tls=bool(setup.certificate))
+    reach = partial(check_exposure, tls=bool(setup.certificate), names=setup.names, behind_tls=setup.behind_tls)
+    await asyncio.to_thread(reach, setup.host, lambda: _admins(setup.store_url))
     check_certificate(setup.certificate, setup.key)
     listening = bind(setup.host, setup.port)
     try:
         store = await asyncio.to_thread(ServiceStore.open, setup.store_url)
+        if words := database_seen_by_others(setup.store_url):
+            log.warning("database", text=words)
         try:
             host, port = listening.getsockname()[:2]
             scheme = "https" if setup.certificate else "http"
             log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
+            last_words.append(partial(open_push, store, setup.machine))
             return await Service(setup, store, listening, clock).run(stop, once=once)
         finally:
             await asyncio.to_thread(store.close)
@@ -275,27 +309,10 @@ async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer
         listening.close()
 
 
-def _users(url: str) -> int:
-    """How many may log in; a database that is not there yet has none, and is not made for the question."""
+def _admins(url: str) -> int:
+    """How many admins may log in; a database that is not there yet has none, and is not made for the question."""
     parsed = parse_url(url)
     if parsed.drivername == "sqlite" and not Path(parsed.database or "").is_file():
         return 0
     with ServiceStore.open(url) as store:
-        return store.active_users()
-
-
-def _cut_off() -> None:
-    log.error("something did not stop in time; ending the process")
-    os._exit(1)
-
-
-def notify(state: str) -> None:
-    """Tell systemd (``sd_notify``). Does nothing where nobody listens."""
-    address = os.environ.get("NOTIFY_SOCKET", "")
-    if not address:
-        return
-    if address.startswith("@"):
-        address = "\0" + address[1:]
-    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
-        channel.connect(address)
-        channel.send(state.encode())
+        return store.active_admins()

@@ -11,7 +11,7 @@ import numpy as np
 from models.machine import AXES, Machine
 from service.capture.settings import MIB, CaptureSettings
 from service.config_schema import Limits, MachineFile
-from service.devices.session import DeviceUrls
+from service.devices.urls import DeviceUrls
 from service.push.limits import PushLimits
 from service.sequences.interlocks import Suspending, Watching
 from service.sequences.nc.settings import NcSettings
@@ -98,6 +98,7 @@ def push_limits(limits: Limits) -> PushLimits:
         value_mm=limits.table_value_um * 1e-3,
         change_mm=limits.table_change_um * 1e-3,
         step_mm=limits.table_step_um * 1e-3,
+        walk_mm=limits.table_walk_um * 1e-3,
         temperature_c=limits.temperature_c,
         age_h=limits.measurement_age_h,
     )

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import getpass
+import hashlib
 import os
 import platform
 import secrets
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from service.audit.chain import Anchor, Event, anchor_of, faults, follow
+from service.audit.chain import Anchor, Event, anchor_of, faults, follow, key_name
+from service.audit.files import append_line, can_append, can_create, create, refusal
 from service.errors import AuditBroken
-from service.secrets import mask_secrets
+from service.secrets import mask_secrets, visible
 from service.storage.engine import parse_url
 from service.storage.store import Store
 from service.storage.store_audit import AuditRecord
 
 ENVIRONMENT = "ABBE_AUDIT_FOLDER"
 KEY_BYTES = 32
+KEY, HEADS = ".audit-key", ".audit-head"
 
 
 class AuditBook:
@@ -36,9 +41,20 @@ class AuditBook:
         self._key: bytes | None = None
         base = place(store, url)
         self._memory = base is None
-        self.key_file = Path(f"{base}.audit-key")
-        self.head_file = Path(f"{base}.audit-head")
+        self.key_file, self.head_file = files_of(str(base))
         self._heads: list[Anchor] = []
+
+    def ready(self) -> None:
+        """Make sure that a record can be written, before something is done that needs one. Leaves nothing behind.
+
+        Raises
+        ------
+        AuditBroken, StoreError
+            None can: which file or database, whose it is, what to do.
+        """
+        if not self._memory:
+            files_ready(self.key_file, self.head_file)
+        self._store.can_write()
 
     def write(self, event: Event) -> AuditRecord:
         """Append a record; on return it is on disk and its head is kept outside.
@@ -49,78 +65,142 @@ class AuditBook:
             It cannot be written.
         """
         key = self._key_of(make=True)
-        event = Event(_short(event.who), _short(event.action), mask_secrets(event.target)[:2000], _short(event.outcome), _masked(event.doc))
+        target = _clean(event.target)[:2000]
+        event = Event(_clean(event.who)[:200], _clean(event.action)[:200], target, _clean(event.outcome)[:200], _cleaned(event.doc))
         record = self._store.append_audit(lambda last, utc: follow(last, utc, event, key))
         self._keep(anchor_of(record, key))
         return record
 
     def verify(self) -> list[str]:
-        """Everything that is wrong; an empty list: all is there and as written. An audit without a record has nothing wrong."""
-        heads = self._heads if self._memory else self._read_heads()
+        """Everything that is wrong; an empty list: all is there and as written. An audit that was never begun has nothing wrong."""
+        heads = self._heads if self._memory else heads_in(self.head_file)
         records = self._store.audit()
-        if not records and not heads and not self.key_file.exists():
-            return []
         try:
+            if not records and not heads and not self._has_key():
+                return []
             key = self._key_of(make=False)
         except AuditBroken as error:
             return [error.detail]
-        return faults(records, heads, key)
+        found = faults(records, heads, key)
+        if not records and not heads and not self._memory:
+            found.append(f"the audit is empty, but its key is here ({self.key_file}): all its records and heads were removed")
+        return found
+
+    def _has_key(self) -> bool:
+        try:
+            return self._key is not None or (not self._memory and self.key_file.exists())
+        except OSError as error:
+            raise refusal(self.key_file, error) from None
 
     def _key_of(self, *, make: bool) -> bytes:
         if self._key is None:
-            self._key = secrets.token_bytes(KEY_BYTES) if self._memory else self._read_key(make=make)
+            self._key = secrets.token_bytes(KEY_BYTES) if self._memory else read_key(self.key_file, make=make)
         return self._key
-
-    def _read_key(self, *, make: bool) -> bytes:
-        try:
-            if make and not self.key_file.exists():
-                _new_key(self.key_file)
-            key = self.key_file.read_bytes()
-        except FileNotFoundError:
-            raise AuditBroken(f"the key of the audit, {self.key_file}, is missing", "bring it back from the backup") from None
-        except OSError as error:
-            raise AuditBroken(
-                f"{self.key_file}: {error.strerror}", "it has to belong to whoever runs the service, with rights 0600"
-            ) from None
-        if len(key) != KEY_BYTES:
-            raise AuditBroken(f"{self.key_file} is no key of an audit", "bring it back from the backup")
-        return key
 
     def _keep(self, anchor: Anchor) -> None:
         if self._memory:
             self._heads.append(anchor)
             return
-        line = f"{anchor.id} {anchor.digest} {anchor.mac}\n".encode()
         try:
-            # One short write at the end of the file: lines of two processes do not mix.
-            file = os.open(self.head_file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-            try:
-                os.write(file, line)
-                os.fsync(file)
-            finally:
-                os.close(file)
+            append_line(self.head_file, f"{anchor.id} {anchor.digest} {anchor.mac}")
         except OSError as error:
-            raise AuditBroken(f"{self.head_file}: {error.strerror}", "the record is in the database, its head is not kept") from None
-
-    def _read_heads(self) -> list[Anchor]:
-        try:
-            lines = self.head_file.read_text(encoding="ascii", errors="replace").splitlines()
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise AuditBroken(f"{self.head_file}: {error.strerror}", "make it readable") from None
-        return [anchor for anchor in map(_anchor, lines) if anchor is not None]
+            raise AuditBroken(
+                refusal(self.head_file, error).detail, "the record is in the database, its head is not kept; make the file writable"
+            ) from None
 
 
-def place(store: Store, url: str) -> str | None:
-    """Path of the audit's files without their ending; None for a database in memory."""
+def heads_in(file: Path) -> list[Anchor]:
+    """The heads that a file has kept, in their order.
+
+    Raises
+    ------
+    AuditBroken
+        It cannot be read.
+    """
+    try:
+        lines = file.read_text(encoding="ascii", errors="replace").splitlines()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise refusal(file, error) from None
+    return [anchor for anchor in map(_anchor, lines) if anchor is not None]
+
+
+def files_of(base: str) -> tuple[Path, Path]:
+    """Key and heads of an audit."""
+    return Path(f"{base}.audit-key"), Path(f"{base}.audit-head")
+
+
+def sqlite_base(database: Path) -> str:
+    """Path of the audit's files of a SQLite file, without their ending. A folder for several databases keeps those of one name apart."""
+    folder, path = os.environ.get(ENVIRONMENT), database.resolve()
+    if not folder:
+        return str(path)
+    return str(Path(folder) / f"{path.name}-{hashlib.sha256(str(path).encode()).hexdigest()[:8]}")
+
+
+def _sqlite_place(store: Store | None, database: Path) -> str:
+    """`sqlite_base`, or the name that earlier versions gave in a folder, if that key sealed this database's last record."""
+    base, folder = sqlite_base(database), os.environ.get(ENVIRONMENT)
+    if store is None or not folder or files_of(base)[0].exists():
+        return base
+    before = str(Path(folder) / database.name)
+    last = store.audit(1)
+    with suppress(OSError):
+        if last and last[0].key == key_name(files_of(before)[0].read_bytes()):
+            return before
+    return base
+
+
+def read_key(file: Path, *, make: bool) -> bytes:
+    """Read the key of the seals; with ``make`` a new one is written if there is none.
+
+    Raises
+    ------
+    AuditBroken
+        It is missing, is no key, or cannot be read or made.
+    """
+    try:
+        if make and not file.exists():
+            create(file, secrets.token_bytes(KEY_BYTES))
+        key = file.read_bytes()
+    except FileNotFoundError:
+        raise AuditBroken(f"the key of the audit, {file}, is missing", "bring it back from the backup") from None
+    except OSError as error:
+        raise refusal(file, error) from None
+    if len(key) != KEY_BYTES:
+        raise AuditBroken(f"{file} is no key of an audit", "bring it back from the backup")
+    return key
+
+
+def files_ready(key_file: Path, head_file: Path) -> None:
+    """Make sure that key and heads can be used or made; nothing is left behind.
+
+    Raises
+    ------
+    AuditBroken
+        Which cannot.
+    """
+    file = key_file
+    try:
+        if key_file.exists():
+            read_key(key_file, make=False)
+        else:
+            can_create(key_file)
+        file = head_file
+        can_append(head_file)
+    except OSError as error:
+        raise refusal(file, error) from None
+
+
+def place(store: Store | None, url: str) -> str | None:
+    """Path of the audit's files without their ending; None for a database in memory. ``store`` is only asked for a server's name."""
     parsed = parse_url(url)
     folder = os.environ.get(ENVIRONMENT)
-    if parsed.drivername == "sqlite":
+    if parsed.drivername == "sqlite" or store is None:
         if parsed.database in {None, "", ":memory:"}:
             return None
-        path = Path(str(parsed.database)).resolve()
-        return str(Path(folder) / path.name) if folder else str(path)
+        return _sqlite_place(store, Path(str(parsed.database)))
     home = Path(folder) if folder else Path.home() / ".local" / "state" / "abbe"
     try:
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -129,23 +209,6 @@ def place(store: Store, url: str) -> str | None:
             f"the folder of the audit's key, {home}, cannot be made: {error.strerror}", f"name another with {ENVIRONMENT}"
         ) from None
     return str(home / store.database_id())
-
-
-def _new_key(path: Path) -> None:
-    """Written aside and linked: whoever is second finds the first one's key, whole."""
-    aside = Path(f"{path}.{secrets.token_hex(4)}")
-    file = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    try:
-        os.write(file, secrets.token_bytes(KEY_BYTES))
-        os.fsync(file)
-    finally:
-        os.close(file)
-    try:
-        os.link(aside, path)
-    except FileExistsError:
-        pass
-    finally:
-        aside.unlink()
 
 
 def _anchor(line: str) -> Anchor | None:
@@ -165,9 +228,15 @@ def this_account() -> str:
     return f"os:{name}@{platform.node()}"
 
 
-def _short(text: str) -> str:
-    return mask_secrets(text)[:200]
+def _clean(text: str) -> str:
+    """Without passwords, and as every terminal, file and database takes it."""
+    return visible(mask_secrets(text))
 
 
-def _masked(doc: dict[str, object]) -> dict[str, object]:
-    return {key: mask_secrets(value)[:2000] if isinstance(value, str) else value for key, value in doc.items()}
+def _cleaned(value: Any) -> Any:
+    """The same for all texts of a document."""
+    if isinstance(value, dict):
+        return {_clean(str(key)): _cleaned(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_cleaned(inner) for inner in value]
+    return _clean(value)[:2000] if isinstance(value, str) else value

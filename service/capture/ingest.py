@@ -20,6 +20,11 @@ RETRY_S = 0.1
 END_S = 10.0
 """So long is waited for a write that the database has begun and does not end."""
 BATCH = 200
+TOGETHER_S = 0.25
+"""So long a batch waits for company. It is safe in the segment; a transaction for each of them (100 a second) cost more
+than all the rest of the capture."""
+TOGETHER_BYTES = 1 << 16
+"""More than this never waits: on a disk that runs full the database must still get what the segment has, and the reserve is not large."""
 
 
 def chunk_of(record: Record) -> ChunkRecord:
@@ -63,7 +68,8 @@ class Ingest:
         self._store, self._disk_full = store, disk_full
         self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         self._places: deque[tuple[int, int]] = deque()
-        self._stop = False
+        self._bytes = 0
+        self._hurry = self._stop = False
         self._news = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="abbe-ingest", daemon=True)
         self._thread.start()
@@ -71,8 +77,11 @@ class Ingest:
     def add(self, places: list[tuple[int, int]]) -> None:
         """Records that are durable now: offset and length in the segment."""
         with self._news:
+            idle = not self._places
             self._places.extend(places)
-            self._news.notify()
+            self._bytes += sum(length for _, length in places)
+            if idle or self._enough():
+                self._news.notify_all()
 
     @property
     def waiting(self) -> int:
@@ -82,6 +91,8 @@ class Ingest:
     def finish(self, timeout_s: float) -> bool:
         """Wait until the database has everything; False when it did not take all in time (the segment keeps it)."""
         with self._news:
+            self._hurry = True
+            self._news.notify_all()
             done = self._news.wait_for(lambda: not self._places or self.error is not None, timeout_s)
             self._stop = True
             self._news.notify_all()
@@ -92,9 +103,12 @@ class Ingest:
         return done and self.error is None
 
     def _run(self) -> None:
+        again = False
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._places or self._stop)
+                if not again:
+                    self._news.wait_for(lambda: self._hurry or self._stop or self._enough(), TOGETHER_S)
                 batch = [self._places[k] for k in range(min(BATCH, len(self._places)))]
                 if self._stop or not batch:
                     return
@@ -108,15 +122,20 @@ class Ingest:
                     self._news.wait_for(lambda: self._stop, RETRY_S)
                 if is_full(error):
                     self._disk_full()
+                again = True
                 continue
             except Exception as error:  # noqa: BLE001 - a thread that dies in silence would look like a slow database
                 self._fail(CaptureFault(f"the way to the database broke: {error!r}", "report this"))
                 return
             with self._news:
                 for _ in batch:
-                    self._places.popleft()
+                    self._bytes -= self._places.popleft()[1]
                 self.ingested += len(batch)
+                again = False
                 self._news.notify_all()
+
+    def _enough(self) -> bool:
+        return len(self._places) >= BATCH or self._bytes >= TOGETHER_BYTES
 
     def _fail(self, error: AbbeError) -> None:
         with self._news:

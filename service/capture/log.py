@@ -88,13 +88,15 @@ class CaptureLog:
                 return
             if not room:
                 self.error = self._hangs()
-            if not self._pending:
+            first = not self._pending
+            if first:
                 now_s = time.monotonic()
                 self._first_s = min(item[1].host_s, now_s) if isinstance(item[1], BarBatch) else now_s
             self._pending.append(item)
             self._given += 1
             self._samples += len(item[1].samples) if isinstance(item[1], BarBatch) else 1
-            self._news.notify_all()
+            if first or self._samples >= MAX_PENDING:
+                self._news.notify_all()  # what joins a group wakes nobody
 
     def flush(self) -> None:
         """Wait until everything given so far is on the disk, or never will be. Blocks."""

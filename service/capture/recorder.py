@@ -38,12 +38,21 @@ def is_active(path: Path) -> bool:
     return _key(path) in _active
 
 
+Look = Callable[[BarBatch], None]
+"""Is shown every batch after it was taken, in the driver's thread; must neither wait nor raise."""
+
+
+def nobody_looks(_: BarBatch) -> None:
+    """Nobody looks on."""
+
+
 class _Tap:
-    def __init__(self, log: CaptureLog, stream: int) -> None:
-        self._log, self._stream = log, stream
+    def __init__(self, log: CaptureLog, stream: int, look: Look) -> None:
+        self._log, self._stream, self._look = log, stream, look
 
     def take(self, batch: BarBatch) -> None:
         self._log.put((self._stream, batch))
+        self._look(batch)
 
     def warn(self, text: str) -> None:
         self._log.warnings.append(text)
@@ -68,11 +77,13 @@ class CaptureRecorder:
         self.behind = True
         self._keep, self._io = keep, io
         self._streams = 0
+        self.look: Look = nobody_looks
+        """Whoever looks on; set before a stream begins."""
 
     def tap(self) -> _Tap:
         """What a new stream gives every sample to."""
         self._streams += 1
-        return _Tap(self.log, self._streams - 1)
+        return _Tap(self.log, self._streams - 1, self.look)
 
     async def add_bar(self, batch: BarBatch) -> None:
         """Hear of a batch that the tap has taken.

@@ -29,6 +29,9 @@ from service.storage.store import Store
 
 __all__ = ["DAMAGED", "Recovered", "ledger_of", "read_segment", "recover_segments"]
 
+MOST_RUNS = 2**31
+"""No database has a row of this number; a damaged segment may name it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
@@ -72,23 +75,36 @@ def recover_segments(store: Store, settings: CaptureSettings) -> list[Recovered]
     return found
 
 
+class _Runs:
+    """Runs by their numbers, each read when it is asked for: with their documents all of a month's runs are 100 MB."""
+
+    def __init__(self, store: Store) -> None:
+        self._store, self._found = store, dict[int, RunRecord | None]()
+
+    def get(self, number: int) -> RunRecord | None:
+        """The run, None if there is none."""
+        if number not in self._found:
+            self._found[number] = self._store.run_numbered(number) if 0 < number < MOST_RUNS else None
+        return self._found[number]
+
+
 def _in_folder(store: Store, folder: Path, settings: CaptureSettings, *, only_ours: bool) -> list[Recovered]:
     """Take over what lies in one folder; in one that may be another database's, only what names a run of this one."""
     if not folder.is_dir() or not any(folder.glob(f"*{SUFFIX}")):
         return []
-    known = {run.id: run for run in store.runs()}
+    known = _Runs(store)
     if only_ours and not any(_is_ours(path, known) for path in folder.glob(f"*{SUFFIX}")):
         return []
     with held_alone(folder / LOCK_NAME) as alone:
         if not alone:
             return [Recovered(0, "", 0, 0, f"another process is taking over what is in {folder}; it was left to it")]
         paths = [path for path in sorted(folder.glob(f"*{SUFFIX}")) if not only_ours or _is_ours(path, known)]
-        known = {run.id: run for run in store.runs()}
+        known = _Runs(store)  # anew: another process may have closed some meanwhile
         found = (_recover_one(store, path, known, settings) for path in paths)
         return [one for one in found if one is not None]
 
 
-def _is_ours(path: Path, known: dict[int, RunRecord]) -> bool:
+def _is_ours(path: Path, known: _Runs) -> bool:
     """Whether a segment says that it is of a run of this database: same number, name and instant of its beginning."""
     try:
         records = read_segment(path).records
@@ -117,7 +133,7 @@ def _read(path: Path) -> Scan:
     return scan(path.read_bytes())  # not mapped: a file that is cut meanwhile, or a bad sector, would kill the process
 
 
-def _recover_one(store: Store, path: Path, known: dict[int, RunRecord], settings: CaptureSettings) -> Recovered | None:
+def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettings) -> Recovered | None:
     number = path.stem.rpartition("-")[2]
     if not number.isdecimal() or path.name != segment_path(path.parent, int(number)).name:
         return _aside(path, CONFLICT, None, "it has the name of no segment")

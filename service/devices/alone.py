@@ -1,59 +1,161 @@
-"""One process a machine: two that command the same axes would each drive a bar that the other believes elsewhere."""
+"""One process a machine: two that command the same axes would each drive a bar that the other believes elsewhere.
+
+Who has the machine holds a lock on a file in a folder that all accounts of this computer see, also a service that sees no processes but its
+own and no ``/tmp`` but its own, as under systemd.
+"""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
+import stat
 import sys
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 
-from service.errors import UnsafeToMove
+from service.errors import MachineInUse, UnsafeToMove
+
+ENVIRONMENT = "ABBE_LOCK_FOLDER"
+"""Names another folder, for a computer or a container where the usual ones do not serve."""
+INSTALLED = Path("/run/abbe")
+"""Made at boot by deploy/abbe-tmpfiles.conf, for a group. Where it is, no other one is used: who may not open it is told so."""
+WITHOUT_INSTALLATION = Path("/tmp/abbe-machines")  # noqa: S108 - the same for all accounts, whatever TMPDIR says
+"""Open to every account. A service with a ``/tmp`` of its own needs the other one."""
+SHARED = 0o1777
+"""Rights of a folder in which everybody makes files and nobody takes away those of others."""
+TRIES = 100
 
 
 @contextmanager
 def alone(url: str | None) -> Iterator[None]:
     """Hold the machine behind a controller's URL for this process. It is given back when the process ends, however it ends.
 
-    Processes of one user on one computer are kept apart; nobody else is.
+    Processes of all accounts on one computer are kept apart, if they name the machine by the same URL; other computers are not.
 
     Raises
     ------
-    UnsafeToMove
+    MachineInUse
         Another process, or another job of this one, has it.
+    UnsafeToMove
+        Nobody can say whether it is in use: the lock cannot be opened.
     """
     if url is None:
         yield
         return
-    path = _folder() / f"{hashlib.sha256(url.partition('?')[0].encode()).hexdigest()[:16]}.lock"
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    path = lock_folder() / f"{hashlib.sha256(url.partition('?')[0].encode()).hexdigest()[:16]}.lock"
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            who = os.read(handle, 200).decode(errors="replace").strip() or "another process"
-            raise UnsafeToMove(f"the machine at {url} is in use by {who}", "wait until it has ended") from None
-        os.ftruncate(handle, 0)
-        os.pwrite(handle, f"process {os.getpid()} ({' '.join([Path(sys.argv[0]).name, *sys.argv[1:2]])})\n".encode()[:200], 0)
+        handle = _locked(path)
+    except OSError as error:
+        raise UnsafeToMove(
+            f"nobody can say whether the machine at {url} is in use: {path} cannot be used ({error.strerror})", _remedy(path.parent)
+        ) from None
+    except _Held as held:
+        raise MachineInUse(f"the machine at {url} is in use by {held}", "wait until it has ended") from None
+    try:
+        with suppress(OSError):  # the lock is held; a full disk keeps only its holder's name from others
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"process {os.getpid()} ({' '.join([Path(sys.argv[0]).name, *sys.argv[1:2]])})\n".encode()[:200], 0)
         yield
     finally:
         os.close(handle)
 
 
-def _folder() -> Path:
-    """The user's runtime folder, which does not outlive a restart; where there is none, one of his own among the temporary files.
+def lock_folder() -> Path:
+    """Where the locks of machines lie: the folder that ``ABBE_LOCK_FOLDER`` names, ``/run/abbe`` where it is, else one among the temporary
+    files.
 
     Raises
     ------
     UnsafeToMove
-        It belongs to somebody else.
+        The last of them is not what all accounts of this computer can share.
     """
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(runtime) / "abbe" if runtime and os.access(runtime, os.W_OK) else Path(tempfile.gettempdir()) / f"abbe-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-        raise UnsafeToMove(f"{folder} is not yours, so nobody can say whether the machine is in use", "remove it, or set XDG_RUNTIME_DIR")
+    given = os.environ.get(ENVIRONMENT)
+    if given:
+        return Path(given)
+    if INSTALLED.is_dir():
+        return INSTALLED
+    try:
+        return _shared(WITHOUT_INSTALLATION)
+    except OSError as error:
+        raise UnsafeToMove(
+            f"nobody can say whether the machine is in use: {WITHOUT_INSTALLATION} cannot be used ({error.strerror})",
+            _remedy(WITHOUT_INSTALLATION),
+        ) from None
+
+
+def _shared(folder: Path) -> Path:
+    """Make a folder for all accounts, or look whether the one that is there keeps them from each other's files."""
+    with suppress(FileExistsError):
+        folder.mkdir()
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode):
+        raise UnsafeToMove(f"{folder} is no folder, so nobody can say whether the machine is in use", "remove it")
+    if found.st_mode & SHARED != SHARED:
+        if found.st_uid != os.geteuid():
+            raise UnsafeToMove(
+                f"{folder} has the mode {stat.S_IMODE(found.st_mode):o}: the lock of a machine could not be made there, or be taken away",
+                f"let its owner or root do: chmod {SHARED:o} {folder}",
+            )
+        folder.chmod(SHARED)
     return folder
+
+
+class _Held(Exception):  # noqa: N818 - reads as what it is
+    """Somebody has the lock; his own words."""
+
+
+def _locked(path: Path) -> int:
+    """Open and lock a file; a file that was removed from its name meanwhile keeps nobody apart, and does not count."""
+    for _ in range(TRIES):
+        handle = _opened(path)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(handle), path.stat()):
+                return handle
+        except BlockingIOError:
+            who = os.pread(handle, 200, 0).decode(errors="replace").strip() or "another process"
+            os.close(handle)
+            raise _Held(who) from None
+        except FileNotFoundError:
+            pass
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+    raise OSError(0, "it is removed again and again")
+
+
+def _opened(path: Path) -> int:
+    """Open the lock of a machine; make it if nobody has, with the rights of its folder, in one step: nobody meets it half made."""
+    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
+    with suppress(FileNotFoundError):
+        return _plain(os.open(path, flags))
+    new = path.with_name(f".{path.name}.{token_hex(6)}")
+    handle = os.open(new, flags | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        os.fchmod(handle, 0o600 | path.parent.stat().st_mode & 0o066)
+        with suppress(FileExistsError):  # another process was faster: the lock is its file
+            os.link(new, path)
+    finally:
+        os.close(handle)
+        new.unlink()
+    return _plain(os.open(path, flags))
+
+
+def _plain(handle: int) -> int:
+    """A lock is a plain file: anything else that lies under its name (a FIFO) is not taken for one."""
+    if stat.S_ISREG(os.fstat(handle).st_mode):
+        return handle
+    os.close(handle)
+    raise OSError(errno.EINVAL, "it is no plain file")
+
+
+def _remedy(folder: Path) -> str:
+    with suppress(OSError):
+        if folder.stat().st_mode & 0o020 and not folder.stat().st_mode & 0o002:
+            return f"{folder} is for a group: become a member of it, see docs/how-to/serve.md"
+    return f"make {folder} writable for whoever uses the machine, or name another folder by {ENVIRONMENT}; see docs/how-to/serve.md"

@@ -17,6 +17,7 @@ class _Noted:
     def __init__(self, controller: Controller) -> None:
         self.noted_controller = controller
         self.clock_notes: deque[tuple[int, float]] = deque(maxlen=MOST)
+        self.latest_status: ControllerStatus | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.noted_controller, name)
@@ -25,12 +26,18 @@ class _Noted:
         """Ask for the status, and note its stamp."""
         status = await self.noted_controller.status()
         self.clock_notes.append((status.ctrl_us, status.host_s))
+        self.latest_status = status
         return status
 
 
 def noted(controller: Controller) -> Controller:
     """The same controller, noting stamp and arrival of every status."""
     return cast(Controller, _Noted(controller))
+
+
+def latest_status(controller: Controller) -> ControllerStatus | None:
+    """The last status that anybody got from a noted controller; None: nobody did, or nothing is noted."""
+    return controller.latest_status if isinstance(controller, _Noted) else None
 
 
 def notes_since(controller: Controller, ctrl_us: int) -> list[list[float]]:

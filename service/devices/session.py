@@ -9,19 +9,10 @@ from dataclasses import dataclass
 from drivers import registry
 from drivers.api import BallBar, Controller, DisplacementMeter, Fixture
 from service.devices.clock_notes import noted
+from service.devices.urls import DeviceUrls as DeviceUrls
 from service.errors import ConfigError
 
 Ask = Callable[[str], Awaitable[None]]
-
-
-@dataclass(frozen=True, slots=True)
-class DeviceUrls:
-    """Where the devices of a machine are; None: not connected."""
-
-    cnc: str | None = None
-    ballbar: str | None = None
-    laser: str | None = None
-    fixture: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,12 @@ def encode_bar(samples: Sequence[BarSample]) -> bytes:
     bytes
         Payload of a chunk.
     """
-    raw = b"".join(_SAMPLE.pack(one.seq, one.device_us, one.reading_nm, one.status) for one in samples)
-    return zlib.compress(raw, _LEVEL)
+    return zlib.compress(pack_bar(samples), _LEVEL)
+
+
+def pack_bar(samples: Sequence[BarSample]) -> bytes:
+    """Ball-bar samples as ``<IQiH``, one after the other, not compressed."""
+    return b"".join(_SAMPLE.pack(one.seq, one.device_us, one.reading_nm, one.status) for one in samples)
 
 
 def decode_bar(payload: bytes) -> list[BarSample]:

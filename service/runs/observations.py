@@ -57,7 +57,7 @@ def _run_data(run: dict[str, Any], blocks: int) -> RunData:
     }
     if run["test"].startswith("laser"):
         common["deviation_mm"] = _since_first(common["deviation_mm"], first_valid=bool(valid[0]))
-        return RunData(kind="laser", **common, beam=_beam(setup, label))
+        return RunData(kind="laser", **common, beam=beam_of(setup, label))
     centre = np.asarray(setup["centre_mm"], dtype=np.float64)
     common |= {"u_length_mm": setup.get("u_length_mm"), "length_calibrated": setup.get("length_calibrated")}
     return block_average(RunData(kind="bar", **common, centre_mm=centre, radius_mm=float(setup["radius_mm"])), blocks)
@@ -86,7 +86,7 @@ def _tool(setup: dict[str, Any]) -> F1 | None:
     return None if tool is None else np.asarray(tool, dtype=np.float64)
 
 
-def _beam(setup: dict[str, Any], label: str) -> F1:
+def beam_of(setup: dict[str, Any], label: str) -> F1:
     """Nominal beam, a unit vector: as stated, else along the test, from its start to its end (a laser_linear along its axis)."""
     if setup.get("nominal_beam") is not None:
         beam = np.asarray(setup["nominal_beam"], dtype=np.float64)

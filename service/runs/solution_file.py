@@ -140,12 +140,18 @@ class WorstPoint(FileObject):
 
 
 class BudgetLineValue(FileObject):
-    """One source of uncertainty, rms over the volume, and its share of the variance."""
+    """One source of uncertainty, rms over the volume, and its share of the variance.
+
+    ``type``: how its size was found, A from readings, B stated or assumed (GUM 4.2, 4.3); ``dof``: its degrees of freedom, null where it
+    was stated. Both are absent in solutions of earlier versions.
+    """
 
     source: str
     words: str
     u_um: float
     share: float
+    type: Literal["A", "B"] | None = None
+    dof: float | None = None
 
 
 class Uncertainty(FileObject):
@@ -222,6 +228,20 @@ class MachineModel(FileObject):
     not_for_tables: list[str]
 
 
+class LostMotion(FileObject):
+    """Lost motion of an axis, mm, with its standard uncertainty."""
+
+    value: float
+    u: float
+
+
+class TableTakenOut(FileObject):
+    """The table that the runs were measured with; what it did beyond smooth corrections was taken out, with this lost motion by axis."""
+
+    crc: int | None = None
+    lost_motion_mm: dict[str, LostMotion]
+
+
 class SolutionFile(FileObject):
     """A solved campaign (``abbe-solution/1``). Every ``u`` is a standard uncertainty (k = 1); ``expanded_um`` has 95 % coverage.
 
@@ -260,6 +280,8 @@ class SolutionFile(FileObject):
     step_diagonals: dict[str, dict[str, float]]
     step_diagonals_note: str
     machine_model: MachineModel | None = None
+    table_taken_out: TableTakenOut | None = None
+    table_not_taken_out: str | None = Field(default=None, description="why the side effects of a table in force are still in the readings")
     campaign: str | None = None
     machine: MachineObject | None = None
     solution_id: int | None = None

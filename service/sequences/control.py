@@ -6,12 +6,13 @@ All calls belong into the event loop of the measurement; from a signal handler o
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import AsyncIterator, Awaitable, Coroutine
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from service.errors import Aborted, Stopped
+from service.sequences.prompts import Prompts
 
 T = TypeVar("T")
 STOPPED = Stopped("stopped as asked", "`abbe measure MACHINE.toml --resume CAMPAIGN` goes on from here")
@@ -48,6 +49,10 @@ class Control:
     def __init__(self) -> None:
         self._now = Situation(State.READY)
         self._pause = self._stop = self._abort = False
+        self.hurry = ""
+        """Why it cannot be paused now; empty: it can. What was asked for before stays asked for: look at `gate` first."""
+        self.prompts = Prompts()
+        """What is asked of a person who is not at the console."""
         self._asked = asyncio.Event()
         self._changed: asyncio.Event = asyncio.Event()
 
@@ -55,7 +60,7 @@ class Control:
 
     def pause(self) -> None:
         """Hold at the next safe place: between points at once; a path that is being recorded is held and measured again later."""
-        if not (self._stop or self._abort or self._pause):
+        if not (self._stop or self._abort or self._pause or self.hurry):
             self._pause = True
             self._to(State.PAUSING)
 
@@ -144,6 +149,20 @@ class Control:
         if self._stop:
             raise Stopped(STOPPED.detail, STOPPED.remedy)
 
+    async def gate(self) -> None:
+        """A safe place between two pieces of work: wait here, or end, if that was asked for.
+
+        Raises
+        ------
+        Stopped, Aborted
+            It was.
+        """
+        self.check()
+        if self._pause:
+            self.now(State.PAUSED)
+            await self.resumed()
+            self.now(State.RUNNING)
+
     async def asked(self) -> None:
         """Wait until a person asks for something."""
         event = self._asked
@@ -163,9 +182,12 @@ class Control:
 
     async def aborted(self) -> None:
         """Wait for an abort, and raise it."""
+        await self._until_aborted()
+        self.check()
+
+    async def _until_aborted(self) -> None:
         while not self._abort:
             await self.asked()
-        self.check()
 
     async def unless_stopped(self, work: Awaitable[T]) -> T:
         """Wait for something that a person does, or until stopped: then the work is cancelled.
@@ -191,6 +213,29 @@ class Control:
                 task.cancel()
                 await asyncio.wait({task})
 
+    async def unless_aborted(self, work: Coroutine[Any, Any, T]) -> T:
+        """Wait for work that ends by itself where it is stopped; an abort cancels it. Whatever it does on its way out is waited for.
+
+        Raises
+        ------
+        Aborted
+            That was asked for; its notes are those of the work.
+        """
+        task, aborting = asyncio.create_task(work), asyncio.create_task(self._until_aborted())
+        cancelled: asyncio.CancelledError | None = None
+        try:
+            while not task.done():
+                try:
+                    await asyncio.wait({task} if aborting.done() else {task, aborting}, return_when=asyncio.FIRST_COMPLETED)
+                    ending = aborting.done() and not task.done() and not task.cancelling()
+                except asyncio.CancelledError as error:
+                    cancelled, ending = error, True
+                if ending:
+                    task.cancel()
+        finally:
+            aborting.cancel()
+        return _ended(task, cancelled)
+
     def _to(self, state: State) -> None:
         if self._now.state not in (State.READY, State.ENDED):
             self._set(replace(self._now, state=state, why=""))
@@ -204,3 +249,21 @@ class Control:
         self._now = situation
         event, self._changed = self._changed, asyncio.Event()
         event.set()
+
+
+def _ended(task: asyncio.Task[T], cancelled: asyncio.CancelledError | None) -> T:
+    """What became of work that may have been cancelled, with what it has to say."""
+    if cancelled is None and not task.cancelled():
+        return task.result()
+    try:
+        task.result()
+    except asyncio.CancelledError as error:
+        notes = getattr(error, "__notes__", [])
+    except Exception as error:  # noqa: BLE001 - who cancelled it waits for nothing else any more, but may hear of it
+        notes = [str(error), *getattr(error, "__notes__", [])]
+    else:
+        notes = []
+    ended: BaseException = cancelled if cancelled is not None else Aborted(ABORTED.detail, ABORTED.remedy)
+    for note in notes:
+        ended.add_note(note)
+    raise ended

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.sequences.incident_notes import DETECTED, OUTCOME
-from service.sequences.journal import ENDED, INCIDENT
+from service.sequences.journal import DETECTED, ENDED, INCIDENT, OUTCOME
 from service.storage.records import CheckpointRecord
 
 UNKNOWN = "no outcome"

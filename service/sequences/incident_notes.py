@@ -16,10 +16,9 @@ from drivers.links.incidents import Incident, Incidents
 from drivers.links.shielded import run_to_end
 from service.clock import Clock
 from service.devices.session import Session
-from service.sequences.journal import INCIDENT, Journal
+from service.sequences.journal import INCIDENT, OUTCOME, Journal
 
 LINKS = {"controller": "controller", "laser": "laser", "ballbar": "ball-bar"}
-DETECTED, OUTCOME = "detected", "outcome"
 STILL_OPEN = "open"
 """How a trouble ended that was not over when the measurement was."""
 MOST_WAITING = 1000

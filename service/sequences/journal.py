@@ -18,6 +18,8 @@ from service.storage.store import Store
 
 BEGUN, HAND, RUN, POINT, DONE, WAITS, GOES_ON, ENDED = "begun", "hand", "run", "point", "done", "waits", "goes-on", "ended"
 INCIDENT = "incident"
+DETECTED, OUTCOME = "detected", "outcome"
+"""The two lines of an incident: it is noticed, and how it ended."""
 
 
 LONGEST_S = CATCH_UP_S

@@ -23,6 +23,8 @@ async def paused(
 ) -> bool:
     """Wait until a pause is taken back and everything is as it has to be; what is not is said, and the pause goes on.
 
+    Where nobody may pause (`Control.hurry`) it does not go on: without a person's word nothing moves because a door was closed.
+
     Returns
     -------
     bool
@@ -34,6 +36,8 @@ async def paused(
         That was asked for instead.
     WorldChanged, BeamLost
         Not to be cleared by waiting.
+    Interlock
+        In a hurry: something is not as it has to be.
     """
     why = "paused as asked"
     await journal.add(WAITS, why=why)
@@ -44,7 +48,7 @@ async def paused(
         try:
             await check_world(session, expected, watching, beam=beam)
         except Interlock as trouble:
-            if isinstance(trouble, BeamLost):
+            if isinstance(trouble, BeamLost) or control.hurry:
                 raise
             why = f"cannot go on: {trouble.detail}"
             control.pause()

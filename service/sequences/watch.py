@@ -1,19 +1,22 @@
 """The watcher beside a running test: asks controller and laser how they are, and ends the test when one of them says no, or nothing.
 
 From an event to the end of the motion command stream: one period, one exchange, and the stop. The controller's link carries one request
-at a time, so the watcher waits its turn like everybody else and never has more than one request under way.
+at a time, so the watcher waits its turn like everybody else and never has more than one request under way. While others ask more often than
+it (a path is followed), it looks at what they were told, and asks only when that is a period old.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import asynccontextmanager
 from typing import Any
 
 from drivers.api import ControllerStatus, DisplacementMeter
 from drivers.errors import DriverError, Rebooted
+from service.devices.clock_notes import latest_status
 from service.devices.session import Session
 from service.errors import Interlock, MeasurementFault, StatusUnknown
 from service.sequences.control import Control
@@ -37,8 +40,17 @@ class Watch:
     def __init__(self, session: Session, watching: Watching) -> None:
         self._s, self._w = session, watching
         self._ended = asyncio.Event()
-        self.tolerated = NOTHING
+        self._tolerated, self._since_s = NOTHING, time.monotonic()
         self.beam = False
+
+    @property
+    def tolerated(self) -> frozenset[str]:
+        """Conditions that are a person's right just now."""
+        return self._tolerated
+
+    @tolerated.setter
+    def tolerated(self, conditions: frozenset[str]) -> None:
+        self._tolerated, self._since_s = conditions, time.monotonic()  # what was heard before is not judged by it
 
     def end(self) -> None:
         """Let the watchers end after the look that they are at."""
@@ -55,9 +67,19 @@ class Watch:
             It restarted.
         """
         while not self._ended.is_set():
-            status = await known_status(self._s.controller.status, self._w.unknown_s)
+            status = self._just_heard()
+            left_s = self._w.period_s if status is None else status.host_s + self._w.period_s - time.monotonic()
+            if status is None:
+                status = await known_status(self._s.controller.status, self._w.unknown_s)
             self._raise(tripped(status, self.tolerated))
-            await self._rest(self._w.period_s)
+            await self._rest(left_s)
+
+    def _just_heard(self) -> ControllerStatus | None:
+        """What somebody else was told less than a period ago."""
+        status = latest_status(self._s.controller)
+        if status is None or status.host_s <= max(self._since_s, time.monotonic() - self._w.period_s):
+            return None
+        return status
 
     async def laser(self, laser: DisplacementMeter) -> None:
         """Ask the laser again and again: for its beam while it counts, for the air always.

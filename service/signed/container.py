@@ -146,7 +146,7 @@ def _parts(sealed: bytes) -> tuple[str, Claims, bytes]:
         if not all(isinstance(text, str) for text in texts) or signature.hex() != doc["signature"]:
             raise ValueError
         _moment(claims.signed_utc), _moment(claims.expiry_utc)
-    except (ValueError, TypeError, AttributeError, RecursionError):
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         raise SignatureRefused(f"no signature of the form {FORM}, or it was changed", FILE_REMEDY) from None
     return doc["key"], claims, signature
 

@@ -18,10 +18,11 @@ from service.runs.columns import load_run
 from service.sequences.bar_recipes import HelixPoints
 from service.sequences.campaigns import hemisphere
 from service.sequences.check import paced
+from service.sequences.control import Control
 from service.sequences.steps import CampaignPlan, Point
 from service.site import Site
 from service.storage.store import Store
-from service.workflows.measure import measure
+from service.workflows.measure import Manner, measure
 
 TURNS = 3.0
 SAMPLES = 50
@@ -38,7 +39,10 @@ class Readings:
 
 @dataclass
 class BarPlaces:
-    """Reads ``places`` places on a hemisphere; the first reading mounts cup and bar, `cleared_away` takes them out."""
+    """Reads ``places`` places on a hemisphere; the first reading mounts cup and bar, `cleared_away` takes them out.
+
+    ``control``: who may stop the job that this is a part of.
+    """
 
     session: Session
     store: Store
@@ -46,6 +50,7 @@ class BarPlaces:
     progress: ProgressSink
     name: str
     places: int
+    control: Control = field(default_factory=Control)
     centre_mm: Point = (0.0, 0.0, 0.0)
     radius_mm: float = 0.0
     run_ids: list[int] = field(default_factory=list)
@@ -69,7 +74,8 @@ class BarPlaces:
             link_mm=None if first else self._end(), samples=SAMPLES,
         )  # fmt: skip
         plan = paced(CampaignPlan(f"{self.name} {what}", (recipe.plan(self.site.machine),)), self.site.max_feed_mm_min)
-        ids = await measure(self.session, self.store, self.site, plan, progress=self.progress)
+        manner = Manner(control=self.control, part=True)
+        ids = await measure(self.session, self.store, self.site, plan, progress=self.progress, manner=manner)
         self.run_ids += ids
         columns = (await asyncio.to_thread(load_run, self.store, ids[0]))["columns"]
         if not all(columns["valid"]):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from service.devices.session import DeviceUrls
+from service.devices.urls import DeviceUrls
 from service.errors import CampaignRefused
 from service.runs.cases import set_once
 from service.runs.columns import load_run

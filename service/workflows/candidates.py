@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime, time
+from datetime import UTC, date, datetime, time, timedelta
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,19 @@ from drivers.cnc.registers import MAP_VERSION
 from models.compensation.tables import NineTables, Predicted
 from models.machine import AXES
 from service.clock import Clock
+from service.push.book import read_entries
 from service.push.candidate import Candidate, Column, Evidence, Scene, Seal
+from service.push.entries import facts
+from service.push.states import State
 from service.push.validate import content_digest
 from service.site import Site
 from service.storage.store import Store
 from service.workflows.base_table import Base
+from service.workflows.tables import tables_from_image
 
 Runs = list[dict[str, Any]]
 SIGNER = "metrologist"
+MONTH = timedelta(days=30)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,19 +103,33 @@ def mark_of(boots: Iterable[int | None]) -> str:
     return "boot " + ", ".join("not known" if boot < 0 else f"{boot:08X}" for boot in seen)
 
 
-async def scene_of(site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock) -> Scene:
-    """This machine, its controller and its table in force, now."""
+async def scene_of(
+    site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
+) -> Scene:
+    """This machine, its controller and its table in force, now. ``attended``: a person who may approve is at the machine."""
     last_s = await asyncio.to_thread(_last_push_s, store, site.name)
+    month_ago = {} if attended else _on_grid(await asyncio.to_thread(_month_ago, store, site.name, base, clock), grid)
     travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}
     return Scene(
         site.name, mark_of([base.status.boot_id]), MAP_VERSION, form.lsb_nm, form.bank_registers, travel, {}, base.crc,
-        _active(base, grid), {}, clock.utc().timestamp(), attended=True, last_push_s=last_s,
+        _on_grid(base.tables, grid), month_ago, clock.utc().timestamp(), attended=attended, last_push_s=last_s,
     )  # fmt: skip
 
 
-def _active(base: Base, grid: NineTables) -> dict[tuple[str, str], tuple[float, ...]]:
-    """The table in force on the new one's grid."""
-    tables = base.tables
+def _month_ago(store: Store, machine: str, base: Base, clock: Clock) -> NineTables | None:
+    """The tables that were in force `MONTH` ago, as far as pushes tell; before the first push that of its base, else the present one."""
+    entries = read_entries(store, machine)
+    then = clock.utc() - MONTH
+    kept = [e for e in entries if e.state is State.KEEP]
+    old = [e.push for e in kept if datetime.fromisoformat(e.utc) <= then]
+    number, key = (old[-1], "image") if old else (kept[0].push, "base_image") if kept else (0, "")
+    if not key:
+        return base.tables
+    return tables_from_image(bytes.fromhex(facts(tuple(e for e in entries if e.push == number))[key]))
+
+
+def _on_grid(tables: NineTables | None, grid: NineTables) -> dict[tuple[str, str], tuple[float, ...]]:
+    """Tables on the new one's grid."""
     if tables is None:
         return {(a, i): (0.0,) * grid.position_mm[k].size for k, a in enumerate(AXES) for i in AXES}
     found = {}

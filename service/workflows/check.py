@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from models.machine import Machine
+from service.capture.live import LiveFeed
 from service.clock import Clock, SystemClock
 from service.config_schema import MachineFile
 from service.devices.alone import alone
 from service.devices.session import open_session
-from service.errors import ConfigError
 from service.events import ProgressSink
 from service.runs.columns import load_run
-from service.sequences.campaigns import quick_check, verification
+from service.sequences.control import Control
 from service.sequences.steps import CampaignPlan
 from service.site import site_of
 from service.storage.store import Store
-from service.workflows.measure import measure
+from service.workflows.measure import Manner, measure
 from service.workflows.recover import recover
+from service.workflows.shipped import recipe_plan
 from service.workflows.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
 
-RECIPES: dict[str, Callable[[Machine], CampaignPlan]] = {"quick-check": quick_check, "verification": verification}
 MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}
 
 
@@ -41,23 +39,23 @@ class CheckResult:
     started_utc: datetime
     duration_s: float
     text: str
+    comparable: bool = True
+    """Whether the figures can be put beside those of other checks: measured in the air in which they can be judged."""
 
 
-def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
-    """The plan of a shipped recipe.
-
-    Raises
-    ------
-    ConfigError
-        There is no such recipe; the message lists those there are.
-    """
-    if name not in RECIPES:
-        raise ConfigError(f"there is no recipe {name!r}", f"use one of: {', '.join(sorted(RECIPES))}")
-    return RECIPES[name](machine)
-
-
-async def run_check(config: MachineFile, store: Store, recipe: str, progress: ProgressSink, clock: Clock | None = None) -> CheckResult:
+async def run_check(
+    config: MachineFile,
+    store: Store,
+    recipe: str,
+    progress: ProgressSink,
+    clock: Clock | None = None,
+    *,
+    control: Control | None = None,
+    live: LiveFeed | None = None,
+) -> CheckResult:
     """Open the devices, measure the recipe, close them, judge.
+
+    ``control`` pauses, resumes, stops or aborts the measurement; ``live`` is shown what its paths read.
 
     Raises
     ------
@@ -68,11 +66,12 @@ async def run_check(config: MachineFile, store: Store, recipe: str, progress: Pr
     started, start_s = clock.utc(), clock.monotonic_s()
     site = site_of(config)
     plan = recipe_plan(recipe, site.machine)
-    plan = CampaignPlan(f"{plan.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
+    # With the machine: services that share a database check at the same second, and a campaign's name is there once.
+    plan = CampaignPlan(f"{plan.name} {config.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
     with alone(site.urls.cnc):
         async with open_session(site.urls) as session:
             await recover(session.controller, store, site)
-            run_ids = await measure(session, store, site, plan, progress=progress, clock=clock)
+            run_ids = await measure(session, store, site, plan, progress=progress, clock=clock, manner=Manner(control=control, live=live))
     runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
     rows = figure_rows(figures(runs))
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
@@ -93,6 +92,7 @@ async def run_check(config: MachineFile, store: Store, recipe: str, progress: Pr
         started,
         clock.monotonic_s() - start_s,
         text,
+        outside is None,
     )
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,17 +20,17 @@ from service.events import Progress, ProgressSink
 from service.push.operations import Verdict
 from service.sequences.campaigns import verification
 from service.sequences.check import paced
+from service.sequences.control import Control
 from service.sequences.interlocks import Suspending
 from service.site import Site
 from service.storage.store import Store
 from service.workflows.bar_places import BarPlaces, Readings
 from service.workflows.commission import check_commissioned
-from service.workflows.measure import measure
+from service.workflows.measure import Manner, measure
 from service.workflows.proposal_checks import Held, hold
 from service.workflows.proposal_doc import load
 from service.workflows.proposals import (
     Made,
-    by_whom,
     check_before_runs,
     check_same_table,
     check_temperature,
@@ -43,6 +43,7 @@ from service.workflows.proved_levels import check_level
 from service.workflows.pushing import Pushed, Pushing, Questions, Wanted
 from service.workflows.recover import recover
 from service.workflows.solve import Solved, helix_misfit
+from service.workflows.table_out import less, taken
 from service.workflows.tables import check_limits
 from service.workflows.verify import Decision, Figures, check_before, decide, figure_rows, figures
 
@@ -87,6 +88,8 @@ class _Bench:
     rate_hz: int
     progress: ProgressSink
     clock: Clock
+    attended: bool = True
+    control: Control = field(default_factory=Control)
 
 
 async def correct(
@@ -140,6 +143,8 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
     rate_hz: int = 100,
     progress: ProgressSink,
     clock: Clock | None = None,
+    attended: bool = True,
+    control: Control | None = None,
 ) -> Correction:
     """Push a stored proposal: everything that was checked when it was made is checked again, then as `correct`.
 
@@ -149,6 +154,11 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
         Of the proposal.
     before : list of dict
         Verification runs measured with the present table, as ``abbe-run/1``.
+    attended : bool
+        A person orders it. Else the limits of unattended pushes hold as well, and a person's approval is needed in any case.
+    control : Control, optional
+        Who may stop or pause it; default: nobody. While a table is in force that nobody has verified it cannot be paused, and a stop takes
+        the old table back.
 
     Raises
     ------
@@ -156,16 +166,20 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
         There is no such proposal, or its row was changed.
     TableRefused, TableMismatch, StillActive
         As of `correct`.
+    Stopped, Aborted
+        Asked for; the old table is in force.
     """
     await recover(session.controller, store, site)
     clock = clock or SystemClock()
     proposed = await asyncio.to_thread(load, store, number)
-    against = (await hold(session.controller, store, site, number, proposed, clock)).reasons()
+    against = (await hold(session.controller, store, site, number, proposed, clock, attended=attended)).reasons()
     if against:
         raise TableRefused("; ".join(against), "nothing was written")
     progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
-    made = Made(number, proposed, await solved_again(store, site, proposed.campaign))
-    return await _push(_Bench(session, store, site, rate_hz, progress, clock), made, before)
+    made = Made(number, proposed, await solved_again(store, site, proposed.campaign, proposed.base_tables))
+    control = control or Control()
+    await control.gate()
+    return await _push(_Bench(session, store, site, rate_hz, progress, clock, attended, control), made, before)
 
 
 async def reasons_now(session: Session, store: Store, site: Site, number: int, clock: Clock | None = None) -> list[str]:
@@ -202,8 +216,8 @@ async def _push(bench: _Bench, made: Made, before: list[dict[str, Any]]) -> Corr
     session, store, proposed = bench.session, bench.store, made.proposed
     site = replace(bench.site, watching=replace(bench.site.watching, suspending=Suspending()))
     bench = replace(bench, site=site)
-    await check_level(session.controller, store, site)
-    held = await hold(session.controller, store, site, made.number, proposed, bench.clock)
+    await check_level(session.controller, store, site, attended=bench.attended)
+    held = await hold(session.controller, store, site, made.number, proposed, bench.clock, attended=bench.attended)
     against = held.reasons()
     if against:
         raise TableRefused("; ".join(against), "nothing was written")
@@ -214,11 +228,11 @@ async def _push(bench: _Bench, made: Made, before: list[dict[str, Any]]) -> Corr
     old = figures(before)
     check_before(old)
     helix = next((r for r in before if r["test"] == "ballbar_helix"), None)
-    misfit_mm = helix_misfit(made.solved, helix) if helix is not None else None
+    misfit_mm = None if helix is None else helix_misfit(made.solved, _as_solved(helix, made.solved, held.base.tables))
     bar = None
     if session.ballbar is not None and session.fixture is not None:
         number = sum(c.name.startswith(SIGN) for c in await asyncio.to_thread(store.campaigns)) + 1
-        bar = BarPlaces(session, store, site, bench.progress, f"{SIGN} {number}", PLACES)
+        bar = BarPlaces(session, store, site, bench.progress, f"{SIGN} {number}", PLACES, bench.control)
     p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
     doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
     work = _Correcting(bench, held, misfit_mm, bar, old)
@@ -230,6 +244,14 @@ async def _push(bench: _Bench, made: Made, before: list[dict[str, Any]]) -> Corr
     return Correction(
         made.solved, proposed.tables, lsb_nm, p, misfit_um, old, after, pushed, decision, bank, image, proposed.not_for_tables, made.number
     )
+
+
+def _as_solved(run: dict[str, Any], solved: Solved, table: NineTables | None) -> dict[str, Any]:
+    """A run as those that were solved were: less what the table in force did beyond its smooth corrections."""
+    if table is None:
+        return run
+    lost = np.array([v for v, _ in solved.joint.backlash_mm().values()])
+    return less([run], taken(table, lost))[0]
 
 
 @dataclass
@@ -250,7 +272,10 @@ class _Correcting:
     def reasons(self) -> list[str]:
         """Everything against it; asked again by the machine of the push, with what the controller says of itself by then."""
         drift = [] if self.drift_mm is not None else [UNSEEN]
-        return [*self.held.reasons(self.drift_mm), *drift]
+        # Decisions are read anew: a person may have rejected it while the ball-bar was read.
+        number, store = self.held.number, self.bench.store
+        now = replace(self.held, rejections=tuple(store.rejections(number)), approvals=tuple(store.approvals(number)))
+        return [*now.reasons(self.drift_mm), *drift]
 
     async def probe(self) -> Verdict:
         """Sign, axis and unit of this table, physically; the bar is taken out afterwards, for the verification mounts its own."""
@@ -267,7 +292,8 @@ class _Correcting:
         number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(bench.store.campaigns)) + 1
         name = f"{VERIFY}{number}"
         plan = paced(verification(bench.site.machine, rate_hz=bench.rate_hz, name=name), bench.site.max_feed_mm_min)
-        ids = await measure(bench.session, bench.store, bench.site, plan, progress=bench.progress)
+        manner = Manner(control=bench.control, part=True)
+        ids = await measure(bench.session, bench.store, bench.site, plan, progress=bench.progress, manner=manner)
         self.after = figures(await load_runs(bench.store, ids))
         self.decision = decide(self.before, self.after, self.pushing.crc if self.pushing is not None else None)
         self.verified_as = name
@@ -281,13 +307,15 @@ async def _push_and_verify(work: _Correcting, wanted: Wanted) -> tuple[Pushed, F
     if against:
         raise TableRefused("; ".join(against), "nothing was written")
     await check_commissioned(bench.session.controller, bench.store, bench.site)
-    questions = Questions(work.reasons, by_whom(), work.probe, work.verify, work.held.approval(bench.clock))
-    work.pushing = pushing = Pushing(bench.session.controller, bench.store, bench.site)
+    questions = Questions(work.reasons, work.held.by, work.probe, work.verify, work.held.approval(bench.clock))
+    work.pushing = pushing = Pushing(bench.session.controller, bench.store, bench.site, attended=bench.attended, control=bench.control)
     if work.bar is None:
+        await bench.control.gate()
         pushed = await pushing.bring(wanted, questions)
     else:
         async with work.bar.cleared_away():
             work.read_before = await work.bar.read("before")
+            await bench.control.gate()
             bench.progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
             pushed = await pushing.bring(wanted, questions)
     if work.after is None or work.decision is None:

@@ -31,7 +31,7 @@ MAX_SAMPLES_PER_S = 6000
 
 CERTIFICATES = {"ballbar": date(2099, 12, 31), "laser": date(2099, 12, 31)}
 """Simulated instruments are as good as their simulator says, for ever."""
-RAW = PushLimits(value_mm=0.2, change_mm=0.2)
+RAW = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
 """Nobody has ever corrected these machines: their first tables replace nothing by everything, as a person would allow after a look."""
 
 
@@ -74,7 +74,13 @@ def write_machine_file(site: Site, folder: Path) -> Path:
     lines += ["", "[pivots_mm]"] + [f"{a} = {row(m.pivots_mm[k])}" for k, a in enumerate("XYZ")]
     lines += ["", "[devices]"] + [f'{k} = "{getattr(site.urls, k)}"' for k in ("cnc", "ballbar", "laser", "fixture")]
     lines += ["", "[calibration]"] + [f"{kind} = {day.isoformat()}" for kind, day in sorted(site.calibrated_until.items())]
-    lines += ["", "[limits]", f"table_value_um = {site.limits.value_mm * 1e3:g}", f"table_change_um = {site.limits.change_mm * 1e3:g}"]
+    lines += [
+        "",
+        "[limits]",
+        f"table_value_um = {site.limits.value_mm * 1e3:g}",
+        f"table_change_um = {site.limits.change_mm * 1e3:g}",
+        f"table_walk_um = {site.limits.walk_mm * 1e3:g}",
+    ]
     lines += ["", "[store]", 'url = "sqlite:///abbe.sqlite3"', ""]
     path = folder / "machine.toml"
     path.write_text("\n".join(lines), encoding="utf-8")

@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from models.arrays import F1
 from models.discovery.answer import Discovery
@@ -30,6 +32,7 @@ from service.workflows.known_effects import applies, readings_of, without
 from service.workflows.model_book import grown
 from service.workflows.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
 from service.workflows.solve import ALL_READINGS
+from service.workflows.table_out import NO_TABLE, TABLE_OUT, TableThen, as_left, table_line
 from service.workflows.thinned import Thinning, thinned, thinning
 
 Search = Callable[[Case, tuple[Effect, ...], ProgressSink], Discovery]
@@ -43,11 +46,12 @@ Thin = Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
 class Job:
     """What a discovery works on.
 
-    ``runs``: the campaign's, long ones as means (`service.workflows.thinned`); ``case``: the same with effects that the model book knows
-    taken out of the readings; ``known_mm``: these, per run; ``known``: their labels; ``base``: the version of the book they are from;
-    ``flags``: what is odd about single runs, and what thinning hides; ``thinning``: that in figures, None where nothing was thinned;
-    ``seen``: the version that has to be the current one when a new one is added - ``base``,
-    unless that is of another geometry, or the discovery goes on with one that has added a version of the same readings itself.
+    ``campaign``: as measured; ``runs``: its runs, long ones as means (`service.workflows.thinned`), less what a table in force did;
+    ``case``: the same with effects that the model book knows taken out of the readings; ``known_mm``: these, per run; ``known``: their
+    labels; ``base``: the version of the book they are from; ``flags``: what is odd about single runs, and what thinning hides;
+    ``thinning``: that in figures, None where nothing was thinned; ``seen``: the version that has to be the current one when a new one is
+    added - ``base``, unless that is of another geometry, or the discovery goes on with one that has added a version of the same readings
+    itself; ``table_mm``: what a table in force did, per run, where it was taken out.
     """
 
     campaign: Campaign
@@ -60,6 +64,7 @@ class Job:
     flags: tuple[str, ...]
     thinning: Thinning | None = None
     seen: int | None = None
+    table_mm: dict[str, F1] = field(default_factory=dict)
 
     @property
     def source(self) -> dict[str, Any]:
@@ -77,13 +82,22 @@ class Job:
         return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
 
 
-def prepare(campaign: Campaign, effects: tuple[Effect, ...], base: ModelRecord | None = None, *, thin: Thin = thinned) -> Job:
+def prepare(
+    campaign: Campaign,
+    effects: tuple[Effect, ...],
+    base: ModelRecord | None = None,
+    *,
+    table: TableThen = NO_TABLE,
+    thin: Thin = thinned,
+) -> Job:
     """Check a campaign's runs and take out what the model book knows.
 
     Parameters
     ----------
     base : ModelRecord, optional
         Current version of the machine's model. A version of another geometry is not used, and that is flagged.
+    table : TableThen
+        In force while it was measured: what it did beyond smooth corrections is taken out of the readings, and flagged.
     thin : function
         From runs to runs with as many readings as the search shall hold.
 
@@ -97,8 +111,11 @@ def prepare(campaign: Campaign, effects: tuple[Effect, ...], base: ModelRecord |
         The book knows an effect that this catalogue does not.
     """
     flags = _checked(campaign)
-    runs = thin(campaign.runs)
-    hidden = thinning(campaign.runs, runs)
+    left = as_left(campaign, table.table)
+    flags += [table_line(left.doc[TABLE_OUT])] if TABLE_OUT in left.doc else [table.why] if table.why else []
+    runs = thin(left.runs)
+    hidden = thinning(left.runs, runs)
+    table_mm = {} if left is campaign else _between(thin(campaign.runs), runs)
     flags += hidden.lines if hidden is not None else ()
     case = case_of(campaign.doc, campaign.site.machine, runs)
     seen = None if base is None else base.version
@@ -108,7 +125,13 @@ def prepare(campaign: Campaign, effects: tuple[Effect, ...], base: ModelRecord |
     known = [] if base is None else [e for e in base.doc["effects"] if applies(e, campaign.name)]
     known_mm = readings_of(known, effects, case)
     labels = tuple(e["label"] for e in known)
-    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen)
+    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen, table_mm)
+
+
+def _between(measured: list[dict[str, Any]], less: list[dict[str, Any]]) -> dict[str, F1]:
+    """What was taken out of the readings of each run, mm."""
+    pairs = [(a, a["columns"]["deviation_mm"], b["columns"]["deviation_mm"]) for a, b in zip(measured, less, strict=True)]
+    return {run["run_id"]: np.subtract(before, after, dtype=np.float64) for run, before, after in pairs if before is not None}
 
 
 def _checked(campaign: Campaign) -> list[str]:

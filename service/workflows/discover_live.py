@@ -24,6 +24,7 @@ from service.workflows.discover import Job, prepare
 from service.workflows.discovery_store import StoredJournal, journal_of
 from service.workflows.measure import measure, start_campaign
 from service.workflows.model_book import version
+from service.workflows.table_out import table_then
 
 ROUNDS = 3
 """So many proposals are measured before a person has to look."""
@@ -166,7 +167,7 @@ def next_search(store: Store, job: Job, journal: StoredJournal, name: str) -> tu
     """
     campaign = joined(job.campaign, from_store(store, name))
     base = None if journal.base is None else version(store, job.campaign.site.name, journal.base)
-    following = replace(prepare(campaign, job.effects, base), seen=journal.leaves)
+    following = replace(prepare(campaign, job.effects, base, table=table_then(store, campaign)), seen=journal.leaves)
     return following, journal_of(store, following, journal)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from models.machine import AXES, Machine
 from service.report.dry_page import DryPage, render_dry
+from service.report.numbers import MM, Unit
 from service.report.plots.views import DrawnTest, three_views
 from service.sequences.check import DryRun
 from service.sequences.steps import CampaignPlan, MountBar, MoveTo, Point, ReadBar, ReadLaser, RecordPath, TestPlan
@@ -20,7 +21,6 @@ NAMES = {
 
 def dry_page(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> str:
     """The page of a checked plan: paths in three views with strokes, set-ups, bars and cups, and a row for each test."""
-    tests = [_drawn(k, test) for k, test in enumerate(plan.tests, start=1)]
     seconds, readings = sum(r.duration_s for r in runs), sum(r.readings for r in runs)
     used = [f"{AXES[a]} {min(r.lowest_mm[a] for r in runs):.0f} to {max(r.highest_mm[a] for r in runs):.0f} mm" for a in range(3)]
     mounted = sum(t.mounts for t in plan.tests)
@@ -30,7 +30,12 @@ def dry_page(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[DryRun
     )
     headings = ("No", "Test", "Set-up", "Kind", "s", "path mm", "X mm", "Y mm", "Z mm", "mm/min", "readings")
     rows = tuple(_row(k, test, run) for k, (test, run) in enumerate(zip(plan.tests, runs, strict=True), start=1))
-    return render_dry(DryPage(f"Dry run: {plan.name}", lead, headings, rows, three_views(machine.stroke_mm, tests)))
+    return render_dry(DryPage(f"Dry run: {plan.name}", lead, headings, rows, picture(machine, plan)))
+
+
+def picture(machine: Machine, plan: CampaignPlan, unit: Unit = MM) -> str:
+    """The paths of a plan in three views with strokes, set-ups, bars and cups, as SVG; ``unit``: of its axes."""
+    return three_views(machine.stroke_mm, [_drawn(k, test) for k, test in enumerate(plan.tests, start=1)], unit=unit)
 
 
 def _row(k: int, test: TestPlan, run: DryRun) -> tuple[str, ...]:

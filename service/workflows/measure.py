@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import platform
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
 from drivers.errors import DriverError
 from drivers.links.shielded import run_to_end
+from service.capture.live import LiveFeed
 from service.capture.recorder import CaptureRecorder, close_run, recording
 from service.clock import Clock, SystemClock
 from service.devices.clock_notes import notes_since
@@ -44,11 +46,12 @@ LAST_LINE_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class How:
-    """By whom a test is run, which part of it, and where its checkpoints go."""
+    """By whom a test is run, which part of it, where its checkpoints go, and who looks on."""
 
     runner: Runner
     attempt: Attempt
     journal: Journal
+    live: LiveFeed | None = None
 
 
 @dataclass
@@ -81,13 +84,16 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
 class Manner:
     """Who may interrupt a measurement, who can say whether a set-up was touched, what it was made of, and where it goes on.
 
-    ``source``: what the plan can be made from again, for `abbe measure --resume`.
+    ``source``: what the plan can be made from again, for `abbe measure --resume`. ``part``: what ``control`` controls is not over with this
+    measurement. ``live``: is shown what paths read.
     """
 
     control: Control | None = None
     confirm: Confirm = nobody
     source: dict[str, Any] = field(default_factory=dict)
     resumed: Resumed | None = None
+    part: bool = False
+    live: LiveFeed | None = None
 
 
 async def measure(  # noqa: PLR0913 - what on what, and for whom
@@ -136,7 +142,7 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
     meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
     control.now(State.RUNNING)
     notes, told = IncidentNotes(journal, clock), asyncio.create_task(meter.tell())
-    once = _once(session, store, site, under_way, meter, control)
+    once = _once(session, store, site, under_way, meter, manner.live)
     try:
         async with incidents_noted(session, notes):
             run_ids = await _all_tests(plan, [d.duration_s for d in dry], conduct, meter, resumed, once)
@@ -146,7 +152,7 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
     else:
         await _ended(journal, notes, "complete", None)
     finally:
-        control.now(State.ENDED)
+        control.now(State.RUNNING if manner.part else State.ENDED)
         told.cancel()
     return run_ids
 
@@ -221,12 +227,12 @@ async def _all_tests(
 
 
 def _once(
-    session: Session, store: Store, site: Site, under_way: OpenCampaign, meter: Meter, control: Control
+    session: Session, store: Store, site: Site, under_way: OpenCampaign, meter: Meter, live: LiveFeed | None
 ) -> Callable[[TestPlan, float], Once]:
     """How one attempt at a test becomes one run."""
 
     def of(test: TestPlan, base_s: float) -> Once:
-        breaks = BarBreaks(session, control, site.watching.suspending)
+        breaks = BarBreaks(session, meter.control or Control(), site.watching.suspending)
 
         async def once(left: TestPlan, attempt: Attempt, runner: Runner) -> int:
             before_s = max(planned_seconds(test) - planned_seconds(left), 0.0)  # what an earlier attempt has done stays done
@@ -234,7 +240,7 @@ def _once(
             def tick(seconds: float, waited_s: float) -> None:
                 meter.at(base_s + before_s + seconds, test.label, waited_s)
 
-            how = How(runner, attempt, runner.journal)
+            how = How(runner, attempt, runner.journal, live)
             try:
                 return await measure_test(session, store, site, under_way, left, tick, meter.clock, how)
             except DriverError as error:
@@ -270,7 +276,8 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
             await journal.add(RUN, test=attempt.test, run=run_id, label=test.label, setup=attempt.setup, mounting=attempt.mounting)
             with run_named(session, f"run {run_id} {test.label}"):
                 await bar_ready(session, test)
-                end = dict(await runner.run(test, recorder, tick, replace(attempt, run_id=run_id)))
+                with shown(how.live if how is not None else None, test, recorder):
+                    end = dict(await runner.run(test, recorder, tick, replace(attempt, run_id=run_id)))
         status, reason = "complete", ""
     except DiskFull as error:
         status, reason = DISK_FULL, f"{error.code}: {error}"
@@ -293,6 +300,21 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
         end |= {} if runner.way is None or status == "complete" else runner.way.doc()
         await run_to_end(close_run(store, run_id, recorder, status, reason, end))
     return run_id
+
+
+@contextmanager
+def shown(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) -> Iterator[None]:
+    """Whoever looks on sees what the test's path reads, beside the way to the disk."""
+    path = next((step for step in test.steps if isinstance(step, RecordPath)), None)
+    if live is None or path is None:
+        yield
+        return
+    live.begin(test.label, test.test, test.setup, (path.points_mm, path.feed_mm_min, path.rate_hz))
+    recorder.look = live.take
+    try:
+        yield
+    finally:
+        live.end()
 
 
 async def start_document(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:

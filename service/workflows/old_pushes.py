@@ -6,7 +6,7 @@ import asyncio
 
 from drivers.api import Controller
 from drivers.links.shielded import run_to_end
-from service.errors import StillActive, TableMismatch, UnsafeToMove
+from service.errors import MachineInUse, StillActive, TableMismatch
 from service.site import Site
 from service.storage.owner import Owner
 from service.storage.store import Store
@@ -26,7 +26,7 @@ async def finish_old_push(controller: Controller, store: Store, site: Site, *, a
 
     Raises
     ------
-    UnsafeToMove
+    MachineInUse
         Its process is still at it.
     StillActive
         The unverified table is still active, because the controller refuses or does not answer.
@@ -38,7 +38,7 @@ async def finish_old_push(controller: Controller, store: Store, site: Site, *, a
     if push is None or push.state not in UNFINISHED:
         return None
     if push.state in OPEN and not Owner(**push.doc["owner"]).is_gone():
-        raise UnsafeToMove(f"push {push.id} is under way (process {push.doc['owner']['pid']})", "wait until it has ended")
+        raise MachineInUse(f"push {push.id} is under way (process {push.doc['owner']['pid']})", "wait until it has ended")
     if accepted:
         now = await controller.comp_status()
         doc = push.doc | {"accepted_bank": now.active_bank, "accepted_crc": now.bank_crc[now.active_bank]}

@@ -18,6 +18,7 @@ from service.site import Site
 from service.storage.base import utc_text
 from service.storage.records import ApprovalRecord
 from service.storage.store import Store
+from service.storage.store_decisions import RejectionRecord
 from service.workflows.base_table import Base, read_base
 from service.workflows.candidates import scene_of, until_s
 from service.workflows.proposal_doc import Proposed
@@ -26,7 +27,10 @@ from service.workflows.proposals import by_whom, login
 
 @dataclass(frozen=True)
 class Held:
-    """A proposal held against its machine, its controller and its approvals as they are now."""
+    """A proposal held against its machine, its controller and its approvals as they are now.
+
+    ``attended``: whoever pushes it is a person; else an approval is needed even where two people are not demanded.
+    """
 
     number: int
     proposed: Proposed
@@ -34,13 +38,24 @@ class Held:
     base: Base
     scene: Scene
     approvals: tuple[ApprovalRecord, ...]
+    rejections: tuple[RejectionRecord, ...] = ()
+    attended: bool = True
+
+    @property
+    def _needs_approval(self) -> bool:
+        return self.site.two_people or not self.attended
+
+    @property
+    def by(self) -> str:
+        """Who pushes."""
+        return by_whom() if self.attended else f"{login()}, by the service"
 
     def reasons(self, drift_mm: float | None = None) -> list[str]:
         """All reasons against pushing it now; ``drift_mm``: what its solution leaves of a newer run that it has not seen."""
         candidate = self.proposed.candidate
         if drift_mm is not None and candidate.digest == content_digest(candidate):
             candidate = _drifted(candidate, drift_mm)
-        found = [*self._bound(), *reasons_against(candidate, self.scene, self.site.limits), *self._approved()]
+        found = [*self._bound(), *self._rejected(), *reasons_against(candidate, self.scene, self.site.limits), *self._approved()]
         if self.proposed.reasons and not found:
             found = [f"PROPOSED: with {len(self.proposed.reasons)} reasons against it, which are gone now: propose again"]
         return found
@@ -60,29 +75,36 @@ class Held:
         if self.site.limits != p.limits:
             yield f"LIMITS: changed since it was proposed ({_changed(asdict(p.limits), asdict(self.site.limits))}): propose again"
 
+    def _rejected(self) -> Iterator[str]:
+        for row in self.rejections[-1:]:
+            yield f"REJECTED: by {row.name} at {row.utc}: {row.reason}"
+
     def _approved(self) -> Iterator[str]:
-        found, why = valid_approval(self.proposed, self.approvals, self.scene.now_s, two_people=True)
+        found, why = valid_approval(self.proposed, self.approvals, self.scene.now_s, two_people=self.site.two_people)
         if self.site.two_people != self.proposed.two_people:
             yield "APPROVAL: whether two people are needed was changed in the machine file since it was proposed: propose again"
-        elif self.site.two_people and found is None:
+        elif self._needs_approval and found is None:
             yield f"APPROVAL: {why}"
 
     def approval(self, clock: Clock) -> Approval | None:
         """The approval that the push machine checks against what it has read; None where whoever orders the push approves it."""
-        if not self.site.two_people:
+        if not self._needs_approval:
             return None
-        found, why = valid_approval(self.proposed, self.approvals, clock.utc().timestamp(), two_people=True)
+        found, why = valid_approval(self.proposed, self.approvals, clock.utc().timestamp(), two_people=self.site.two_people)
         if found is None:
             raise TableRefused(why, "abbe comp approve; nothing was written")
         left_s = _utc_s(found.expiry) - clock.utc().timestamp()
-        return Approval(found.digest, f"{found.name}; pushed by {by_whom()}", found.expiry, clock.monotonic_s() + left_s)
+        return Approval(found.digest, f"{found.name}; pushed by {self.by}", found.expiry, clock.monotonic_s() + left_s)
 
 
-async def hold(controller: Controller, store: Store, site: Site, number: int, proposed: Proposed, clock: Clock) -> Held:
+async def hold(
+    controller: Controller, store: Store, site: Site, number: int, proposed: Proposed, clock: Clock, *, attended: bool = True
+) -> Held:
     """Read what a proposal is held against. Nothing is written."""
     base = await read_base(controller)
-    scene = await scene_of(site, store, base, await controller.table_format(), proposed.tables, clock)
-    return Held(number, proposed, site, base, scene, tuple(await asyncio.to_thread(store.approvals, number)))
+    scene = await scene_of(site, store, base, await controller.table_format(), proposed.tables, clock, attended=attended)
+    approvals, rejections = await asyncio.to_thread(lambda: (store.approvals(number), store.rejections(number)))
+    return Held(number, proposed, site, base, scene, tuple(approvals), tuple(rejections), attended)
 
 
 def valid_approval(
@@ -102,10 +124,17 @@ def valid_approval(
     return None, why
 
 
-def approve(store: Store, number: int, proposed: Proposed, name: str, hours: float, clock: Clock) -> ApprovalRecord:
+def approve(
+    store: Store, number: int, proposed: Proposed, name: str, hours: float, clock: Clock, account: str | None = None
+) -> ApprovalRecord:
     """Approve a proposal: exactly this table on exactly this base, for this machine, under these limits, for some hours.
 
     The approval ends at the latest when the measurement becomes too old.
+
+    Parameters
+    ----------
+    account : str, optional
+        By which account; of this command line where nothing is said.
 
     Raises
     ------
@@ -121,8 +150,22 @@ def approve(store: Store, number: int, proposed: Proposed, name: str, hours: flo
     if proposed.two_people and _same(name, proposed.by):
         raise TableRefused(f"{name} proposed it: this machine needs a second person to approve", "let somebody else approve it")
     expiry = utc_text(now + timedelta(seconds=min(hours * 3600.0, left_s)))
-    store.add_approval(ApprovalRecord(0, number, name, login(), proposed.binding(expiry), expiry, ""))
+    store.add_approval(ApprovalRecord(0, number, name, account or login(), proposed.binding(expiry), expiry, ""))
     return store.approvals(number)[-1]
+
+
+def reject(store: Store, number: int, name: str, reason: str, account: str | None = None) -> RejectionRecord:
+    """Reject a proposal for good: it cannot be approved or pushed any more, whatever approvals it has. Tables have to be proposed anew.
+
+    Raises
+    ------
+    TableRefused
+        No reason is given.
+    """
+    if not reason.strip():
+        raise TableRefused(f"proposal {number} is not rejected without a reason", "say why; the proposer has to know")
+    store.add_rejection(RejectionRecord(0, number, name, account or login(), reason.strip(), ""))
+    return store.rejections(number)[-1]
 
 
 def _same(one: str, other: str) -> bool:

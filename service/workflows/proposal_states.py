@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,14 +12,15 @@ from service.push.entries import Entry, Journal, facts
 from service.push.states import TERMINAL, State
 from service.storage.records import ApprovalRecord
 from service.storage.store import Store
+from service.storage.store_decisions import RejectionRecord
 from service.workflows.proposal_checks import valid_approval
 from service.workflows.proposal_doc import Proposed
-from service.workflows.rollback import KIND, pushes_of
+from service.workflows.push_history import KIND, pushes_of
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """One word and one sentence. Words: refused, proposed, approved, expired, superseded, pushed, kept, rolled back."""
+    """One word and one sentence. Words: refused, rejected, proposed, approved, expired, superseded, pushed, kept, rolled back."""
 
     word: str
     text: str
@@ -28,11 +30,17 @@ def standing(store: Store, number: int, proposed: Proposed, now_s: float) -> Sta
     """Where a stored proposal stands."""
     entries = read_entries(store, proposed.candidate.machine)
     docs = {t.id: t.doc for t in store.tables()}
-    return standing_of(number, proposed, store.approvals(number), entries, docs, now_s)
+    return standing_of(number, proposed, store.approvals(number), entries, docs, now_s, store.rejections(number))
 
 
 def standing_of(
-    number: int, proposed: Proposed, approvals: list[ApprovalRecord], entries: list[Entry], docs: dict[int, dict[str, Any]], now_s: float
+    number: int,
+    proposed: Proposed,
+    approvals: list[ApprovalRecord],
+    entries: list[Entry],
+    docs: dict[int, dict[str, Any]],
+    now_s: float,
+    rejections: Sequence[RejectionRecord] = (),
 ) -> Standing:
     """The same from plain values; ``docs``: of the store's tables, by number."""
     journals = pushes_of(entries)
@@ -41,6 +49,8 @@ def standing_of(
         found = _pushed(own[-1], journals, docs)
         if found is not None:
             return found
+    if rejections:
+        return Standing("rejected", f"by {rejections[-1].name}: {rejections[-1].reason}")
     if proposed.reasons:
         return Standing("refused", f"{len(proposed.reasons)} reasons against it when it was proposed")
     wrote = [e.push for e in entries if e.state is State.STAGING and e.utc > proposed.utc]

@@ -10,6 +10,7 @@ import asyncio
 import getpass
 import os
 import secrets
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -26,12 +27,14 @@ from service.storage.base import utc_text
 from service.storage.records import CampaignRecord, RunRecord
 from service.storage.store import Store
 from service.workflows.base_table import Base, read_base
+from service.workflows.campaign_folder import from_store
 from service.workflows.candidates import Promise, candidate_of, scene_of
 from service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from service.workflows.solve import Solved, solve_runs
 from service.workflows.solve_report import solution_doc
+from service.workflows.table_out import TableThen
 from service.workflows.tables import added
-from service.workflows.taken_out import stored_without
+from service.workflows.taken_out import TakenOut, taken_out
 
 GRID = (25, 21, 19)
 
@@ -89,13 +92,26 @@ async def gather(controller: Controller, store: Store, site: Site, campaign: str
     return Gathered(record, records, runs, base, await controller.table_format())
 
 
-async def make(store: Store, site: Site, gathered: Gathered, *, clock: Clock | None = None, progress: ProgressSink) -> Made:
-    """Solve, and store what follows as a proposal, with every reason that speaks against it now."""
+async def make(
+    store: Store,
+    site: Site,
+    gathered: Gathered,
+    *,
+    clock: Clock | None = None,
+    progress: ProgressSink,
+    agree: Callable[[Predicted], None] = lambda _: None,
+    by: str = "",
+) -> Made:
+    """Solve, and store what follows as a proposal, with every reason that speaks against it now.
+
+    ``agree``: sees what is promised; what it raises is raised, and nothing is stored. ``by``: who proposes; default: whose process it is.
+    """
     clock = clock or SystemClock()
     progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
     name, base, form = gathered.campaign.name, gathered.base, gathered.form
-    known = await asyncio.to_thread(stored_without, store, name)
+    known = await asyncio.to_thread(_without, store, name, base.tables)
     proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, form.lsb_nm)
+    agree(proposal.predicted)
     doc = solution_doc(proposal.solved) | known.doc | {"machine": site.doc}
     solution_id = await store.write(store.add_solution, gathered.campaign.id, "joint", [r.id for r in gathered.records], doc)
     promise = Promise(proposal.tables, proposal.change, proposal.predicted, None, *_ends_s(gathered.records))
@@ -104,8 +120,8 @@ async def make(store: Store, site: Site, gathered: Gathered, *, clock: Clock | N
     status = base.status
     proposed = Proposed(
         site.doc, name, solution_id, candidate, proposal.tables.u_mm,
-        BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people, login(),
-        utc_text(clock.utc()), tuple(reasons_against(candidate, scene, site.limits)), known.lines,
+        BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people,
+        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, scene, site.limits)), known.lines,
     )  # fmt: skip
     plain = doc_of(proposed)
     number = await store.write(store.add_proposal, site.name, solution_id, plain, digest_of_doc(plain))
@@ -119,17 +135,21 @@ def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
 
 
 def propose(site: Site, runs: list[dict[str, Any]], base: Base, lsb_nm: int) -> Proposal:
-    """Absolute tables from runs that were measured while ``base`` was active."""
+    """Absolute tables from runs that were measured while ``base`` was active (`taken_out`)."""
     solved = solve_runs(site, runs)
     change = nine_tables(solved.joint, GRID)
     predicted = predict_residual(solved.joint, change)
     return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted)
 
 
-async def solved_again(store: Store, site: Site, campaign: str) -> Solved:
-    """The solution that a stored proposal follows from: needed to ask what a newer run says of it."""
-    known = await asyncio.to_thread(stored_without, store, campaign)
+async def solved_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:
+    """The solution that a stored proposal follows from: needed to ask what a newer run says of it. ``table``: in force when measured."""
+    known = await asyncio.to_thread(_without, store, campaign, table)
     return await asyncio.to_thread(solve_runs, site, known.campaign.runs)
+
+
+def _without(store: Store, name: str, table: NineTables | None) -> TakenOut:
+    return taken_out(store, from_store(store, name), TableThen(table))
 
 
 def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
@@ -145,6 +165,9 @@ def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
         if seen != base.crc:
             with_what = "does not say with which table it was measured" if seen is None else f"was measured with table {seen:08X}"
             raise TableMismatch(f"run {run['run_id']} {with_what}; active is {base.crc:08X}", "measure again with the present table")
+        if base.tables is not None and run["table"].get("acting") is False:
+            why = f"run {run['run_id']} was measured while table {base.crc:08X} did not act: the compensation was switched off"
+            raise TableMismatch(why, "switch it on at the control and measure again")
 
 
 def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:

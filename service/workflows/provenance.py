@@ -19,6 +19,10 @@ from models.machine import Machine
 SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
 
 
+AS_MEASURED, LESS = "as_measured", "less"
+"""Keys of a run whose readings were changed: digest of what was measured, and in words what was taken out of it."""
+
+
 def run_digest(run: dict[str, Any]) -> str:
     """SHA-256 of what was measured: test, set-up and the columns that are solved from; the run's name and campaign do not count."""
     out = hashlib.sha256(json.dumps([run["test"], run["setup"]], sort_keys=True).encode())
@@ -29,11 +33,32 @@ def run_digest(run: dict[str, Any]) -> str:
     return out.hexdigest()
 
 
+def changed(run: dict[str, Any], columns: dict[str, Any], less: str) -> dict[str, Any]:
+    """A run with other readings, which remembers what was measured and what was taken out of it."""
+    return run | {"columns": columns, AS_MEASURED: measured_digest(run), LESS: [*run.get(LESS, ()), less]}
+
+
+def measured_digest(run: dict[str, Any]) -> str:
+    """`run_digest` of a run as it was measured, whatever was taken out of its readings since."""
+    return str(run.get(AS_MEASURED) or run_digest(run))
+
+
+def taken_from(runs: list[dict[str, Any]]) -> list[str]:
+    """What was taken out of readings, in words, each once."""
+    return sorted({words for run in runs for words in run.get(LESS, ())})
+
+
 def whole_run_digest(run: dict[str, Any]) -> str:
-    """SHA-256 of everything that a search can take from a run: `run_digest`, name, role, its machine, and all columns."""
+    """SHA-256 of everything that a search can take from a run: `run_digest`, name, role, its machine, and all columns.
+
+    Of readings that were changed those that were measured count, and what was taken out of them: what a solver makes of that may differ
+    in the last digit from computer to computer.
+    """
     out = hashlib.sha256(json.dumps([run[k] for k in ("run_id", "test", "role", "machine", "setup")], sort_keys=True).encode())
+    if AS_MEASURED in run:
+        out.update(json.dumps([run[AS_MEASURED], run[LESS]]).encode())
     for name, values in sorted(run["columns"].items()):
-        if values is not None:
+        if values is not None and not (name == "deviation_mm" and AS_MEASURED in run):
             out.update(name.encode() + np.asarray(values, dtype="<f8").tobytes())
     return out.hexdigest()
 

@@ -16,7 +16,7 @@ from drivers.cnc.tables import crc32, encode
 from drivers.links.shielded import run_to_end
 from models.compensation.tables import NineTables
 from service.clock import Clock, SystemClock
-from service.errors import AbbeError, PushNotBegun, StillActive, TableMismatch, TableRefused, UnsafeToMove
+from service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableRefused
 from service.push import conduct
 from service.push.adapter import ControllerPort, People
 from service.push.approval import approval_digest
@@ -27,14 +27,15 @@ from service.push.meaning import meaning_of_tables
 from service.push.operations import Approval, Verdict
 from service.push.order import Order
 from service.push.states import State
+from service.sequences.control import Control
 from service.site import Site
 from service.storage.owner import this_process
 from service.storage.store import Store
 from service.workflows.base_table import Base
 from service.workflows.proved_levels import standing
+from service.workflows.push_history import STILL_ACTIVE, operator_needed, push_log
 from service.workflows.tables import table_image
 
-STILL_ACTIVE = "the unverified table is STILL ACTIVE"
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"
 PERHAPS = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
@@ -113,6 +114,8 @@ class Pushing:
     level: int | None = None
     """Capability level of the controller; None: what its commissioning has proved."""
     attended: bool = True
+    control: Control = field(default_factory=Control)
+    """Who may stop it: what is active and not verified goes back then. A pause is waited for before anything is written, and not after."""
     crc: int | None = None
     """Of the image on its way, from `bring` on."""
     _stop: str = ""
@@ -133,8 +136,10 @@ class Pushing:
             The old table could not be made active again (yet).
         TableMismatch
             The controller holds what the journal does not know; or encoding is not what the tables mean.
-        UnsafeToMove
-            Another push on this machine has not come to an end.
+        MachineInUse, UnsafeToMove
+            Another push on this machine is under way, or has not come to an end.
+        Stopped, Aborted
+            Asked for before anything was written.
         StoreError
             The journal cannot be written. A note says whether the new table may be in force.
         asyncio.CancelledError
@@ -143,14 +148,18 @@ class Pushing:
         order = await self._order(wanted)
         key = (str(self.store.url), self.site.name)
         if key in _under_way:
-            raise UnsafeToMove(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
-        book = await StoreBook.new(self.store, self.site.name, self.clock)
-        await self._stand_still()
+            raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
         _under_way.add(key)
+        # First nobody can pause any more, then a pause of before is heard: none gets in between and holds what is in force unverified.
+        self.control.hurry = "a table that nobody has verified may be in force: stop it, or let it end"
         try:
+            await self.control.gate()
+            book = await StoreBook.new(self.store, self.site.name, self.clock)
+            await self._stand_still()
             ended = await self._drive(book, order, wanted, questions)
         finally:
             _under_way.discard(key)
+            self.control.hurry = ""
         return self._outcome(ended)
 
     async def _order(self, wanted: Wanted | WantedAgain) -> Order:
@@ -180,7 +189,7 @@ class Pushing:
     async def _drive(self, book: StoreBook, order: Order, wanted: Wanted | WantedAgain, questions: Questions) -> Ended:
         """Let the machine run in a task of its own; a cancellation is raised when it has come to its end, and says what is in force."""
         port = ControllerPort(self.controller, self._people(wanted, questions), self.clock)
-        task = asyncio.ensure_future(conduct.push(port, book, order, stop=lambda: self._stop))
+        task = asyncio.ensure_future(conduct.push(port, book, order, stop=self._told_to_stop))
         cancelled: asyncio.CancelledError | None = None
         while not task.done():
             try:
@@ -200,6 +209,9 @@ class Pushing:
         if failed is not None:
             raise failed
         return task.result()
+
+    def _told_to_stop(self) -> str:
+        return self._stop or ("stopped by a person" if self.control.stopping or self.control.aborting else "")
 
     async def _failed(self, port: ControllerPort, book: StoreBook, failed: BaseException) -> BaseException:
         """The journal could not be written, or there is a defect: try the way back once, and say how that ended."""
@@ -241,8 +253,8 @@ class Pushing:
         async def ask() -> Verdict:
             return await question()
 
-        if self._stop:  # heard before anything of this question has moved
-            return Verdict(False, self._stop)
+        if stop := self._told_to_stop():  # heard before anything of this question has moved
+            return Verdict(False, stop)
         self._question = asyncio.ensure_future(ask())
         try:
             await asyncio.wait([self._question])
@@ -312,22 +324,6 @@ def _image(wanted: Wanted | WantedAgain) -> tuple[bytes, str]:
     return encode(table_image(wanted.tables, wanted.lsb_nm, number)), meaning_of_tables(wanted.tables)
 
 
-def operator_needed(journal: Journal, detail: str = "") -> TableMismatch:
-    """What a person has to know whom the machine calls: why, and whether the table that nobody has verified is the one in force."""
-    known = facts(journal)
-    why = str(known.get("why", ""))
-    cause = f"{detail}; {why}" if detail and detail != why else why
-    says = known.get("controller", {})
-    if says and says["crc"][says["active"]] == known["crc"]:
-        return TableMismatch(
-            f"push {journal[-1].push}: {cause}: {STILL_ACTIVE} (CRC {known['crc']:08X})",
-            "do not machine; restore the old table at the controller, or vouch for this one with `abbe accept-table MACHINE.toml`",
-        )
-    return TableMismatch(
-        f"push {journal[-1].push}: {cause}", "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
-    )
-
-
 def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
     """What whoever stopped it has to know."""
     if ended is None:
@@ -345,14 +341,3 @@ def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
 def pushes_here(store: Store, machine: str) -> bool:
     """Whether this process is pushing into a machine now."""
     return (str(store.url), machine) in _under_way
-
-
-def push_log(journal: Journal) -> tuple[str, ...]:
-    """Every transition of a push as a line for people."""
-    lines = []
-    for entry in journal:
-        words = [str(entry.doc[key]) for key in ("why", "pending", "again", "approved_by", "probe", "verify") if entry.doc.get(key)]
-        if entry.state is State.SNAPSHOT:
-            words = [f"bank {entry.doc['base_bank']}, CRC {entry.doc['base_crc']:08X}; to come: CRC {entry.doc['crc']:08X}"]
-        lines.append(": ".join([str(entry.state), *words]) + f" ({entry.utc})")
-    return tuple(lines)

@@ -9,7 +9,7 @@ from drivers.errors import DriverError
 from drivers.links.shielded import run_to_end
 from service.capture.recovery import recover_segments
 from service.clock import Clock, SystemClock
-from service.errors import AbbeError, StillActive, TableMismatch, UnsafeToMove
+from service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
 from service.push import conduct
 from service.push.adapter import ControllerPort, nobody
 from service.push.book import StoreBook, read_entries
@@ -20,7 +20,8 @@ from service.site import Site
 from service.storage.owner import Owner, this_process
 from service.storage.store import Store
 from service.workflows.old_pushes import finish_old_push
-from service.workflows.pushing import operator_needed, pushes_here
+from service.workflows.push_history import operator_needed
+from service.workflows.pushing import pushes_here
 from service.workflows.unverified import unverified_crcs
 
 LOOK = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
@@ -32,7 +33,7 @@ async def recover(controller: Controller, store: Store, site: Site) -> str | Non
 
     Raises
     ------
-    UnsafeToMove
+    MachineInUse
         Another process is in the middle of a push on this machine.
     StillActive
         The unverified table is still active, because the controller refuses or does not answer.
@@ -57,7 +58,7 @@ async def finish_push(controller: Controller, store: Store, site: Site, clock: C
 
     Raises
     ------
-    UnsafeToMove, StillActive, TableMismatch
+    MachineInUse, StillActive, TableMismatch
         As of `recover`.
     """
     clock = clock or SystemClock()
@@ -111,7 +112,7 @@ async def accept(controller: Controller, store: Store, site: Site) -> str:
 
     Raises
     ------
-    UnsafeToMove
+    MachineInUse
         Another process is in the middle of a push on this machine.
     """
     clock = SystemClock()
@@ -160,4 +161,4 @@ def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
     owner = Owner(**process) if process else None
     ours = owner == this_process()
     if owner is not None and (pushes_here(store, site.name) if ours else not owner.is_gone()):
-        raise UnsafeToMove(f"push {last.push} is under way (process {owner.pid})", "wait until it has ended")
+        raise MachineInUse(f"push {last.push} is under way (process {owner.pid})", "wait until it has ended")

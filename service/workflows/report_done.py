@@ -21,7 +21,7 @@ from service.storage.store import Store
 from service.workflows import report_parts as parts
 from service.workflows.campaign_folder import Campaign, from_store
 from service.workflows.iso_report import Evaluated, evaluate
-from service.workflows.pushing import push_log
+from service.workflows.push_history import push_log
 from service.workflows.report_parts import Doc, Rules
 from service.workflows.tables import tables_from_image
 from service.workflows.verify import COVERAGE

@@ -8,25 +8,25 @@ compare-and-swap, and the way back if it breaks off.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from drivers.api import Controller
 from drivers.cnc.tables import crc32
-from service.errors import StoreError, TableMismatch, TableRefused
+from service.errors import TableMismatch, TableRefused
 from service.push.book import read_entries
-from service.push.entries import Entry, Journal, JournalBroken, check_chain, facts
+from service.push.entries import Entry, Journal, facts
 from service.push.operations import Verdict
 from service.push.states import TERMINAL, State
+from service.sequences.control import Control
 from service.site import Site
 from service.storage.store import Store
 from service.workflows.base_table import Base, read_base
 from service.workflows.commission import check_commissioned
 from service.workflows.proposals import by_whom
+from service.workflows.push_history import KIND, last_kept, pushes_of
 from service.workflows.pushing import Pushed, Pushing, Questions, WantedAgain
 from service.workflows.recover import recover
 from service.workflows.unverified import unverified_crcs
-
-KIND = "rollback"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,17 @@ class Back:
     how: str
 
 
-async def rollback(controller: Controller, store: Store, site: Site, to: int | None = None) -> Back | None:
+@dataclass(frozen=True, slots=True)
+class Ordered:
+    """Who orders a table back, why, under which number of the order, and who may stop it. Kept with the table and in its journal."""
+
+    who: str
+    reason: str
+    number: str
+    control: Control = field(default_factory=Control)
+
+
+async def rollback(controller: Controller, store: Store, site: Site, to: int | None = None, ordered: Ordered | None = None) -> Back | None:
     """Make a table active again that was in force before.
 
     Parameters
@@ -54,6 +64,8 @@ async def rollback(controller: Controller, store: Store, site: Site, to: int | N
     to : int, optional
         The table that was in force when this push had ended; 0: before the first push. Default: before the last kept push, which must have
         brought the table that is in force now.
+    ordered : Ordered, optional
+        Who orders it. Default: whoever is logged in at this computer.
 
     Returns
     -------
@@ -90,9 +102,13 @@ async def rollback(controller: Controller, store: Store, site: Site, to: int | N
     async def in_force_before() -> Verdict:
         return Verdict(not reasons(), why)
 
-    questions = Questions(reasons, f"{by_whom()}: rollback", in_force_before, in_force_before)
-    doc = {"kind": KIND, "to": to, "how": wanted.how}
-    pushed = await Pushing(controller, store, site).bring(WantedAgain(wanted.image, wanted.meaning, base, doc), questions)
+    by = by_whom() if ordered is None else ordered.who
+    questions = Questions(reasons, f"{by}: rollback", in_force_before, in_force_before)
+    doc = {"kind": KIND, "to": to, "how": wanted.how, "by": by}
+    if ordered is not None:
+        doc |= {"reason": ordered.reason, "order": ordered.number}
+    pushing = Pushing(controller, store, site, control=Control() if ordered is None else ordered.control)
+    pushed = await pushing.bring(WantedAgain(wanted.image, wanted.meaning, base, doc), questions)
     if not pushed.kept:
         raise TableRefused(
             f"the table was not brought back: {pushed.why}", "the table of before is in force; look at the cause, then again"
@@ -102,22 +118,6 @@ async def rollback(controller: Controller, store: Store, site: Site, to: int | N
 
 def _rollbacks(store: Store) -> frozenset[int]:
     return frozenset(t.id for t in store.tables() if t.doc.get("kind") == KIND)
-
-
-def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
-    """Journals of all pushes of a machine, by number.
-
-    Raises
-    ------
-    StoreError
-        The chain is broken: an entry was changed, removed or swapped.
-    """
-    try:
-        check_chain(entries)
-    except JournalBroken as error:
-        raise StoreError(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
-    numbers = sorted({e.push for e in entries})
-    return {n: tuple(e for e in entries if e.push == n) for n in numbers}
 
 
 def _base(journal: Journal, how: str) -> Known:
@@ -175,13 +175,8 @@ def table_after(entries: list[Entry], push: int) -> Known:
 
 def table_before_last_kept(entries: list[Entry], base: Base, rollbacks: frozenset[int]) -> Known:
     """The table before the last kept push, if that one is in force and was no rollback itself."""
-    kept = [j for j in pushes_of(entries).values() if j[-1].state is State.KEEP]
-    if not kept:
-        raise TableRefused("no push of this machine was kept: there is nothing to take back", "nothing was written")
-    last = kept[-1]
+    last = last_kept(entries, rollbacks)
     f, number = facts(last), last[-1].push
-    if int(f["table"]) in rollbacks:
-        raise TableRefused(f"the last kept push ({number}) was a rollback itself", "say how far with --to PUSH; nothing was written")
     if bytes.fromhex(f["image"]) != base.image:
         raise TableRefused(f"the table in force is not the one of push {number}", "say which with --to PUSH; nothing was written")
     return _base(last, f"the table that was in force before push {number}")

@@ -26,9 +26,9 @@ AGREE = 1.1
 class Simulation:
     """Readings of every run as the present model has them, and what measurement leaves of them.
 
-    ``predicted_mm``: by run, sealed runs too; ``left_mm``: reading less prediction once the runs have set what is their own (the zero of a
-    laser run, cup and bar length of a set-up that no fitted run shares), NaN where the instrument flagged it; ``noise_mm``: of one reading,
-    by instrument.
+    ``predicted_mm``: by run, sealed runs too, as the instrument would read it; ``left_mm``: reading less prediction once the runs have
+    set what is their own (the zero of a laser run, cup and bar length of a set-up that no fitted run shares), NaN where the
+    instrument flagged it; ``noise_mm``: of one reading, by instrument.
     """
 
     predicted_mm: dict[str, F1]
@@ -42,7 +42,7 @@ def simulate(job: Job) -> Simulation:
     predicted = predictions(scene, solve(scene, ()))
     seen = {r.path.setup for r in scene.runs}
     left = left_together([r for r in job.case.runs if r.deviation_mm is not None], predicted, seen)
-    total = {label: p + job.known_mm[label] for label, p in predicted.items()}
+    total = {label: p + job.known_mm[label] + job.table_mm.get(label, 0.0) for label, p in predicted.items()}
     return Simulation(total, left, {kind: c.sd_mm for kind, c in scene.colours.items()})
 
 

@@ -22,7 +22,7 @@ from service.runs.observations import bar_noise_mm, run_data
 from service.site import Site
 from service.workflows.campaign_checks import check_files, check_readings, copies, refuse
 from service.workflows.finding import Finding
-from service.workflows.provenance import run_digest
+from service.workflows.provenance import measured_digest, taken_from
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
@@ -56,9 +56,9 @@ STEP_PLACE_MM = 0.1
 class Solved:
     """Joint solution plus the papers' own solutions of the same runs, for comparison.
 
-    ``flags``: what is odd about single runs without being wrong for certain. ``digests``: a hash of every run's data, by its name.
-    ``tables``: the compensation table that each run was measured with, where it says so.
-    ``rows``: for every value of a run the first and the last row of its file (from 1) that went into it, shape (values, 2).
+    ``flags``: what is odd about single runs without being wrong for certain. ``digests``: a hash of every run's data as measured, by its
+    name. ``tables``: the compensation table that each run was measured with, where it says so. ``taken``: what was taken out of the
+    readings. ``rows``: for every value of a run the first and the last row of its file (from 1) that went into it, shape (values, 2).
     """
 
     joint: JointSolution
@@ -69,6 +69,7 @@ class Solved:
     digests: dict[str, str] = field(default_factory=dict)
     rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
+    taken: tuple[str, ...] = ()
 
 
 def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid21", say: Say | None = None) -> Solved:
@@ -96,8 +97,13 @@ def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid2
     flags += check_instruments(joint, data)
     spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not tell ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
-    digests, tables = {r["run_id"]: run_digest(r) for r in used}, {r["run_id"]: r["table"] for r in used if "crc" in r.get("table", {})}
-    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables)
+    digests, tables = (
+        {r["run_id"]: measured_digest(r) for r in used},
+        {r["run_id"]: r["table"] for r in used if "crc" in r.get("table", {})},
+    )
+    return Solved(
+        joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(taken_from(used))
+    )
 
 
 def value_rows(runs: list[dict[str, Any]], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:

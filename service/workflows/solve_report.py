@@ -12,7 +12,7 @@ from models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
 from models.solvers.joint import JointSolution
 from models.solvers.observability import Observability, observability_of
 from models.solvers.robust import Outlier
-from models.uncertainty.budget import Budget, budget_over, worst_point
+from models.uncertainty.budget import Budget, BudgetLine, budget_over, worst_point
 from models.uncertainty.frame import volume_frame
 from models.uncertainty.mask import CompensableMask, compensable_mask
 from models.uncertainty.prediction import Prediction, predict_deviation
@@ -124,7 +124,7 @@ def _verdict(found: Account) -> dict[str, Any]:
 def _inputs(found: Account, model: str) -> dict[str, Any]:
     machine = machine_digest(found.joint.machine)
     return {
-        "digest": campaign_digest(found.solved.digests, model, machine),
+        "digest": campaign_digest(found.solved.digests, "\n".join([model, *found.solved.taken]), machine),
         "machine": machine,
         "runs": found.solved.digests,
         "tables": distinct(found.solved.tables.values()),
@@ -205,9 +205,16 @@ def _uncertainty(found: Account) -> dict[str, Any]:
             "expanded_vector_um": float(p.expanded_vector_mm[at]) * 1e3,
         },
         "rms_um": float(np.sqrt(np.mean(p.u_vector_mm**2))) * 1e3,
-        "budget": [{"source": line.name, "words": line.words, "u_um": line.u_mm * 1e3, "share": line.share} for line in found.budget.lines],
+        "budget": [_budget_line(found, line) for line in found.budget.lines],
         "compensable_share": found.mask.share,
     }
+
+
+def _budget_line(found: Account, line: BudgetLine) -> dict[str, Any]:
+    """A source with the type of its evaluation and its degrees of freedom; null: stated, or the allowance for them."""
+    source = found.sources.source(line.name)
+    dof = float(source.dof) if np.isfinite(source.dof) else None
+    return {"source": line.name, "words": line.words, "u_um": line.u_mm * 1e3, "share": line.share, "type": source.evaluation, "dof": dof}
 
 
 def worst_line(found: Account) -> str:

@@ -10,11 +10,12 @@ import numpy as np
 from models.effects.effect import Effect
 from service.runs.cases import case_of
 from service.storage.store import Store
-from service.workflows.campaign_folder import Campaign, from_store
+from service.workflows.campaign_folder import Campaign
 from service.workflows.discovery_engine import catalogue
 from service.workflows.known_effects import applies, readings_of
 from service.workflows.model_book import current, no_table_lines
-from service.workflows.provenance import machine_digest
+from service.workflows.provenance import changed, machine_digest
+from service.workflows.table_out import TABLE_OUT, TableThen, as_left
 
 
 @dataclass(frozen=True)
@@ -22,30 +23,46 @@ class TakenOut:
     """Runs without what the model book says is no matter for tables.
 
     ``labels``: the effects that were taken out of the readings; ``lines``: every effect that a table cannot take out, with its remedy, or
-    why the book was not used; ``version``: of the model, None without a book.
+    why the book was not used; ``version``: of the model, None without a book; ``in_force``: the table whose side effects were taken out
+    (`service.workflows.table_out.as_left`), None for none; ``not_taken``: why those of a table are still in the readings, empty if they are
+    not.
     """
 
     campaign: Campaign
     labels: tuple[str, ...]
     lines: tuple[str, ...]
     version: int | None
+    in_force: dict[str, Any] | None = None
+    not_taken: str = ""
 
     @property
     def doc(self) -> dict[str, Any]:
-        """For the document of a solution; empty without a book."""
+        """For the document of a solution; empty without a book and without a table."""
+        told: dict[str, Any] = {} if self.in_force is None else {TABLE_OUT: self.in_force}
+        told |= {"table_not_taken_out": self.not_taken} if self.not_taken else {}
         if self.version is None:
-            return {}
-        return {"machine_model": {"version": self.version, "taken_out": list(self.labels), "not_for_tables": list(self.lines)}}
+            return told
+        return told | {"machine_model": {"version": self.version, "taken_out": list(self.labels), "not_for_tables": list(self.lines)}}
 
 
-def taken_out(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | None = None) -> TakenOut:
-    """Take lasting effects whose remedy is no table out of a campaign's readings, as the machine's current model has them.
+def taken_out(store: Store, campaign: Campaign, then: TableThen, effects: tuple[Effect, ...] | None = None) -> TakenOut:
+    """Take what is no matter for tables out of a campaign's readings.
+
+    That is what the table ``then``, in force while it was measured, did beyond smooth corrections, and lasting effects whose remedy is no
+    table, as the machine's current model has them.
 
     Raises
     ------
+    CampaignRefused
+        A table was in force, and a run cannot be what it says.
     ModelUnknown
         The book knows an effect that this catalogue does not.
     """
+    left = as_left(campaign, then.table)
+    return replace(_less_known(store, left, effects), in_force=left.doc.get(TABLE_OUT), not_taken=then.why)
+
+
+def _less_known(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | None) -> TakenOut:
     record = current(store, campaign.site.name)
     if record is None:
         return TakenOut(campaign, (), (), None)
@@ -58,17 +75,13 @@ def taken_out(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | No
         return TakenOut(campaign, (), lines, record.version)
     case = case_of(campaign.doc, campaign.site.machine, campaign.runs)
     known_mm = readings_of(chosen, effects or catalogue(), case)
-    runs = [_less(run, known_mm[run["run_id"]]) for run in campaign.runs]
+    words = f"model version {record.version}: {', '.join(e['label'] for e in chosen)}"
+    runs = [_less(run, known_mm[run["run_id"]], words) for run in campaign.runs]
     return TakenOut(replace(campaign, runs=runs), tuple(e["label"] for e in chosen), lines, record.version)
 
 
-def stored_without(store: Store, name: str) -> TakenOut:
-    """The same for a campaign of the store."""
-    return taken_out(store, from_store(store, name))
-
-
-def _less(run: dict[str, Any], known_mm: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
+def _less(run: dict[str, Any], known_mm: np.ndarray[Any, np.dtype[np.float64]], words: str) -> dict[str, Any]:
     reading = run["columns"]["deviation_mm"]
     if reading is None:
         return run
-    return run | {"columns": run["columns"] | {"deviation_mm": (np.asarray(reading, dtype=np.float64) - known_mm).tolist()}}
+    return changed(run, run["columns"] | {"deviation_mm": (np.asarray(reading, dtype=np.float64) - known_mm).tolist()}, words)

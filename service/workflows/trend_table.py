@@ -44,24 +44,40 @@ def trends(records: Sequence[VerificationRecord], after_utc: datetime | None = N
     after_utc : datetime, optional
         Only later checks: a new table, a repair, begins a new series.
     """
-    docs = sorted((_when(one), one.doc) for one in records if one.doc.get("values"))
-    docs = [(at, doc) for at, doc in docs if after_utc is None or at > after_utc]
+    docs = _docs(records, after_utc)
     if not docs:
         return []
     judged = [key for key, limit in docs[-1][1].get("limits", {}).items() if limit is not None]
     return [found for key in judged if (found := _of_figure(key, docs)) is not None]
 
 
+def of_series(key: str, records: Sequence[VerificationRecord], after_utc: datetime | None) -> list[tuple[datetime, float, float]]:
+    """One figure's series: when, value, expanded uncertainty, in order of time."""
+    return _rows(key, _docs(records, after_utc))
+
+
+def _docs(records: Sequence[VerificationRecord], after_utc: datetime | None) -> list[tuple[datetime, dict[str, Any]]]:
+    """Checks whose figures can be put beside each other: measured, and in the air in which they can be judged."""
+    usable = [one for one in records if one.doc.get("values") and one.doc.get("comparable", True)]
+    docs = sorted(((_when(one), one.doc) for one in usable), key=lambda one: one[0])
+    return [(at, doc) for at, doc in docs if after_utc is None or at > after_utc]
+
+
 def _when(record: VerificationRecord) -> datetime:
     return datetime.fromisoformat(record.doc.get("started_utc") or record.utc)
 
 
-def _of_figure(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> FigureTrend | None:
+def _rows(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> list[tuple[datetime, float, float]]:
     rows = []
     for at, doc in docs:
         value, expanded = doc["values"].get(key), doc.get("uncertainties", {}).get(key)
         if value is not None and expanded is not None and expanded > 0:
             rows.append((at, float(value), float(expanded)))
+    return rows
+
+
+def _of_figure(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> FigureTrend | None:
+    rows = _rows(key, docs)
     if not rows:
         return None
     limit = docs[-1][1]["limits"].get(key)

@@ -1,0 +1,112 @@
+"""What the service is to do, taken from the machine file: everything that `service.serve` is wired from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from service.capture.live import LiveFeed
+from service.channel.messages import MachineTold
+from service.clock import Clock
+from service.core.campaigns import MeasureCampaign
+from service.core.open_ends import Recover
+from service.core.orders import Hands
+from service.mqtt.broker import Broker
+from service.mqtt.topics import Topics
+from service.plant.opcua.setup import OpcUaSetup
+from service.scheduler.desk import Duties
+from service.scheduler.ports import Check, Readiness
+from service.scheduler.ready import AlwaysReady
+from service.scheduler.slots import Schedule
+from service.scheduler.store import ServiceStore
+from service.scheduler.windows import Window
+from service.workflows.in_force import LookAtTable
+from service.workflows.report_parts import Rules
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What the service is to do, taken from the machine file.
+
+    Parameters
+    ----------
+    machine : str
+        Name of the machine.
+    doc : dict
+        Its description as the store keeps it.
+    devices : mapping of str to str
+        Role and URL.
+    schedules : tuple of Schedule
+        The timetable.
+    store_url : str
+        Where everything is kept.
+    broker : Broker or None
+        Where everything is told.
+    topics : Topics
+        Under which names.
+    host, port : str, int
+        Where the page is.
+    check : callable
+        Given the open store, returns ``check(recipe, progress)``.
+    maintenance : tuple of Window
+        Nothing starts by itself in these.
+    ready : callable
+        Given the clock, returns who knows the preconditions.
+    names : tuple of str
+        Under which other computers ask for the page.
+    certificate, key : str
+        PEM files of the page; empty: plain HTTP.
+    opcua : OpcUaSetup or None
+        Where OPC UA clients may read; checked.
+    recipes : tuple of str
+        What a person may start at any time, besides those of the timetable.
+    recover : callable, optional
+        Given the open store, returns how what an earlier end has left open is closed.
+    behind_tls : bool
+        A reverse proxy on this computer takes off the TLS.
+    rules : Rules
+        Limits, certificates and temperatures that reports add to the data.
+    duties : callable, optional
+        Given the open store, what is done about alarms; None: none are raised.
+    table : callable, optional
+        Given the open store, how the table in force is looked at; None: nobody watches it.
+    live : LiveFeed, optional
+        What ``check`` shows of its paths, for the page.
+    told : MachineTold, optional
+        What the page calculates dry runs from.
+    hands : callable, optional
+        Given the open store, what a person can order of tables; None: nothing.
+    campaigns : tuple of str
+        Full campaigns that a person may start, if ``campaign`` is there.
+    campaign : callable, optional
+        Given the open store, how one is measured, solved and proposed.
+    """
+
+    machine: str
+    doc: dict[str, Any]
+    devices: Mapping[str, str]
+    schedules: tuple[Schedule, ...]
+    store_url: str
+    broker: Broker | None
+    topics: Topics
+    host: str
+    port: int
+    check: Callable[[ServiceStore], Check]
+    maintenance: tuple[Window, ...] = ()
+    ready: Callable[[Clock], Readiness] = lambda _: AlwaysReady()
+    names: tuple[str, ...] = ()
+    certificate: str = ""
+    key: str = ""
+    opcua: OpcUaSetup | None = None
+    recipes: tuple[str, ...] = ()
+    recover: Callable[[ServiceStore], Recover] | None = None
+    behind_tls: bool = False
+    rules: Rules = field(default_factory=Rules)
+    duties: Callable[[ServiceStore], Duties] | None = None
+    table: Callable[[ServiceStore], LookAtTable] | None = None
+    live: LiveFeed | None = None
+    told: MachineTold | None = None
+    hands: Callable[[ServiceStore], Hands] | None = None
+    campaigns: tuple[str, ...] = ()
+    campaign: Callable[[ServiceStore], MeasureCampaign] | None = None

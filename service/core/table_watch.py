@@ -1,0 +1,102 @@
+"""Somebody else changed the table in force: seen within seconds, told once, shown until a person has looked.
+
+Modbus asks nobody for a password: whoever is in the machine's network can put any table into force. Nothing here writes to the
+controller or takes anything back: which table is right is a person's word (``abbe accept-table``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableSequence
+
+import structlog
+
+from drivers.errors import DriverError
+from service.clock import Clock
+from service.errors import AbbeError
+from service.scheduler.loop import Alarms
+from service.workflows.in_force import InForce, LookAtTable
+
+log = structlog.get_logger("abbe.table")
+
+LOOK_S = 10.0
+AGAIN_S = 1.0
+"""A first difference is looked at once more after this: a push of another process may have ended between both readings."""
+CODE = "CMP-010"
+NOBODY_PUSHED = "look at the controller; if its table is right, start the service again"
+"""Without a push in the journal there is nothing to accept and nothing to go back to: the first look of a service is what counts."""
+REMEDY = "find out who wrote it; if the table is right: abbe accept-table MACHINE.toml; else: abbe comp rollback or a new push"
+
+
+class TableWatch:
+    """Looks at the table in force while nobody works with the machine.
+
+    Parameters
+    ----------
+    look : LookAtTable
+        One look; it raises what devices and store raise.
+    alarms : Alarms
+        Told once of each strange table.
+    attention : list of str
+        What the page shows until the table is one that Abbe knows.
+    clock : Clock
+        Pauses.
+    changed : callable
+        Told when ``attention`` has changed.
+    """
+
+    def __init__(
+        self, look: LookAtTable, alarms: Alarms, attention: MutableSequence[str], clock: Clock, changed: Callable[[], None]
+    ) -> None:
+        self._look, self._alarms, self._attention = look, alarms, attention
+        self._clock, self._changed = clock, changed
+        self._first: int | None = None
+        """CRC that stands for the journal's while there is none: that of the first look."""
+        self._told: tuple[int, str] | None = None
+
+    async def run(self) -> None:
+        """Look for ever. A controller that does not answer says nothing about its table: others tell that."""
+        while True:
+            seen = await self._one()
+            if seen is not None and self._strange(seen):
+                await self._clock.sleep(AGAIN_S)
+                again = await self._one()
+                seen = again if again is not None and again.crc == seen.crc else None
+            if seen is not None:
+                await self._judge(seen)
+            await self._clock.sleep(LOOK_S)
+
+    async def _one(self) -> InForce | None:
+        try:
+            seen = await self._look()
+        except (AbbeError, DriverError, OSError):  # in use, out of reach, restarting: the next look is soon
+            return None
+        if seen.wanted is None and self._first is None:
+            self._first = seen.crc
+        return seen if seen.settled else None
+
+    def _strange(self, seen: InForce) -> bool:
+        wanted = seen.wanted if seen.wanted is not None else self._first
+        return seen.crc != wanted
+
+    async def _judge(self, seen: InForce) -> None:
+        if not self._strange(seen):
+            self._show(None)
+            return
+        if self._told is not None and self._told[0] == seen.crc:
+            return
+        wanted = seen.wanted if seen.wanted is not None else self._first
+        text = f"somebody else changed the compensation in force: bank {seen.bank} has CRC {seen.crc:08X}, expected is {wanted:08X}"
+        log.error("the table in force is not ours", bank=seen.bank, crc=f"{seen.crc:08X}", wanted=f"{wanted:08X}")
+        remedy = REMEDY if seen.wanted is not None else NOBODY_PUSHED
+        self._show((seen.crc, f"{CODE}: {text} - {remedy}"))
+        await self._alarms.alarm({"code": CODE, "what": text, "remedy": remedy, "at_utc": self._clock.utc().isoformat()})
+
+    def _show(self, told: tuple[int, str] | None) -> None:
+        if told == self._told:
+            return
+        if self._told is not None:
+            self._attention.remove(self._told[1])
+        if told is not None:
+            self._attention.append(told[1])
+        self._told = told
+        self._changed()

@@ -1,0 +1,54 @@
+"""Who is told what the running check does: the board, and with it the page; and the broker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import datetime
+
+from service.clock import Clock
+from service.events import Progress
+from service.mqtt.publisher import Publisher
+from service.scheduler.ports import Doc
+from service.scheduler.slots import Schedule
+from service.web.board import Board
+
+
+class BoardWatch:
+    """Writes on the board, and says that there is something to tell."""
+
+    def __init__(self, board: Board, changed: Callable[[], None]) -> None:
+        self._board, self._changed = board, changed
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        """A check begins."""
+        self._board.job_started(schedule, at_utc)
+        self._changed()
+
+    def job_progress(self, progress: Progress) -> None:
+        """The check got further."""
+        self._board.job_progress(progress)
+        self._changed()
+
+    def job_ended(self, doc: Doc | None) -> None:
+        """The check ended."""
+        self._board.job_ended(doc)
+        self._changed()
+
+
+class StateTeller:
+    """Keeps the retained state message true."""
+
+    def __init__(self, publisher: Publisher, clock: Clock) -> None:
+        self._publisher = publisher
+        self._clock = clock
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        """A check begins."""
+        self._publisher.set_state("measuring", at_utc, schedule=schedule.name)
+
+    def job_progress(self, progress: Progress) -> None:
+        """Nothing: the state is retained, so every change is a write in the broker. Progress is for the page."""
+
+    def job_ended(self, doc: Doc | None) -> None:
+        """The check ended."""
+        self._publisher.set_state("online", self._clock.utc())

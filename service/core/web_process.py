@@ -1,0 +1,216 @@
+"""The web process as the core sees it: started, told how things stand, heard, ended; and started again when it is gone or hangs.
+
+Nothing that happens to it may hold up or end the core: it is told without waiting, and what it says is checked before it is believed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+
+import structlog
+
+from service.capture.live import LiveFeed
+from service.channel.messages import (
+    PROTOCOL,
+    Alive,
+    Answer,
+    Asked,
+    Begin,
+    DoneByHand,
+    Jobs,
+    Moment,
+    PushNow,
+    RollBack,
+    StartJob,
+    SteerJob,
+    Up,
+    from_web,
+)
+from service.channel.wire import Wire
+from service.clock import Clock
+from service.core.jobs import JobBook
+from service.core.live import show_live
+from service.core.orders import Orders
+from service.errors import AbbeError, ChannelBroken
+
+log = structlog.get_logger("abbe.web")
+
+PERIOD_S, SHORTEST_S = 1.0, 0.2
+"""The page hears of the core so often at least, and of its progress no more often."""
+PAUSE_S, LONGEST_PAUSE_S, GOOD_LIFE_S = 0.1, 30.0, 30.0
+"""Before the next start, doubled each time up to the longest; after a good life from the beginning."""
+START_S, HANG_S = 60.0, 20.0
+"""A process that does not serve after this, or says nothing for this long, is ended."""
+GOODBYE_S = 1.2
+PASSED_ON = frozenset({"ABBE_AUDIT_FOLDER"})
+WITHHELD = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"})
+
+
+class WebProcess:
+    """Keeps one web process running.
+
+    Parameters
+    ----------
+    begin : Begin
+        What it has to know.
+    listening : socket
+        Where it answers; it stays open here, so that a request waits while the process is started again.
+    moment : callable
+        How things stand, given the number of restarts.
+    book : JobBook
+        Is asked for what people want.
+    clock : Clock
+        Monotonic time.
+    live : LiveFeed, optional
+        What the running path reads.
+    orders : Orders, optional
+        Is asked for what people order of tables; None: nothing can be ordered.
+    """
+
+    def __init__(
+        self,
+        begin: Begin,
+        listening: socket.socket,
+        moment: Callable[[int], Moment],
+        book: JobBook,
+        clock: Clock,
+        live: LiveFeed | None = None,
+        orders: Orders | None = None,
+    ) -> None:
+        self._live, self._orders = live, orders
+        self._begin, self._listening, self._moment, self._book, self._clock = begin, listening, moment, book, clock
+        self.restarts = 0
+        self._changed, self._ending = asyncio.Event(), asyncio.Event()
+        self._child: asyncio.subprocess.Process | None = None
+        self._up = False
+        self._heard_s = 0.0
+
+    def changed(self) -> None:
+        """Something is to be told."""
+        self._changed.set()
+
+    def stop(self) -> None:
+        """`run` ends now, and the process with it."""
+        self._ending.set()
+
+    async def run(self) -> None:
+        """Work until `stop`."""
+        pause_s = PAUSE_S
+        while not self._ending.is_set():
+            begun_s = self._clock.monotonic_s()
+            try:
+                await self._one_life()
+            except (ChannelBroken, OSError) as trouble:
+                log.error("the web process is ended", cause=str(trouble))
+            if self._ending.is_set():
+                return
+            pause_s = PAUSE_S if self._clock.monotonic_s() - begun_s > GOOD_LIFE_S else pause_s
+            self.restarts += 1
+            log.warning("the web process ended; starting it again", code=self._child and self._child.returncode, pause_s=pause_s)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(pause_s):
+                    await self._ending.wait()
+            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+    async def _one_life(self) -> None:
+        ours, theirs = socket.socketpair()
+        try:
+            self._up, self._heard_s = False, self._clock.monotonic_s()
+            self._child = await self._started(theirs)
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
+        wire = await Wire.over(ours)
+        tasks = [asyncio.create_task(work, name=f"web {name}") for name, work in self._works(wire)]
+        ending = asyncio.create_task(self._ending.wait(), name="web ending")
+        try:
+            wire.send(self._begin)
+            await asyncio.wait({*tasks, ending}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in (*tasks, ending):
+                task.cancel()
+            wire.close()
+            await self._end(self._child)
+        for task in tasks:
+            if task.done() and not task.cancelled():
+                task.result()
+
+    def _works(self, wire: Wire) -> list[tuple[str, Coroutine[None, None, None]]]:
+        show = [] if self._live is None else [("show", show_live(wire, self._live, self._clock))]
+        return [("tell", self._tell(wire)), ("hear", self._hear(wire)), *show]
+
+    async def _started(self, theirs: socket.socket) -> asyncio.subprocess.Process:
+        # Nothing secret on the command line; and in its environment neither the broker's password nor systemd's address.
+        env = {k: v for k, v in os.environ.items() if k in PASSED_ON or not (k.startswith("ABBE_") or k in WITHHELD)}
+        ends = (theirs.fileno(), self._listening.fileno())
+        words = (sys.executable, "-m", "service.web.process", *map(str, ends))
+        return await asyncio.create_subprocess_exec(*words, stdin=subprocess.DEVNULL, pass_fds=ends, env=env)
+
+    async def _end(self, child: asyncio.subprocess.Process) -> None:
+        """It has read the end of the channel, and ends by itself; one that does not is killed. It holds nothing that could be lost."""
+        if self._up:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(GOODBYE_S):
+                    await child.wait()
+        if child.returncode is None:
+            with suppress(ProcessLookupError):
+                child.kill()
+        await child.wait()
+
+    async def _tell(self, wire: Wire) -> None:
+        told: tuple[object, ...] | None = None
+        while True:
+            self._changed.clear()
+            if not wire.is_full:
+                jobs = self._book.seen()
+                if jobs != told:
+                    told = jobs
+                    wire.send(Jobs("jobs", jobs))
+                wire.send(self._moment(self.restarts))
+            silent_s = self._clock.monotonic_s() - self._heard_s
+            if silent_s > (HANG_S if self._up else START_S):
+                raise ChannelBroken(f"the web process has said nothing for {silent_s:.0f} s")
+            await asyncio.sleep(SHORTEST_S)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(PERIOD_S - SHORTEST_S):
+                    await self._changed.wait()
+
+    async def _hear(self, wire: Wire) -> None:
+        while (body := await wire.receive()) is not None:
+            message = from_web(body)
+            self._heard_s = self._clock.monotonic_s()
+            match message:
+                case Up(protocol=protocol):
+                    if protocol != PROTOCOL:
+                        raise ChannelBroken(f"the web process speaks version {protocol} of the channel, the core {PROTOCOL}")
+                    self._up = True
+                    log.info("page up", restarts=self.restarts)
+                case StartJob() | SteerJob() | DoneByHand() | RollBack() | PushNow():
+                    answer = await self._answered(message)
+                    wire.send(Jobs("jobs", self._book.seen()))  # first: who gets the number of a job can ask for it
+                    wire.send(answer)
+                case Alive():
+                    pass
+
+    async def _answered(self, message: Asked) -> Answer:
+        try:
+            match message:
+                case StartJob():
+                    return await self._book.start(message)
+                case SteerJob():
+                    return await self._book.steer(message)
+                case DoneByHand():
+                    return await self._book.done_by_hand(message)
+            if self._orders is None:
+                return Answer("answer", message.request, "conflict", "this service takes no orders of tables", "")
+            return await (self._orders.rollback(message) if isinstance(message, RollBack) else self._orders.push(message))
+        except AbbeError as error:  # the store does not answer: then nobody is known
+            return Answer("answer", message.request, "busy", str(error)[:1000], "")

@@ -1,0 +1,51 @@
+"""What a service looks for before its first check, and whenever a push was left open: runs cut off, a push that nobody has finished."""
+
+from __future__ import annotations
+
+import asyncio
+
+from service.capture.recovery import recover_segments
+from service.devices.alone import alone
+from service.devices.session import DeviceUrls, open_session
+from service.push.states import TERMINAL, State
+from service.site import Site
+from service.storage.store import Store
+from service.workflows.recover import recover
+
+
+async def recover_at_start(store: Store, site: Site) -> str | None:
+    """Take over interrupted runs; finish a push that is open, for which the controller is needed, and only for that.
+
+    Returns
+    -------
+    str or None
+        What was done; None if nothing was open.
+
+    Raises
+    ------
+    AbbeError, DriverError
+        As of `service.workflows.recover.recover`: the controller cannot be reached, or a person has to look.
+    """
+    runs = await asyncio.to_thread(recover_segments, store, site.capture)
+    told = [run.text for run in runs]
+    if await push_is_open(store, site.name):
+        with alone(site.urls.cnc):
+            async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
+                pushed = await recover(session.controller, store, site)
+        told += [pushed] if pushed else []
+    return "; ".join(told) or None
+
+
+async def push_is_open(store: Store, machine: str) -> bool:
+    """Whether the last push of a machine is on its way, waits for its way back, or needs a person: by its journal alone.
+
+    Raises
+    ------
+    StoreError
+        The database does not answer.
+    """
+    journal = await asyncio.to_thread(store.last_push, machine)
+    if not journal:
+        return False
+    state = State(journal[-1].state)
+    return state is State.OPERATOR or state not in TERMINAL
