@@ -22,6 +22,7 @@ LONGEST = timedelta(hours=12)
 TOUCH = timedelta(seconds=30)
 """A session's last use is written down no more often than this: a page that refreshes itself is not a write each time."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+DEVICE = re.compile(r"[0-9a-f]{32}\.[0-9a-f]{64}")
 TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 
 
@@ -147,8 +148,11 @@ class People:
         """End a session."""
         self._store.end_session(digest_of(secret))
 
-    def by_session(self, secret: str) -> Principal:
-        """Who has this secret; `NOBODY` if the session has ended, was idle or is too old, or its user is disabled."""
+    def by_session(self, secret: str, *, in_use: bool = True) -> Principal:
+        """Who has this secret; `NOBODY` if the session has ended, was idle or is too old, or its user is disabled.
+
+        ``in_use`` False: this question is no use of the session, it goes on being idle.
+        """
         digest = digest_of(secret)
         found = self._store.session(digest)
         if found is None:
@@ -158,10 +162,24 @@ class People:
         seen, begun = moment(session.seen_utc), moment(session.created_utc)
         if session.ended_utc is not None or user.disabled_utc is not None or now - seen > IDLE or now - begun > LONGEST:
             return NOBODY
-        if now - seen > TOUCH:
+        if in_use and now - seen > TOUCH:
             self._store.touch_session(session.id)
         role = Role(user.role)
         return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)
+
+    def device_of(self, name: str, cookie: str) -> str:
+        """Which browser this is, if this user has logged in with it since he has this password; else empty.
+
+        The cookie is not kept: its seal is made with the hash of the user's password, which leaves the database nowhere.
+        """
+        label, _, seal = cookie.partition(".")
+        user = self._store.user(name) if DEVICE.fullmatch(cookie) and NAME.fullmatch(name) else None
+        return label if user is not None and hmac.compare_digest(seal, _device_seal(user, label)) else ""
+
+    def new_device(self, user: UserRecord) -> str:
+        """A cookie by which a browser is known again when this user logs in with it."""
+        label = secrets.token_hex(16)
+        return f"{label}.{_device_seal(user, label)}"
 
     def add_token(self, name: str, title: str, scopes: list[str], days: float) -> str:
         """Make a token of a user; return its text, which is kept nowhere.
@@ -233,6 +251,11 @@ def role_of(text: str) -> Role:
         return Role(text)
     except ValueError:
         raise UserRefused(f"there is no role {text!r}", f"one of: {', '.join(Role)}") from None
+
+
+def _device_seal(user: UserRecord, label: str) -> str:
+    key = hashlib.sha256(b"abbe device " + user.password.encode()).digest()
+    return hmac.new(key, f"{user.name} {label}".encode(), hashlib.sha256).hexdigest()
 
 
 def digest_of(secret: str) -> str:

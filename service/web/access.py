@@ -23,6 +23,9 @@ class Open(Enum):
 
 Need = Permission | Open
 PUBLIC = Open.PUBLIC
+ACTIVE_HEADER = "X-Abbe-Active"
+REFRESHED = frozenset({"/api/v1/status", "/api/v1/live", "/api/v1/live/samples"})
+"""What pages ask again and again by themselves."""
 MOUNTS: dict[str, Need] = {"/static": PUBLIC}
 
 
@@ -42,6 +45,15 @@ def need_of(route: BaseRoute) -> Need | None:
         return MOUNTS.get(route.path)
     found = getattr(getattr(route, "endpoint", None), MARK, None)
     return found if isinstance(found, Permission | Open) else None
+
+
+def in_use(path: str, said: str | None) -> bool:
+    """Tell whether a request is a use of its session: one that a page makes by itself does not keep the session alive.
+
+    ``said``: the header ``X-Abbe-Active``, "1" if a person has touched the page since its last request, "0" if not. Without it
+    everything counts but what pages refresh.
+    """
+    return said == "1" if said is not None else path not in REFRESHED
 
 
 def cells(routes: Sequence[BaseRoute]) -> Iterator[tuple[str, str, Need | None]]:

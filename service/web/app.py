@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Sequence
-from typing import Annotated, Protocol
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Protocol
 
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse, JSONResponse, Response
@@ -11,15 +13,35 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from service.plant.facts import FactsSource
+from service.plant.gather import Gatherer
 from service.users.roles import Permission
 from service.web import problems
 from service.web.access import PUBLIC, needs
+from service.web.api.install import add_api
+from service.web.api.sources import Sources
+from service.web.api.table_orders import add_table_orders
+from service.web.core_line import CoreLine
+from service.web.document import complete
 from service.web.door import Door
+from service.web.frame import Framed
 from service.web.guard import Guard
 from service.web.headers import SecurityHeaders
+from service.web.jobs import add_jobs
+from service.web.live import add_live
 from service.web.login import add_login
+from service.web.metrics import Counted, add_metrics
+from service.web.mtconnect import add_mtconnect
 from service.web.page import HERE, ICON, environment, render
+from service.web.pages.live import add_live_page
+from service.web.pages.new import add_new_page
+from service.web.pages.plant_screens import add_plant_screens
+from service.web.pages.rehearsal import Rehearsals
+from service.web.pages.routes import add_pages
+from service.web.pages.table import add_table_screen
 from service.web.schemas import Health, Problem, Status, Verification, Verifications
+from service.web.silence import add_silence
+from service.workflows.report_parts import Rules
 
 PAGE_ROWS = 60
 
@@ -35,17 +57,71 @@ class Source(Protocol):
         """Return the latest checks, newest first."""
         ...
 
+    async def ready(self) -> None:
+        """Return if a check could be kept and shown now; raise what is wrong."""
+        ...
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What there is besides a page where there is a core: jobs, live events, metrics.
+
+    Parameters
+    ----------
+    core : CoreLine
+        The core.
+    store : Counted
+        What is counted.
+    machine : str
+        Name of the machine.
+    recipes : tuple of str
+        What can be started.
+    plans : Rehearsals
+        What can be run dry before.
+    campaigns : tuple of str
+        Those of the recipes that end with a proposal.
+    """
+
+    core: CoreLine
+    store: Counted
+    machine: str
+    recipes: tuple[str, ...]
+    plans: Rehearsals = field(default_factory=Rehearsals)
+    campaigns: tuple[str, ...] = ()
+
+
+def as_in_host_header(host: str) -> str:
+    """A name or address as browsers write it behind ``Host:``: IPv6 in brackets, in its shortest form."""
+    try:
+        address = ipaddress.ip_address(host.removeprefix("[").removesuffix("]"))
+    except ValueError:
+        return host
+    return f"[{address}]" if address.version == 6 else str(address)
+
 
 class Application(FastAPI):
     """FastAPI with our headers outside of everything: also the answer to a defect has them."""
 
+    behind_tls = False
+
     def build_middleware_stack(self) -> ASGIApp:
         """Return what answers."""
-        return SecurityHeaders(super().build_middleware_stack())
+        return SecurityHeaders(super().build_middleware_stack(), behind_tls=self.behind_tls)
+
+    def openapi(self) -> dict[str, Any]:
+        """The OpenAPI document, with what stands in front of all routes."""
+        return complete(super().openapi(), self.routes)
 
 
 def create_app(
-    source: Source, *, version: str, hosts: Sequence[str] = ("127.0.0.1", "localhost", "[::1]"), door: Door | None = None
+    source: Source,
+    *,
+    version: str,
+    hosts: Sequence[str] = ("127.0.0.1", "localhost", "[::1]"),
+    door: Door | None = None,
+    plant: FactsSource | None = None,
+    parts: Parts | None = None,
+    api: Sources | None = None,
 ) -> FastAPI:
     """Return the application.
 
@@ -59,22 +135,45 @@ def create_app(
         Names under which the page may be asked for: a foreign page must not reach it through a name of its own (DNS rebinding).
     door : Door, optional
         Users and audit; without it everybody may look, and nobody may change anything.
+    plant : FactsSource, optional
+        What MTConnect documents tell; without it what the status says.
+    parts : Parts, optional
+        The core, for jobs, live events and metrics.
+    api : Sources, optional
+        What the interface `/api/v1` reads; without it there is only what the page needs.
     """
     # FastAPI's own /docs loads its scripts from a CDN; plants have none.
     app = Application(title="Abbe", version=version, docs_url=None, redoc_url=None, openapi_url=None)
+    app.behind_tls = door is not None and door.behind_tls
     problems.install(app)
+    add_silence(app, environment())
     _add_routes(app, source)
+    add_mtconnect(app, plant or Gatherer(source.status))
+    if api is not None:
+        add_api(app, api)
     if door is not None:
         add_login(app, environment(), door)
+        add_pages(app, environment(), door, source, Rules() if api is None else api.rules)
+        add_live_page(app, environment(), door, source, parts.core.jobs if parts is not None else tuple)
+        add_new_page(app, environment(), door, source, parts.plans if parts is not None else Rehearsals())
+    if door is not None and api is not None:
+        add_plant_screens(app, environment(), door, source, api)
+        add_table_screen(app, environment(), door, source, api)
+    if parts is not None:
+        add_jobs(app, parts.core, parts.recipes, parts.campaigns)
+        add_table_orders(app, parts.core)
+        add_live(app, parts.core)
+        add_metrics(app, parts.store, parts.core, parts.machine)
     app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
+    app.add_middleware(Framed, routes=app.router.routes, behind_tls=app.behind_tls)  # inside of the guard: it knows who asks
     app.add_middleware(Guard, routes=app.router.routes, door=door)
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[as_in_host_header(host) for host in hosts])
     return app
 
 
 def _add_routes(app: FastAPI, source: Source) -> None:
     env = environment()
-    trouble: dict[int | str, dict[str, object]] = {503: {"model": Problem, "description": "The store does not answer"}}
+    trouble: dict[int | str, dict[str, object]] = {503: {"model": Problem, "description": "The store or the core does not answer"}}
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     @needs(Permission.READ)
@@ -112,6 +211,6 @@ def _add_routes(app: FastAPI, source: Source) -> None:
     @app.get("/readyz", responses=trouble)
     @needs(PUBLIC)
     async def readyz() -> Health:
-        """Answer if the store can be read: without it no check can be kept."""
-        await source.verifications(1)
+        """Answer if the store can be read, without which no check can be kept, and the core answers."""
+        await source.ready()
         return Health()

@@ -1,4 +1,4 @@
-"""What the page knows of the moment: the running check, the devices, the broker. Kept in memory; results live in the store."""
+"""What the core knows of the moment: the running check, the devices, the broker. Kept in memory; results live in the store."""
 
 from __future__ import annotations
 
@@ -29,6 +29,8 @@ class Board:
         self.devices = [Device(role=role, url=url, state="not used yet") for role, url in devices.items()]
         self.job: Job | None = None
         self.mqtt_connected = False
+        self.mqtt_dropped = 0
+        self.attention: list[str] = []
         self.changes = 0
 
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
@@ -42,6 +44,8 @@ class Board:
         """Note how far it is."""
         if self.job is not None:
             now = {name: getattr(progress, name) for name in ("stage", "message", "done", "total", "eta_s")}
+            if progress.place is not None:
+                now |= {name: getattr(progress.place, name) for name in ("step", "steps", "points")}
             self.job = self.job.model_copy(update=now)
 
     def job_ended(self, doc: Doc | None) -> None:
@@ -60,8 +64,17 @@ class Board:
             return device
         return device.model_copy(update={"state": "fault", "at_utc": self._clock.utc(), "text": cause["what"]})
 
+    def changed(self) -> None:
+        """Note that something else has changed, such as what needs a person."""
+        self.changes += 1
+
     def broker(self, connected: bool) -> None:
         """Note whether the broker is there."""
         if connected != self.mqtt_connected:
             self.changes += 1
             self.mqtt_connected = connected
+
+    def messages_dropped(self, count: int) -> None:
+        """Note that waiting messages were dropped, because the broker was away for too long."""
+        self.changes += 1
+        self.mqtt_dropped += count

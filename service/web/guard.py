@@ -5,7 +5,6 @@ from __future__ import annotations
 import hmac
 from collections.abc import Sequence
 from dataclasses import dataclass
-from urllib.parse import urlsplit
 
 from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse, Response
@@ -15,8 +14,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.audit.chain import Event
 from service.errors import AbbeError
 from service.users.people import NOBODY, ONLOOKER, Principal
-from service.web.access import MUTATING, PUBLIC, Need, need_of, route_of
-from service.web.door import COOKIE, SECURE_COOKIE, Door, csrf_token
+from service.web.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
+from service.web.door import Door, csrf_token
+from service.web.origin import address_of, is_ours, is_tls
 from service.web.problems import problem
 
 CSRF_HEADER = "X-CSRF-Token"
@@ -24,13 +24,15 @@ CSRF_HEADER = "X-CSRF-Token"
 
 @dataclass
 class Visit:
-    """What is known of a request; handlers find it in ``request.state.visit``. ``target``, ``who``: for the record, if they know better."""
+    """What is known of a request; handlers find it in ``request.state.visit``. ``target``, ``who``: for the record, if they know better.
+    ``replayed``: the answer was given before, and nothing was done again."""
 
     principal: Principal
     address: str
     secret: str = ""
     target: str = ""
     who: str = ""
+    replayed: bool = False
 
 
 class Guard:
@@ -48,6 +50,7 @@ class Guard:
 
     def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute], door: Door | None) -> None:
         self._app, self._routes, self._door = app, routes, door
+        self._behind_tls = door is not None and door.behind_tls
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let pass, or answer."""
@@ -55,7 +58,7 @@ class Guard:
             await self._app(scope, receive, send)
             return
         request = HTTPConnection(scope)
-        address = request.client.host if request.client else ""
+        address = address_of(request, behind_tls=self._behind_tls)
         if self._door is not None and not self._door.requests.take(address):
             await _answer(problem(429, "too many requests from this address", headers={"Retry-After": "1"}), scope, receive, send)
             return
@@ -82,44 +85,93 @@ class Guard:
         if need is None:
             return problem(403, "nobody has said who may do this")
         bearer = _bearer(request)
-        secret = request.cookies.get(SECURE_COOKIE if _is_tls(request) else COOKIE)
+        tls = is_tls(request, behind_tls=self._behind_tls)
+        secret = None if self._door is None else request.cookies.get(self._door.cookie(tls=tls))
         if need is not PUBLIC or (changes and secret):
-            visit.principal = ONLOOKER if self._door is None else await self._door.who(bearer, secret)
+            used = changes or in_use(request.url.path, request.headers.get(ACTIVE_HEADER))
+            visit.principal = ONLOOKER if self._door is None else await self._door.who(bearer, secret, in_use=used)
         visit.secret = (secret or "") if visit.principal.by == "session" else ""
         if need is not PUBLIC and (missing := _missing(request, need, visit.principal, changes=changes)) is not None:
             return missing
         if changes or request.scope["type"] == "websocket":
-            return _foreign(request, visit, need, changes=changes)
+            return self._foreign(request, visit, need, changes=changes)
+        return None
+
+    def _foreign(self, request: HTTPConnection, visit: Visit, need: Need, *, changes: bool) -> Response | None:
+        """Whether another site's page sends this. A browser always says where from; a program with a token has no cookie to be misused."""
+        origin = request.headers.get("origin")
+        by_token = visit.principal.by == "token"
+        if not (origin is None and by_token) and not is_ours(request, origin, behind_tls=self._behind_tls):
+            return problem(403, "this came from another page than ours (Origin)")
+        if changes and need is not PUBLIC and not by_token:
+            sent = request.headers.get(CSRF_HEADER, "")
+            if not hmac.compare_digest(sent.encode(), csrf_token(visit.secret).encode()):
+                return problem(403, f"the header {CSRF_HEADER} is missing or not of this session")
         return None
 
     async def _recorded(
         self, door: Door, route: BaseRoute, visit: Visit, refused: Response | None, call: tuple[Scope, Receive, Send]
     ) -> None:
-        """Answer, with a record of it on disk before the answer leaves; without one the answer is that something is wrong."""
+        """Answer, with a record of it on disk before the answer leaves. What could not be recorded is not begun."""
         scope, receive, send = call
-        action, unrecorded = f"{scope['method']} {getattr(route, 'path', '')}", False
+        log = _Log(door, visit, f"{scope['method']} {getattr(route, 'path', '')}", scope["path"], refused=refused is not None)
+        if refused is None:
+            try:
+                await door.ready()
+            except AbbeError as error:
+                await problem(503, f"not done, since it could not be recorded: {error.detail}", error.code, {"Retry-After": "5"})(*call)
+                return
 
         async def record_first(message: Message) -> None:
-            nonlocal unrecorded
             if message["type"] == "http.response.start":
                 try:
-                    await self._record(door, action, visit, scope["path"], int(message["status"]))
+                    await log.answered(int(message["status"]))
                 except AbbeError as error:
-                    unrecorded = True
-                    await problem(503, error.detail, error.code, {"Retry-After": "5"})(scope, receive, send)
-            if not unrecorded:
+                    log.unrecorded = True
+                    await problem(503, error.detail, error.code, {"Retry-After": "5"})(*call)
+            if not log.unrecorded:
                 await send(message)
 
-        if refused is not None:
-            await _answer(refused, scope, receive, record_first)
-        else:
-            await self._app(scope, receive, record_first)
+        try:
+            await (self._app if refused is None else refused)(scope, receive, record_first)
+        except BaseException as error:
+            await log.broken(error)
+            raise
 
-    async def _record(self, door: Door, action: str, visit: Visit, path: str, status: int) -> None:
-        if status == 429 or (status >= 400 and not door.noise.take(visit.address)):
+
+@dataclass
+class _Log:
+    """The record of one changing request, however it ends."""
+
+    door: Door
+    visit: Visit
+    action: str
+    path: str
+    refused: bool
+    written: bool = False
+    unrecorded: bool = False
+
+    async def answered(self, status: int) -> None:
+        """Record how it was answered. Refusals of one address are not all recorded; what may have changed something always is."""
+        if status == 429 or (status >= 400 and (status < 500 or self.refused) and not self.door.noise.take(self.visit.address)):
             return
-        outcome = f"done {status}" if status < 400 else f"refused {status}"
-        await door.record(Event(visit.who or visit.principal.name, action, visit.target or path, outcome, {"address": visit.address}))
+        kind = "replayed" if self.visit.replayed else "done" if status < 400 else "refused" if status < 500 or self.refused else "failed"
+        await self._write(f"{kind} {status}")
+
+    async def broken(self, error: BaseException) -> None:
+        """Record that it ended in a defect, or was broken off; what that was is told by the service's log."""
+        if self.unrecorded:
+            return
+        try:
+            await self._write(f"failed: {type(error).__name__}" + (" after the answer had begun" if self.written else ""))
+        except AbbeError as trouble:
+            error.add_note(f"not recorded: {trouble}")
+
+    async def _write(self, outcome: str) -> None:
+        visit = self.visit
+        event = Event(visit.who or visit.principal.name, self.action, visit.target or self.path, outcome, {"address": visit.address})
+        await self.door.record(event)
+        self.written = True
 
 
 def _missing(request: HTTPConnection, need: Need, principal: Principal, *, changes: bool) -> Response | None:
@@ -131,34 +183,6 @@ def _missing(request: HTTPConnection, need: Need, principal: Principal, *, chang
     if need not in principal.permissions:
         return problem(403, f"a {principal.role} may not do this: it needs {need.value!r}")
     return None
-
-
-def _foreign(request: HTTPConnection, visit: Visit, need: Need, *, changes: bool) -> Response | None:
-    """Whether another site's page sends this. A browser always says where from; a program with a token has no cookie to be misused."""
-    origin = request.headers.get("origin")
-    by_token = visit.principal.by == "token"
-    if not (origin is None and by_token) and not _is_ours(request, origin):
-        return problem(403, "this came from another page than ours (Origin)")
-    if changes and need is not PUBLIC and not by_token:
-        sent = request.headers.get(CSRF_HEADER, "")
-        if not hmac.compare_digest(sent.encode(), csrf_token(visit.secret).encode()):
-            return problem(403, f"the header {CSRF_HEADER} is missing or not of this session")
-    return None
-
-
-def _is_ours(request: HTTPConnection, origin: str | None) -> bool:
-    if request.headers.get("sec-fetch-site", "same-origin") not in {"same-origin", "none"}:
-        return False
-    try:
-        parts = urlsplit(origin or "")
-    except ValueError:
-        return False
-    schemes = {"https"} if _is_tls(request) else {"http", "https"}  # a reverse proxy may have taken the TLS off
-    return parts.scheme in schemes and bool(parts.netloc) and parts.netloc.lower() == request.headers.get("host", "").lower()
-
-
-def _is_tls(request: HTTPConnection) -> bool:
-    return request.scope.get("scheme") in {"https", "wss"}
 
 
 def _bearer(request: HTTPConnection) -> str | None:

@@ -10,16 +10,22 @@ from urllib.parse import parse_qs
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
+from starlette.requests import ClientDisconnect
 
+from service.users.lockout import Came
 from service.users.roles import Permission
 from service.web.access import PUBLIC, needs
-from service.web.door import COOKIE, SECURE_COOKIE, Door, csrf_token
+from service.web.door import Door, csrf_token
 from service.web.guard import Visit
+from service.web.listening import is_local
+from service.web.origin import is_tls
 from service.web.problems import problem
 from service.web.schemas import Problem
 from service.web.schemas_people import AuditEntry, AuditList, Me, User, Users
 
 LONGEST_FORM = 4096
+DEVICE_S = 90 * 86_400
+"""So long a browser is known again; what that is good for stands in `service/users/lockout.py`."""
 
 
 def add_login(app: FastAPI, env: Environment, door: Door) -> None:
@@ -40,23 +46,27 @@ def add_login(app: FastAPI, env: Environment, door: Door) -> None:
         visit: Visit = request.state.visit
         fields = await _form(request)
         if fields is None:
-            return problem(413, "a login is a short form")
+            return problem(413, "a login is a short form of two fields")
         name, password = fields.get("name", ""), fields.get("password", "")
         visit.target = "unknown user"
-        wait_s = door.lockout.wait_s(name, visit.address)
+        came = await asyncio.to_thread(_came, door, request, name)
+        wait_s = door.lockout.wait_s(name, came)
         if wait_s > 0:
             return page(429, f"Too many tries. Wait {ceil(wait_s)} s.", wait_s)
         # Counted before the password is looked at: tries that come together must not all see a free account.
-        wait_s = door.lockout.failed(name, visit.address)
+        wait_s = door.lockout.failed(name, came)
         user = await asyncio.to_thread(door.people.check, name, password)
         visit.target = name if await asyncio.to_thread(door.people.known, name) else "unknown user"
         if user is None:
             return page(401, "Name or password is wrong." + (f" Next try in {ceil(wait_s)} s." if wait_s else ""))
-        door.lockout.succeeded(name, visit.address)
+        door.lockout.succeeded(name, came)
         visit.who = f"user:{user.name}"
         secret = await asyncio.to_thread(door.people.begin, user, visit.secret)
         answer = RedirectResponse("/", 303)
-        _set_cookie(request, answer, secret)
+        _set_cookie(door, request, answer, secret)
+        if not came.device:
+            made, tls = await asyncio.to_thread(door.people.new_device, user), is_tls(request, behind_tls=door.behind_tls)
+            answer.set_cookie(door.device_cookie(), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
         return answer
 
     @app.post("/logout", include_in_schema=False)
@@ -66,7 +76,7 @@ def add_login(app: FastAPI, env: Environment, door: Door) -> None:
         if visit.secret:
             await asyncio.to_thread(door.people.end, visit.secret)
         answer = RedirectResponse("/login", 303)
-        _set_cookie(request, answer, "")
+        _set_cookie(door, request, answer, "")
         return answer
 
     _add_reading(app, door)
@@ -106,17 +116,26 @@ def _add_reading(app: FastAPI, door: Door) -> None:
 
 
 async def _form(request: Request) -> dict[str, str] | None:
-    """Fields of a short form; None: it is too long."""
+    """Fields of a short form; None: it is too long, has too many fields, or did not come to its end."""
     body = b""
-    async for piece in request.stream():
-        body += piece
-        if len(body) > LONGEST_FORM:
-            return None
-    return {key: values[0] for key, values in parse_qs(body.decode("utf-8", "replace"), max_num_fields=8).items()}
+    try:
+        async for piece in request.stream():
+            body += piece
+            if len(body) > LONGEST_FORM:
+                return None
+        return {key: values[0] for key, values in parse_qs(body.decode("utf-8", "replace"), max_num_fields=8).items()}
+    except (ValueError, ClientDisconnect):
+        return None
 
 
-def _set_cookie(request: Request, answer: Response, secret: str) -> None:
+def _came(door: Door, request: Request, name: str) -> Came:
+    visit: Visit = request.state.visit
+    device = door.people.device_of(name, request.cookies.get(door.device_cookie(), ""))
+    return Came(visit.address, device, here=is_local(visit.address) and not door.behind_tls)
+
+
+def _set_cookie(door: Door, request: Request, answer: Response, secret: str) -> None:
     """The cookie dies with the browser; how long the session lasts is decided here, not there."""
-    tls = request.url.scheme == "https"
+    tls = is_tls(request, behind_tls=door.behind_tls)
     age = None if secret else 0
-    answer.set_cookie(SECURE_COOKIE if tls else COOKIE, secret, max_age=age, path="/", httponly=True, samesite="strict", secure=tls)
+    answer.set_cookie(door.cookie(tls=tls), secret, max_age=age, path="/", httponly=True, samesite="strict", secure=tls)

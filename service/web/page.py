@@ -10,9 +10,11 @@ from zoneinfo import ZoneInfo
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.web import words
+from service.web import language, words
+from service.web.frame import current, template_words
 from service.web.schemas import Status, Verification
 from service.web.trend import Point, trend_svg
+from service.web.units import converted
 
 HERE = Path(__file__).parent
 MARKS = {"pass": "✔", "fail": "✖", "cannot tell": "◐"}
@@ -30,13 +32,19 @@ def environment() -> Environment:
         loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     env.filters["number"] = words.number
-    env.filters["span"] = words.span
+    env.filters["length"] = lambda value, unit="µm", decimals=None: current().length(value, unit, decimals)
+    env.filters["lengths"] = _lengths
+    env.filters["span"] = lambda seconds: language.span(current().lang, seconds)
+    # Pictures come from our own SVG writer, which has escaped every text; escaping again would show the reader the tags.
+    env.filters["picture"] = Markup
+    env.globals |= template_words()
     return env
 
 
 def render(env: Environment, status: Status, past: Sequence[Verification]) -> str:
     """Return the page."""
     zone: tzinfo = ZoneInfo(status.next_due[0].timezone) if status.next_due else UTC
+    lang = current().lang
     return env.get_template("page.html").render(
         status=status,
         past=past,
@@ -46,9 +54,12 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
         trends=trends(past, zone),
         marks=MARKS,
         zone=zone,
-        name=words.figure_name,
+        machine=status.machine,
+        name=lambda key: _named(lang, key),
+        measured=lambda value, key: current().length(value, language.figure(lang, key)[1]),
         stamp=lambda moment: words.stamp(moment, zone),
-        ago=lambda moment: words.ago(moment, status.now_utc),
+        ago=lambda moment: language.ago(lang, moment, status.now_utc),
+        due_words=lambda one: language.due(lang, one.due_utc, status.now_utc),
     )
 
 
@@ -62,15 +73,31 @@ def trends(past: Sequence[Verification], zone: tzinfo) -> list[Markup]:
     """Return a plot for each figure."""
     plots = []
     for key in figures(past):
-        name, unit = words.figure_name(key)
-        points = [
-            Point(check.started_utc, value, check.uncertainties.get(key) or 0.0, check.limits.get(key), figure_verdict(check, key))
-            for check in past
-            if (value := check.values.get(key)) is not None
-        ]
+        name, unit = language.figure(current().lang, key)
+        points = [point for check in past if (point := _point(check, key, unit)) is not None]
         if points:
-            plots.append(Markup(trend_svg(name, unit, points, zone)))  # noqa: S704 - our own writer, which escapes
+            plots.append(Markup(trend_svg(name, current().unit(unit), points, zone)))  # noqa: S704 - our own writer, which escapes
     return plots
+
+
+def _lengths(rows: Sequence[Sequence[str]], *at: int) -> list[list[str]]:
+    """Rows of a table whose cells at these places are µm, in the reader's unit."""
+    return [[current().length(cell) if k in at else cell for k, cell in enumerate(row)] for row in rows]
+
+
+def _named(lang: str, key: str) -> tuple[str, str]:
+    name, unit = language.figure(lang, key)
+    return name, current().unit(unit)
+
+
+def _point(check: Verification, key: str, unit: str) -> Point | None:
+    """A figure of a check in the reader's unit; None: it has none."""
+    value, limit, system = check.values.get(key), check.limits.get(key), current().units
+    if value is None:
+        return None
+    u = converted(check.uncertainties.get(key) or 0.0, unit, system)
+    line = None if limit is None else converted(limit, unit, system)
+    return Point(check.started_utc, converted(value, unit, system), u, line, figure_verdict(check, key))
 
 
 def figure_verdict(check: Verification, key: str) -> str:

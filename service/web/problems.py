@@ -1,4 +1,4 @@
-"""Errors as application/problem+json, mapped here and nowhere else."""
+"""Errors as application/problem+json, mapped here and nowhere else; codes and statuses are those of the catalogue."""
 
 from __future__ import annotations
 
@@ -8,17 +8,31 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
-from service.errors import AbbeError, StoreError
+from service.errors import AbbeError
+from service.web.catalogue import DEFECT, HTTP, status_of
 from service.web.schemas import Problem
 
 MEDIA_TYPE = "application/problem+json"
+LONGEST = 1000
+"""Characters of a detail: it may repeat what was sent."""
 
 
 def problem(status: int, detail: str, code: str = "", headers: dict[str, str] | None = None) -> JSONResponse:
-    """Return an RFC 9457 response."""
-    body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, code=code)
+    """Return an RFC 9457 response; without a code it is the status's own."""
+    code = code or HTTP.get(status, (f"WEB-{status}", ""))[0]
+    # Halves of characters can be sent in JSON and cannot be answered in UTF-8.
+    plain = detail[:LONGEST].encode("utf-8", "backslashreplace").decode("utf-8")
+    body = Problem(type=f"urn:abbe:error:{code}", title=HTTPStatus(status).phrase, status=status, detail=plain, code=code)
     return JSONResponse(body.model_dump(), status, headers=headers, media_type=MEDIA_TYPE)
+
+
+def problem_of(error: AbbeError) -> JSONResponse:
+    """The response to an error of ours."""
+    status = status_of(type(error))
+    detail = error.detail + (f" - {error.remedy}" if error.remedy and status != 503 else "")
+    return problem(status, detail, error.code, {"Retry-After": "5"} if status == 503 else None)
 
 
 async def _http(_: Request, error: Exception) -> JSONResponse:
@@ -26,28 +40,34 @@ async def _http(_: Request, error: Exception) -> JSONResponse:
     return problem(error.status_code, str(error.detail), headers=dict(error.headers or {}))
 
 
+async def _gone(_: Request, error: Exception) -> JSONResponse:
+    # Nobody reads it; without it a visitor who goes away, or was too slow, would be a defect of ours in the log.
+    assert isinstance(error, ClientDisconnect)
+    return problem(400, "the request did not come to its end")
+
+
 async def _invalid(_: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return problem(422, f"{where}: {first['msg']}")
+    where = ".".join(str(part)[:100] for part in first["loc"])
+    # What cannot be the number of anything is not there, as one that nothing has.
+    return problem(404 if first["loc"][0] == "path" else 422, f"{where}: {first['msg']}")
 
 
 async def _abbe(_: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, AbbeError)
-    if isinstance(error, StoreError):
-        return problem(503, error.detail, error.code, {"Retry-After": "5"})
-    return problem(500, error.detail, error.code)
+    return problem_of(error)
 
 
 async def _defect(_: Request, error: Exception) -> JSONResponse:
     # The traceback goes to the log (the server re-raises); a client has no use for our insides.
-    return problem(500, f"{type(error).__name__}: a defect of this program; see the service's log", "ABB-001")
+    return problem(500, f"{type(error).__name__}: a defect of this program; see the service's log", DEFECT)
 
 
 def install(app: FastAPI) -> None:
     """Answer every kind of error with a problem document."""
     app.add_exception_handler(HTTPException, _http)
     app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(ClientDisconnect, _gone)
     app.add_exception_handler(AbbeError, _abbe)
     app.add_exception_handler(Exception, _defect)

@@ -52,16 +52,23 @@ class Device(_Answer):
 
 
 class Job(_Answer):
-    """The check that runs now."""
+    """The check that runs now. ``prompt``: number of what a person is asked to do, ``ask``: what that is; 0: nothing."""
 
     schedule: str
     recipe: str
     since_utc: datetime
+    id: str = ""
+    state: str = "running"
     stage: str = ""
     message: str = ""
     done: float = 0.0
     total: float = 0.0
     eta_s: float | None = None
+    step: int = 0
+    steps: int = 0
+    points: int = 0
+    prompt: int = 0
+    ask: str = ""
 
 
 class Due(_Answer):
@@ -82,10 +89,28 @@ class Mqtt(_Answer):
     broker: str = ""
     connected: bool = False
     waiting: int = 0
+    dropped: int = 0
+
+
+class Alarm(_Answer):
+    """An alarm that is active, or that nobody has acknowledged. ``signals``: figures behind it; ``outcome``: what was done so far."""
+
+    alarm: int
+    state: Literal["raised", "acknowledged", "cleared"]
+    recipe: str
+    schedule: str
+    text: str
+    signals: list[dict[str, str | float | None]]
+    raised_utc: datetime
+    acknowledged_by: str = ""
+    cleared_utc: datetime | None = None
+    outcome: str = ""
+    proposal: int | None = None
 
 
 class Status(_Answer):
-    """Everything the page shows. ``revision`` changes when more than the progress of a running check has changed."""
+    """Everything the page shows. ``revision`` changes when more than the progress of a running check has changed; ``attention``: what needs
+    a person now."""
 
     machine: str
     version: str
@@ -95,7 +120,9 @@ class Status(_Answer):
     devices: list[Device]
     next_due: list[Due]
     mqtt: Mqtt
+    alarms: Annotated[list[Alarm], Field(default_factory=list)]
     last: list[Verification]
+    attention: Annotated[list[str], Field(default_factory=list)]
 
 
 class Verifications(_Answer):

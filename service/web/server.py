@@ -1,30 +1,56 @@
-"""The web server inside our own event loop: our socket, our signals, our end."""
+"""The web server inside the event loop of the web process: the core's socket, our signals, our end."""
 
 from __future__ import annotations
 
-import ipaddress
+import asyncio
 import socket
-import ssl
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import uvicorn
 from fastapi import FastAPI
 
-from service.errors import ConfigError
+from service.web.connections import PatientProtocol
+
+HANDSHAKE_S = 10.0
+LONGEST_WORD_B = 1024
+"""A client of a WebSocket has nothing to say; what is longer ends the connection."""
 
 
 class Server(uvicorn.Server):
-    """uvicorn that leaves the signals alone: the service stops its parts in its own order."""
+    """uvicorn that leaves the signals alone: the service stops its parts in its own order. ``answers`` is set when it serves."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self.answers = asyncio.Event()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Capture none."""
         yield
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer, and say so."""
+        await self._listen(sockets)
+        self.answers.set()
+
+    async def _listen(self, sockets: list[socket.socket] | None) -> None:
+        """Begin to listen. A visitor who never ends his TLS handshake is let go sooner than after asyncio's minute."""
+        if self.config.ssl is None or sockets is None:
+            await super().startup(sockets)
+            return
+        await super().startup([])  # all but the listening: uvicorn cannot be told how long a handshake may take
+
+        def protocol() -> asyncio.Protocol:
+            return PatientProtocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
+
+        loop, tls = asyncio.get_running_loop(), self.config.ssl
+        for listening in sockets:
+            self.servers.append(await loop.create_server(protocol, sock=listening, ssl=tls, ssl_handshake_timeout=HANDSHAKE_S))
+
 
 def make_server(app: FastAPI, certificate: str = "", key: str = "") -> Server:
-    """Return a server for ``app``; run it with ``await server.serve(sockets=[bind(...)])``, end it with ``should_exit``.
+    """Return a server for ``app``; run it with ``await server.serve(sockets=[...])``, end it with ``should_exit``.
 
     Parameters
     ----------
@@ -41,85 +67,17 @@ def make_server(app: FastAPI, certificate: str = "", key: str = "") -> Server:
             log_config=None,
             access_log=False,
             lifespan="off",
-            http="h11",
-            ws="none",
+            http=PatientProtocol,
+            ws="websockets-sansio",
+            ws_max_size=LONGEST_WORD_B,
+            ws_ping_interval=20.0,
+            ws_ping_timeout=20.0,
+            ws_per_message_deflate=False,
             server_header=False,
             proxy_headers=False,
             timeout_keep_alive=5,
             timeout_graceful_shutdown=1,
-            limit_concurrency=100,
+            # How many are connected and at work at the same time is the protocol's business: uvicorn counts who says nothing, too.
+            limit_concurrency=None,
         )
     )
-
-
-def check_certificate(certificate: str, key: str) -> None:
-    """Refuse a certificate that cannot be used; nothing happens without one.
-
-    Raises
-    ------
-    ConfigError
-        Certificate or key cannot be read, or do not belong together.
-    """
-    if not certificate:
-        return
-    try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
-    except OSError as trouble:  # ssl.SSLError is one
-        why = trouble.strerror or str(trouble)
-        raise ConfigError(f"[web] certificate {certificate}, key {key}: {why}", "give a PEM certificate and its key") from None
-
-
-def check_exposure(host: str, users: Callable[[], int], *, tls: bool) -> None:
-    """Refuse to be reached from other computers without users and encryption.
-
-    Parameters
-    ----------
-    host : str
-        Address to listen on.
-    users : callable
-        How many may log in; asked only if it matters.
-    tls : bool
-        Whether a certificate is configured.
-
-    Raises
-    ------
-    ConfigError
-        What is missing.
-    """
-    if is_loopback(host):
-        return
-    if users() == 0:
-        raise ConfigError(
-            f"[web] host {host!r} can be reached from other computers, and there is no user",
-            "add one first (abbe user add NAME admin), or use 127.0.0.1",
-        )
-    if not tls:
-        raise ConfigError(
-            f"[web] host {host!r} can be reached from other computers, and passwords would cross the network in clear",
-            "give certificate and key under [web], or use 127.0.0.1 behind a reverse proxy with TLS",
-        )
-
-
-def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket. Whether it may listen there is `check_exposure`'s to say, before.
-
-    Raises
-    ------
-    ConfigError
-        Somebody else has the port, or the address is not this computer's.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family, backlog=64)
-    except OSError as trouble:
-        raise ConfigError(
-            f"[web] cannot listen on {host} port {port}: {trouble.strerror}", "is another service running? choose another with --port"
-        ) from trouble
-
-
-def is_loopback(host: str) -> bool:
-    """Tell whether an address can be reached from this computer only."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

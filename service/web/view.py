@@ -10,10 +10,11 @@ from zoneinfo import ZoneInfo
 
 from service.clock import Clock
 from service.scheduler.slots import Schedule, cron_in_words
-from service.storage.records import VerificationRecord
+from service.storage.records import AlarmEntryRecord, VerificationRecord
 from service.web import words
-from service.web.board import Board
-from service.web.schemas import Due, Mqtt, Status, Verification
+from service.web.schemas import Alarm, Device, Due, Job, Mqtt, Status, Verification
+from service.workflows.alarm_states import folded, is_open
+from service.workflows.alarms import alarm_doc
 
 
 class Archive(Protocol):
@@ -23,8 +24,50 @@ class Archive(Protocol):
         """Return the latest checks, newest first."""
         ...
 
+    def alarm_entries(self, machine: str) -> list[AlarmEntryRecord]:
+        """Return everything about a machine's alarms."""
+        ...
+
+    def newest_slot(self, schedules: Sequence[str]) -> str:
+        """Return which slot of these schedules was taken last, and how it stands."""
+        ...
+
     def waiting_messages(self) -> int:
         """Return how many messages wait for the broker."""
+        ...
+
+
+class Standing(Protocol):
+    """How things stand now. All of it raises CoreSilent while nobody knows."""
+
+    @property
+    def devices(self) -> list[Device]:
+        """The devices, and when they were last heard of."""
+        ...
+
+    @property
+    def job(self) -> Job | None:
+        """The check that runs."""
+        ...
+
+    @property
+    def changes(self) -> int:
+        """Grows when more than the progress of a check has changed."""
+        ...
+
+    @property
+    def mqtt_connected(self) -> bool:
+        """Whether the broker is there."""
+        ...
+
+    @property
+    def mqtt_dropped(self) -> int:
+        """Alarms that were dropped because too many waited for the broker."""
+        ...
+
+    @property
+    def attention(self) -> list[str]:
+        """What needs a person now."""
         ...
 
 
@@ -37,7 +80,7 @@ class View:
         Name of the machine.
     version : str
         Version of this program.
-    board : Board
+    board : Standing
         The moment.
     archive : Archive
         The past.
@@ -53,7 +96,7 @@ class View:
         self,
         machine: str,
         version: str,
-        board: Board,
+        board: Standing,
         archive: Archive,
         next_due: Callable[[], Sequence[tuple[Schedule, datetime]]],
         broker: str,
@@ -87,24 +130,38 @@ class View:
             for row in rows
         ]
 
+    async def ready(self) -> None:
+        """Return if the store can be read and the core has said lately how things stand; else raise what is wrong."""
+        await self.verifications(1)
+        _ = self._board.changes
+
     async def status(self) -> Status:
         """Return everything the page shows."""
         last = await self.verifications(10)
         mqtt = Mqtt(configured=False)
         if self._broker:
             waiting = await asyncio.to_thread(self._archive.waiting_messages)
-            mqtt = Mqtt(configured=True, broker=self._broker, connected=self._board.mqtt_connected, waiting=waiting)
+            board = self._board
+            mqtt = Mqtt(configured=True, broker=self._broker, connected=board.mqtt_connected, waiting=waiting, dropped=board.mqtt_dropped)
         now = self._clock.utc()
+        entries = await asyncio.to_thread(self._archive.alarm_entries, self._machine)
+        upcoming = self._next_due()
+        # A slot that was skipped leaves no check and may leave no alarm: without it an open page would go on as if it had not been due.
+        slot = await asyncio.to_thread(self._archive.newest_slot, [f"{self._machine}/{schedule.name}" for schedule, _ in upcoming])
+        job = self._board.job
+        asked = 0 if job is None else job.prompt
         return Status(
             machine=self._machine,
             version=self._version,
             now_utc=now,
-            revision=f"{last[0].id if last else 0}.{self._board.changes}",
-            job=self._board.job,
+            revision=f"{last[0].id if last else 0}.{self._board.changes}.{len(entries)}.{asked}.{slot}",
+            job=job,
             devices=self._board.devices,
-            next_due=[_due(schedule, slot, now) for schedule, slot in self._next_due()],
+            next_due=[_due(schedule, slot_utc, now) for schedule, slot_utc in upcoming],
             mqtt=mqtt,
+            alarms=[Alarm.model_validate(alarm_doc(one)) for one in reversed(folded(entries)) if is_open(one)],
             last=last,
+            attention=self._board.attention,
         )
 
 

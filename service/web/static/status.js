@@ -1,23 +1,50 @@
-// Refreshes the page: what moves every 2 s from the JSON, everything else from the server when the revision changes.
+// Tells whether the service still answers, on every screen. Refreshes the home page: what moves every 2 s from the JSON, everything else from
+// the server when the revision changes. Other screens are not replaced: somebody may be reading or filling in a form.
 
 const PERIOD_MS = 2000;
 const PATIENCE_MS = 5000;
 
 const banner = document.getElementById("lost");
+const words = JSON.parse(document.body.dataset.words);
+// Whether a person has touched the page since it was last refreshed: only that keeps the session alive.
+let touched = false;
+for (const kind of ["pointerdown", "keydown", "wheel"]) addEventListener(kind, () => { touched = true; }, { passive: true });
 let revision = document.getElementById("content").dataset.revision;
+const refreshes = revision !== undefined;
 
 function setText(id, text) {
   const element = document.getElementById(id);
   if (element && element.textContent !== text) element.textContent = text;
 }
 
+function filled(key, name, value) {
+  return words[key].replace(`{${name}}`, value);
+}
+
+function span(seconds) {
+  const s = Math.abs(seconds);
+  if (s < 90) return filled("span.s", "n", Math.round(s));
+  if (s < 5400) return filled("span.min", "n", Math.round(s / 60));
+  if (s < 129600) return filled("span.h", "n", Math.round(s / 3600));
+  return filled("span.days", "n", Math.round(s / 86400));
+}
+
 function left(seconds) {
-  if (seconds === null) return "time left not known yet";
-  return seconds < 90 ? `${Math.round(seconds)} s left` : `${Math.round(seconds / 60)} min left`;
+  return seconds === null ? words["job.unknown"] : filled("job.left", "span", span(seconds));
 }
 
 function showMoment(status) {
-  for (const [index, due] of status.next_due.entries()) setText(`due-${index}`, due.words);
+  const now = Date.parse(status.now_utc);
+  for (const element of document.querySelectorAll("[data-until]")) {
+    const seconds = (Date.parse(element.dataset.until) - now) / 1000;
+    const text = seconds > 0 ? filled("due.in", "span", span(seconds)) : words["due.now"];
+    if (element.textContent !== text) element.textContent = text;
+  }
+  // Only where what the age is of is fetched anew as well: an age that grows beside an old time would be wrong.
+  for (const element of refreshes ? document.querySelectorAll("[data-since]") : []) {
+    const text = filled("ago", "span", span((now - Date.parse(element.dataset.since)) / 1000));
+    if (element.textContent !== text) element.textContent = text;
+  }
   setText("waiting", String(status.mqtt.waiting));
   if (!status.job) return;
   const bar = document.getElementById("job-bar");
@@ -25,36 +52,51 @@ function showMoment(status) {
     bar.max = status.job.total;
     bar.value = status.job.done;
   }
-  setText("job-stage", status.job.stage || "starting");
+  if (status.job.stage) setText("job-stage", status.job.stage);
   setText("job-message", status.job.message);
   setText("job-left", left(status.job.eta_s));
 }
 
+function ask(path, active) {
+  return fetch(path, { headers: { "X-Abbe-Active": active ? "1" : "0" }, signal: AbortSignal.timeout(PATIENCE_MS) });
+}
+
 async function replaceContent(next) {
-  const answer = await fetch("/", { signal: AbortSignal.timeout(PATIENCE_MS) });
+  const answer = await ask("/", false);
   if (!answer.ok) throw new Error(`status ${answer.status}`);
   const page = new DOMParser().parseFromString(await answer.text(), "text/html");
   document.getElementById("content").replaceWith(page.getElementById("content"));
   revision = next;
 }
 
-function connected(yes) {
+const LOST = banner.textContent;
+
+function connected(yes, silent = false) {
   banner.hidden = yes;
+  banner.textContent = silent ? words["lost.core"] : LOST;
   document.body.classList.toggle("stale", !yes);
 }
 
 async function refresh() {
+  let silent = false;
   try {
-    const answer = await fetch("/api/v1/status", { signal: AbortSignal.timeout(PATIENCE_MS) });
+    const active = touched;
+    touched = false;
+    const answer = await ask("/api/v1/status", active);
     if (answer.status === 401) location.assign("/login");
-    if (!answer.ok) throw new Error(`status ${answer.status}`);
+    if (!answer.ok) {
+      silent = answer.status === 503 && (await answer.json()).code === "SRV-002";
+      throw new Error(`status ${answer.status}`);
+    }
     const status = await answer.json();
-    if (status.revision !== revision) await replaceContent(status.revision);
+    // A screen of a silent core has no revision: its own address is asked again, now that somebody answers.
+    if (revision === "") { location.reload(); return; }
+    if (revision !== undefined && status.revision !== revision) await replaceContent(status.revision);
     showMoment(status);
     connected(true);
   } catch {
     // Whatever the reason, what stands on the page is from now on old.
-    connected(false);
+    connected(false, silent);
   }
   setTimeout(refresh, PERIOD_MS);
 }

@@ -21,7 +21,7 @@ from service.web.board import Board
 from service.web.door import COOKIE, Door, csrf_token
 from service.web.guard import CSRF_HEADER
 from service.web.headers import HEADERS
-from service.web.server import check_exposure
+from service.web.listening import check_exposure
 from service.web.view import View
 from tests.unit.service_users.conftest import PHRASE, World
 
@@ -120,7 +120,8 @@ def everybody(gate: Gate) -> list[Somebody]:
 
 async def test_every_route_by_everybody(gate: Gate) -> None:
     with_one_route_for_each_right(gate.app)
-    table = [cell for cell in cells(gate.app.routes) if cell[1] not in {"/login", "/logout", "/static"}]
+    # An approval names its proposal; by whom it is accepted is asked in tests/unit/service_web_pages.
+    table = [cell for cell in cells(gate.app.routes) if cell[1] not in {"/login", "/logout", "/static", "/proposal/approve"}]
     asserted = 0
     for somebody in everybody(gate):
         for method, path, need in table:
@@ -360,21 +361,44 @@ async def test_a_foreign_name_of_this_computer_is_refused_also_at_the_login(gate
 
 
 @pytest.mark.parametrize(
-    ("host", "users", "tls", "why"),
+    ("host", "names", "admins", "tls", "why"),
     [
-        ("127.0.0.1", 0, False, None),
-        ("::1", 0, False, None),
-        ("localhost", 0, False, None),
-        ("0.0.0.0", 0, True, "there is no user"),
-        ("192.168.1.5", 0, False, "there is no user"),
-        ("::", 3, False, "in clear"),
-        ("abbe.plant", 3, False, "in clear"),
-        ("0.0.0.0", 3, True, None),
+        ("127.0.0.1", (), 0, "no", None),
+        ("::1", (), 0, "no", None),
+        ("localhost", (), 0, "no", None),
+        ("127.0.0.1", ("localhost", "[::1]"), 0, "no", None),
+        ("0.0.0.0", (), 0, "own", "no user who is admin"),
+        ("192.168.1.5", (), 0, "own", "no user who is admin"),
+        ("127.0.0.1", ("abbe.plant",), 0, "proxy", "names 'abbe.plant' are asked for .* no user who is admin"),
+        ("127.0.0.1", ("abbe.plant",), 1, "no", "in clear - .*behind_tls"),
+        ("127.0.0.1", ("abbe.plant",), 1, "proxy", None),
+        ("127.0.0.1", ("abbe.plant",), 1, "own", None),
+        ("::", (), 3, "no", "in clear"),
+        ("abbe.plant", (), 3, "no", "in clear"),
+        ("0.0.0.0", ("abbe.plant",), 3, "proxy", "in clear"),  # also past the proxy
+        ("0.0.0.0", (), 3, "own", None),
     ],
 )
-def test_where_the_page_may_listen(host: str, users: int, tls: bool, why: str | None) -> None:
+def test_where_the_page_may_listen(host: str, names: tuple[str, ...], admins: int, tls: str, why: str | None) -> None:
+    given = {"tls": tls == "own", "names": names, "behind_tls": tls == "proxy"}
     if why is None:
-        check_exposure(host, lambda: users, tls=tls)
+        check_exposure(host, lambda: admins, **given)
         return
     with pytest.raises(ConfigError, match=why):
-        check_exposure(host, lambda: users, tls=tls)
+        check_exposure(host, lambda: admins, **given)
+
+
+def test_only_an_admin_who_can_log_in_counts(world: World) -> None:
+    """Anybody else could shut nobody out, and give nobody a right."""
+    assert world.store.active_admins() == 0
+    for role in Role:
+        if role is not Role.ADMIN:
+            world.people.add(f"a-{role}", role, PHRASE)
+    assert world.store.active_admins() == 0
+    world.people.add("ana", "admin", PHRASE)
+    world.people.add("bob", "admin", PHRASE)
+    assert world.store.active_admins() == 2
+    world.people.disable("bob")
+    assert world.store.active_admins() == 1
+    world.store.change_user(world.people.get("ana").id, password="")
+    assert world.store.active_admins() == 0

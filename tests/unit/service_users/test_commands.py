@@ -51,15 +51,18 @@ SAMPLES: dict[str, list[str]] = {
     "measure": ["measure", "m.toml", "--recipe", "none"],
     "listen": ["listen", "m.toml", "--recipe", "none.toml"],
     "solve": ["solve", "none"],
+    "solve-all": ["solve-all", "none", "--keep"],
     "discover": ["discover", "none"],
     "correct": ["correct", "m.toml", "none"],
     "accept-table": ["accept-table", "m.toml"],
+    "alarm acknowledge": ["alarm", "acknowledge", "m.toml", "7"],
     "import": ["import", "none"],
     "model revert": ["model", "revert", "none", "1"],
     "comp commission": ["comp", "commission", "m.toml"],
     "comp export": ["comp", "export", "7", "--format", "fanuc", "--out", "x", "--sign", "none.pem"],
     "comp propose": ["comp", "propose", "m.toml", "none"],
     "comp approve": ["comp", "approve", "7"],
+    "comp reject": ["comp", "reject", "7", "--reason", "none"],
     "comp push": ["comp", "push", "m.toml", "7"],
     "comp rollback": ["comp", "rollback", "m.toml"],
     "comp import": ["comp", "import", "none", "--format", "fanuc"],
@@ -121,7 +124,7 @@ def test_users_by_the_commands(folder: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert token not in shown
     assert PHRASE not in shown
     with Store.open(URL) as store:
-        assert store.active_users() == 2
+        assert store.active_admins() == 1
     (folder / "abbe.sqlite3.audit-head").write_text("")
     code, out = abbe("audit", "verify")
     assert code == 1

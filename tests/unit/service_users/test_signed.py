@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import stat
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -79,6 +80,14 @@ def test_another_machine_base_limit_format_day_or_signer_is_refused(key: Ed25519
     for files in ({"a.ini": FILES["a.ini"]}, {**FILES, "c.ini": b""}, {"b.ini": FILES["a.ini"], "a.ini": FILES["b.ini"]}):
         with pytest.raises(SignatureRefused, match="not the file that was signed"):
             check(seal, files, expected(key), NOW)
+
+
+def test_a_day_before_the_first_or_after_the_last_is_refused_in_one_line(key: Ed25519PrivateKey) -> None:
+    """Written with a zone so that in UTC there is no such day; signed by somebody whose key is trusted."""
+    good = claims_of("mill-7", "siemens-cec", FILES, "none", "5" * 64, (NOW, NOW + timedelta(days=30)))
+    for days in ({"signed_utc": "0001-01-01T00:00:00+23:59"}, {"expiry_utc": "9999-12-31T23:59:59-23:59"}, {"expiry_utc": "99999-01-01"}):
+        with pytest.raises(SignatureRefused, match="no signature of the form"):
+            check(sign(replace(good, **days), key), FILES, expected(key), NOW)
 
 
 @pytest.mark.parametrize(

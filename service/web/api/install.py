@@ -1,0 +1,22 @@
+"""Puts the interface into the application."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI
+
+from service.web.api.field import add_field
+from service.web.api.found import add_found
+from service.web.api.measured import add_measured
+from service.web.api.plant import add_plant
+from service.web.api.reports import add_reports
+from service.web.api.sources import Sources
+from service.web.api.tables import add_tables
+
+
+def add_api(app: FastAPI, sources: Sources) -> None:
+    """Add every route of the interface.
+
+    They are added to the application itself and not by a router of their own: the guard asks the application's routes what each needs.
+    """
+    for add in (add_measured, add_found, add_field, add_tables, add_plant, add_reports):
+        add(app, sources)

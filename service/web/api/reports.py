@@ -1,0 +1,96 @@
+"""Route: reports to sign, of anything that is stored. Made in a thread, few at a time; nothing is computed anew."""
+
+from __future__ import annotations
+
+import asyncio
+from enum import StrEnum
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Query
+from fastapi.responses import Response
+
+from service.errors import NotStored
+from service.report.document import Document
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.api.sources import Number, Sources, as_stored, storable
+from service.workflows.report import FORMS, default_name, numbered_report, stored_report
+
+AT_A_TIME = 2
+
+
+class Kind(StrEnum):
+    """What a report is about."""
+
+    RUN = "run"
+    CAMPAIGN = "campaign"
+    VERIFICATION = "verification"
+    DISCOVERY = "discovery"
+    PUSH = "push"
+
+
+class Form(StrEnum):
+    """How it is written."""
+
+    PDF = "pdf"
+    HTML = "html"
+    CSV = "csv"
+    JSON = "json"
+
+
+MEDIA = {Form.PDF: "application/pdf", Form.HTML: "text/html", Form.CSV: "text/csv", Form.JSON: "application/json"}
+WRITTEN: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The report, as a file to be saved; the same data give the same bytes",
+        "content": {
+            "application/pdf": {"schema": {"type": "string", "format": "binary"}},
+            "text/html": {"schema": {"type": "string"}},
+            "text/csv": {"schema": {"type": "string"}},
+            "application/json": {"schema": {"type": "object"}},
+        },
+    }
+}
+
+
+def add_reports(app: FastAPI, sources: Sources) -> None:
+    """Add the route."""
+    few = asyncio.Semaphore(AT_A_TIME)
+
+    @app.get("/api/v1/reports/{kind}/{number}", response_class=Response, responses=WRITTEN)
+    @needs(Permission.READ)
+    async def report(
+        kind: Kind,
+        number: Number,
+        form: Annotated[Form, Query(description="How it is written.")] = Form.PDF,
+        machine: Annotated[str | None, Query(description="Whose push, where several machines are stored.")] = None,
+    ) -> Response:
+        """A report to sign: figures with U by ISO 230, conditions, decision, what was not observable."""
+        async with few:
+            name, data = await asyncio.to_thread(_written, sources, kind, number, form, machine)
+        return Response(data, media_type=MEDIA[form], headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+def _written(sources: Sources, kind: Kind, number: int, form: Form, machine: str | None) -> tuple[str, bytes]:
+    with as_stored():
+        document = _document(sources, kind, number, machine)
+        found = FORMS[f".{form}"](document)
+    name = default_name(document).removesuffix(".pdf") + f".{form}"
+    return name, found.encode() if isinstance(found, str) else found
+
+
+def _document(sources: Sources, kind: Kind, number: int, machine: str | None) -> Document:
+    store = sources.store
+    if kind is Kind.PUSH:
+        if machine is not None and (not storable(machine) or not store.push_entries(machine)):
+            raise NotStored("this machine has no push")
+        found = store.page("pushes", {"push": number, "machine": machine}, None, 1)
+        if not found:
+            raise NotStored(f"there is no push {number}")
+        return numbered_report(store, kind, number, sources.rules, machine)
+    listing = {Kind.RUN: "runs", Kind.CAMPAIGN: "campaigns", Kind.VERIFICATION: "verifications", Kind.DISCOVERY: "discoveries"}[kind]
+    row = sources.row(listing, number, kind)
+    if kind is Kind.RUN:
+        return stored_report(store, store.run(f"{row['campaign']}/{row['label']}"), sources.rules)
+    if kind is Kind.CAMPAIGN:
+        return stored_report(store, store.campaign(row["name"]), sources.rules)
+    return numbered_report(store, kind, number, sources.rules)

@@ -1,0 +1,58 @@
+"""Routes: what is ordered of the table in force. The core does it, as a job, and decides whether; here it is only passed on."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI, Request
+from fastapi.responses import Response
+
+from service.channel.messages import Answer
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.api.once import REPLAYED, Key
+from service.web.api.shapes_tables import PushBody, RollbackBody
+from service.web.api.sources import Number
+from service.web.core_line import CoreLine
+from service.web.guard import Visit
+from service.web.jobs import ACCEPTED, REFUSALS, answered
+from service.web.schemas_jobs import JobState
+
+LONGEST_BODY = 4096
+RESPONSES = ACCEPTED | REFUSALS
+
+
+def add_table_orders(app: FastAPI, core: CoreLine) -> None:
+    """Add the routes."""
+
+    @app.post("/api/v1/tables/rollback", status_code=202, responses=RESPONSES, response_model=JobState, max_body_size=LONGEST_BODY)
+    @needs(Permission.APPROVE)
+    async def rollback(request: Request, body: RollbackBody, key: Key) -> Response:
+        """Order that the table in force gives way to the one before, as `abbe comp rollback` does; refused (409) says why."""
+        visit: Visit = request.state.visit
+        visit.target = f"table of push {body.push} ({body.crc})"
+        reason = body.reason.replace("\0", "\ufffd")  # the one character that not every database can keep
+        answer = await core.roll_back(body.push, int(body.crc, 16), reason, key, visit.principal.name)
+        return _passed_on(core, visit, answer)
+
+    @app.post(
+        "/api/v1/proposals/{number}/push",
+        status_code=202,
+        responses=RESPONSES,
+        response_model=JobState,
+        max_body_size=LONGEST_BODY,
+    )
+    @needs(Permission.APPROVE)
+    async def push(request: Request, number: Number, body: PushBody, key: Key) -> Response:
+        """Order that an approved proposal is pushed now, where the service does not push by itself; refused (409) says why."""
+        visit: Visit = request.state.visit
+        visit.target = f"proposal {number}"
+        return _passed_on(core, visit, await core.push(number, key, visit.principal.name))
+
+
+def _passed_on(core: CoreLine, visit: Visit, answer: Answer) -> Response:
+    if answer.job:
+        visit.target += f", job {answer.job}"
+    visit.replayed = answer.outcome == "done" and bool(answer.text)
+    sent = answered(core, answer)
+    if visit.replayed:
+        sent.headers[REPLAYED] = "true"
+    return sent

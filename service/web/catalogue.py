@@ -1,0 +1,106 @@
+"""Every code that an error can have, from one place: the classes that carry them, and the answers of the network that have no class.
+
+``python -m service.web.catalogue`` prints the page docs/error-codes.md; a test compares the two.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from drivers.errors import DriverError
+from service import errors
+from service.errors import AbbeError
+
+DEFECT = "ABB-001"
+HTTP: dict[int, tuple[str, str]] = {
+    400: ("WEB-400", "The request cannot be read: no JSON, a header that is missing or foreign, a Host that is not ours."),
+    401: ("WEB-401", "Nobody is logged in, or the token does not hold any more."),
+    403: ("WEB-403", "The role does not allow it, or the request comes from a page that is not ours."),
+    404: ("WEB-404", "There is no such path, or nothing can have this number."),
+    405: ("WEB-405", "The path is there, by another method; the header Allow says which."),
+    409: ("WEB-409", "It contradicts what is stored."),
+    413: ("WEB-413", "The request is longer than anything that is expected there."),
+    422: ("WEB-422", "A parameter or a field is not what the OpenAPI document demands; the detail names it."),
+    429: ("WEB-429", "Too many requests from this address. The header Retry-After says when to try again."),
+    500: (DEFECT, "A defect of this program. The service's log has the details."),
+    503: ("WEB-503", "The service is overloaded or ends. Try again."),
+}
+"""Status, code and meaning of answers that no class of error stands for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One code: what it is called inside, what it means, and the HTTP status that it is answered with, where it is answered."""
+
+    code: str
+    name: str
+    meaning: str
+    status: int | None
+
+
+STATUS: dict[type[AbbeError], int] = {
+    errors.NotStored: 404,
+    errors.StoreError: 503,
+    errors.AuditBroken: 503,
+    errors.CoreSilent: 503,
+    errors.KeyReused: 409,
+    errors.KeyInUse: 409,
+    errors.Unusable: 409,
+    errors.TableRefused: 409,
+    errors.FileFormatError: 409,
+    errors.MeasurementFault: 409,
+    errors.NotObservable: 409,
+    errors.CampaignRefused: 409,
+    errors.ModelUnknown: 409,
+    errors.EffectUnknown: 409,
+    errors.ConfigError: 409,
+}
+"""The one table from errors to HTTP. A class that is not here is answered as the nearest one above it; none: 500."""
+
+
+def status_of(kind: type[AbbeError]) -> int:
+    """The HTTP status that an error is answered with."""
+    return next((STATUS[one] for one in kind.__mro__ if one in STATUS), 500)
+
+
+def entries() -> list[Entry]:
+    """The catalogue, in the order of the codes."""
+    found = {code: Entry(code, f"HTTP {status}", meaning, status) for status, (code, meaning) in HTTP.items()}
+    for kind in (*_tree(AbbeError), *_tree(DriverError)):
+        status = status_of(kind) if issubclass(kind, AbbeError) else None
+        found[kind.code] = Entry(kind.code, kind.__name__, _meaning(kind), None if status == 500 else status)
+    return [found[code] for code in sorted(found)]
+
+
+def page() -> str:
+    """The catalogue as a Markdown page."""
+    rows = [f"| {one.code} | {one.name} | {one.status or ''} | {one.meaning} |" for one in entries()]
+    head = (
+        "# Codes of errors\n\n"
+        "Every error has a code that does not change. The command line prints cause and remedy and ends with exit code 2; the HTTP\n"
+        "interface answers `application/problem+json` (RFC 9457) with the code in `code`, and in `type` as `urn:abbe:error:CODE`.\n"
+        "This page is made by `python -m service.web.catalogue` from the classes themselves; `GET /api/v1/errors` gives the same.\n\n"
+        "| code | name | HTTP | meaning |\n|---|---|---|---|\n"
+    )
+    return head + "\n".join(rows) + "\n"
+
+
+def _tree(kind: type[AbbeError] | type[DriverError]) -> Iterator[type[AbbeError] | type[DriverError]]:
+    """A class and all below it that are the product's own."""
+    yield kind
+    for below in kind.__subclasses__():
+        if below.__module__ in {"service.errors", "drivers.errors"}:
+            yield from _tree(below)
+
+
+def _meaning(kind: type) -> str:
+    """The first paragraph of a class's docstring, on one line."""
+    text = inspect.getdoc(kind) or ""
+    return " ".join(text.split("\n\n")[0].split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

@@ -1,0 +1,78 @@
+"""The OpenAPI document, made complete: who may ask, and every status that can be answered, for every route alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from starlette.routing import BaseRoute
+
+from service.web.access import MUTATING, PUBLIC, Need, cells
+from service.web.catalogue import HTTP
+from service.web.door import COOKIE
+from service.web.problems import MEDIA_TYPE
+from service.web.schemas import Problem
+
+Doc = dict[str, Any]
+REF = {"$ref": "#/components/schemas/Problem"}
+UNUSED = ("HTTPValidationError", "ValidationError")
+"""What FastAPI declares for 422, and nobody answers here."""
+
+
+def complete(document: Doc, routes: Sequence[BaseRoute]) -> Doc:
+    """Add to an OpenAPI document, in place, what stands in front of all routes; may be done again.
+
+    Parameters
+    ----------
+    document : dict
+        As FastAPI makes it from the routes.
+    routes : sequence of routes
+        Of the application.
+    """
+    wanted = {(path, method.lower()): need for method, path, need in cells(routes)}
+    for path, methods in document.get("paths", {}).items():
+        for method, operation in methods.items():
+            need = wanted.get((path, method))
+            _who(operation, need)
+            _answers(operation, need, changes=method.upper() in MUTATING)
+    schemas = document.setdefault("components", {}).setdefault("schemas", {})
+    for name in UNUSED:
+        schemas.pop(name, None)
+    schemas["Problem"] = Problem.model_json_schema()
+    document["components"]["securitySchemes"] = {
+        "token": {"type": "http", "scheme": "bearer", "description": "abbe user token new"},
+        "session": {"type": "apiKey", "in": "cookie", "name": COOKIE, "description": "of POST /login; changes need X-CSRF-Token too"},
+    }
+    return document
+
+
+def _who(operation: Doc, need: Need | None) -> None:
+    if need is PUBLIC or need is None:
+        return
+    operation["security"] = [{"token": []}, {"session": []}]
+    operation["x-permission"] = need.value
+
+
+def _answers(operation: Doc, need: Need | None, *, changes: bool) -> None:
+    given = {p["in"] for p in operation.get("parameters", [])}
+    statuses = {400, 429, 500, 503}
+    if need is not PUBLIC:
+        statuses |= {401, 403}
+    if given or changes:
+        statuses.add(422)
+    if "path" in given:
+        statuses |= {404, 409}
+    if changes:
+        statuses |= {409, 413}
+    answers: Doc = operation.setdefault("responses", {})
+    for status in sorted(statuses):
+        answers.setdefault(str(status), {"description": HTTP[status][1]})
+    for name, answer in answers.items():
+        if name >= "400":
+            answer["description"] = HTTP[422][1] if name == "422" else answer["description"]
+            answer["content"] = {MEDIA_TYPE: {"schema": REF}}
+    # In front of the application, and answered in words: a Host that is not ours, too much at once.
+    for name in ("400", "503", *(("413",) if changes else ())):
+        answers[name]["content"]["text/plain"] = {"schema": {"type": "string"}}
+    if need is not PUBLIC and not changes:
+        answers.setdefault("303", {"description": "Nobody is logged in, and a browser asks for text/html: to the login page"})

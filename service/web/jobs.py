@@ -1,0 +1,121 @@
+"""Jobs over HTTP: start a declared recipe now, see how a job stands, stop, pause and go on, say what is done by hand. The core does it, and
+decides whether.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+from fastapi import FastAPI, Header, HTTPException, Path, Request
+from fastapi.responses import JSONResponse, Response
+
+from service.channel.messages import Answer, How, JobSeen
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.core_line import CoreLine
+from service.web.guard import Visit
+from service.web.problems import problem
+from service.web.schemas import Problem
+from service.web.schemas_jobs import JobList, JobState, NewJob
+from service.workflows.shipped import named, parted
+
+STATUS = {"unknown": 404, "busy": 409, "forbidden": 403, "conflict": 409}
+NUMBER = Path(pattern="^[0-9a-f]{12}$", description="Number of the job")
+PROMPT = Path(ge=1, le=10**6, description="Number of what is asked for, as the job says it")
+REFUSALS: dict[int | str, dict[str, object]] = {
+    401: {"model": Problem, "description": "Nobody is logged in"},
+    403: {"model": Problem, "description": "The role does not allow it"},
+    404: {"model": Problem, "description": "There is no such job"},
+    409: {"model": Problem, "description": "Not now: the machine measures; the job has ended, cannot pause, or asks for something else"},
+    422: {"model": Problem, "description": "There is no such recipe, or the request is not well-formed"},
+    429: {"model": Problem, "description": "Too many requests"},
+    503: {"model": Problem, "description": "The core or the store does not answer"},
+}
+ACCEPTED: dict[int | str, dict[str, object]] = {202: {"model": JobState, "description": "Accepted; `Location` is the job"}}
+
+
+def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: tuple[str, ...] = ()) -> None:
+    """Add the routes of jobs to the application. ``campaigns``: those of the recipes that end with a proposal."""
+
+    @app.get("/api/v1/jobs", responses=REFUSALS)
+    @needs(Permission.READ)
+    async def jobs() -> JobList:
+        """List the jobs since the service began, newest first (`kind` says what each is), and the recipes that can be started."""
+        return JobList(recipes=list(recipes), jobs=[_state(job) for job in core.jobs()])
+
+    @app.post("/api/v1/jobs", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
+    @needs(Permission.MEASURE)
+    async def start(
+        request: Request,
+        wanted: NewJob,
+        key: Annotated[str, Header(alias="Idempotency-Key", max_length=100, description="Said twice, it starts one job")] = "",
+    ) -> Response:
+        """Measure a recipe now; ``identification`` is the full campaign, at whose end a proposal waits: it needs ``propose``, too."""
+        visit: Visit = request.state.visit
+        recipe = named(wanted.recipe, wanted.rate_hz)
+        visit.target = f"recipe {recipe}"
+        # The core knows the role, not the scopes of a token.
+        if parted(recipe)[0] in campaigns and Permission.PROPOSE not in visit.principal.permissions:
+            return problem(
+                403, f"{recipe} ends with a proposal: it needs {Permission.PROPOSE.value!r} as well as {Permission.MEASURE.value!r}"
+            )
+        answer = await core.start(recipe, key, visit.principal.name)
+        if answer.outcome == "unknown":
+            return problem(422, answer.text)
+        visit.target = f"job {answer.job}, recipe {recipe}" if answer.job else visit.target
+        return answered(core, answer)
+
+    @app.get("/api/v1/jobs/{job}", responses=REFUSALS)
+    @needs(Permission.READ)
+    async def one(job: Annotated[str, NUMBER]) -> JobState:
+        """Say how a job stands."""
+        found = _find(core, job)
+        if found is None:
+            raise HTTPException(404, f"there is no job {job} since the service began")
+        return _state(found)
+
+    @app.post("/api/v1/jobs/{job}/prompts/{prompt}/done", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
+    @needs(Permission.MEASURE)
+    async def done(request: Request, job: Annotated[str, NUMBER], prompt: Annotated[int, PROMPT]) -> Response:
+        """Say that what the job asks for is done; the machine moves then. Refused (409) if another prompt stands."""
+        visit: Visit = request.state.visit
+        visit.target = f"job {job}, prompt {prompt}"
+        return answered(core, await core.done_by_hand(job, prompt, visit.principal.name))
+
+    def add_steering(how: How, words: str) -> None:
+        @app.post(
+            f"/api/v1/jobs/{{job}}/{how}",
+            status_code=202,
+            response_model=JobState,
+            responses=ACCEPTED | REFUSALS,
+            summary=words,
+            operation_id=f"{how}_job",
+        )
+        @needs(Permission.MEASURE)
+        async def steer(request: Request, job: Annotated[str, NUMBER]) -> Response:
+            visit: Visit = request.state.visit
+            return answered(core, await core.steer(job, how, visit.principal.name))
+
+    add_steering("stop", "Stop at the next safe place; what is complete stays")
+    add_steering("abort", "Stop the axes at once, and end")
+    add_steering("pause", "Hold at the next safe place")
+    add_steering("resume", "Go on after a pause")
+
+
+def answered(core: CoreLine, answer: Answer) -> Response:
+    """What the core said to a request, as a response; with a job its state and where it is."""
+    if answer.outcome != "done":
+        return problem(STATUS[answer.outcome], answer.text)
+    found = _find(core, answer.job)
+    if found is None:  # so long ago that the core has forgotten it
+        return problem(404, f"job {answer.job} is not known any more")
+    return JSONResponse(_state(found).model_dump(mode="json"), 202, headers={"Location": f"/api/v1/jobs/{answer.job}"})
+
+
+def _find(core: CoreLine, number: str) -> JobSeen | None:
+    return next((job for job in core.jobs() if job.id == number), None)
+
+
+def _state(job: JobSeen) -> JobState:
+    return JobState.model_validate(asdict(job))

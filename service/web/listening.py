@@ -1,0 +1,97 @@
+"""Where the page is reached: socket and certificate, and whether it may be reached from there. Checked by the core at its start."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import ssl
+from collections.abc import Callable, Sequence
+
+from service.errors import ConfigError
+
+
+def check_certificate(certificate: str, key: str) -> None:
+    """Refuse a certificate that cannot be used; nothing happens without one.
+
+    Raises
+    ------
+    ConfigError
+        Certificate or key cannot be read, or do not belong together.
+    """
+    if not certificate:
+        return
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
+    except OSError as trouble:  # ssl.SSLError is one
+        why = trouble.strerror or str(trouble)
+        raise ConfigError(f"[web] certificate {certificate}, key {key}: {why}", "give a PEM certificate and its key") from None
+
+
+def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Sequence[str] = (), behind_tls: bool = False) -> None:
+    """Refuse to be reached from other computers without somebody who manages the users, and without encryption.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen on.
+    admins : callable
+        How many admins with a password may log in; asked only if it matters. A user who is not one could shut nobody out.
+    tls : bool
+        Whether a certificate is configured.
+    names : sequence of str
+        Under which other computers ask for the page: by a reverse proxy, if the address is this computer's own.
+    behind_tls : bool
+        Whether that proxy takes off the TLS.
+
+    Raises
+    ------
+    ConfigError
+        What is missing.
+    """
+    wide, proxied = not is_loopback(host), [name for name in names if not is_loopback(name.removeprefix("[").removesuffix("]"))]
+    if not wide and not proxied:
+        return
+    what = f"[web] host {host!r} can be reached" if wide else f"[web] names {', '.join(map(repr, proxied))} are asked for"
+    if admins() == 0:
+        raise ConfigError(
+            f"{what} from other computers, and there is no user who is admin, has a password and may log in",
+            "add one first (abbe user add NAME admin), or use 127.0.0.1" + ("" if wide else " without names"),
+        )
+    if not tls and (wide or not behind_tls):
+        raise ConfigError(
+            f"{what} from other computers, and passwords would cross the network in clear",
+            "give certificate and key under [web], or use 127.0.0.1 behind a reverse proxy with TLS and say behind_tls = true",
+        )
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """Return a listening socket. Whether it may listen there is `check_exposure`'s to say, before.
+
+    Raises
+    ------
+    ConfigError
+        Somebody else has the port, or the address is not this computer's.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        listening = socket.create_server((host, port), family=family, backlog=64)
+        # Connections inherit it. Without, head and body of an answer wait 40 ms for each other: asyncio sets it on no socket of protocol 0.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return listening
+    except OSError as trouble:
+        raise ConfigError(
+            f"[web] cannot listen on {host} port {port}: {trouble.strerror}", "is another service running? choose another with --port"
+        ) from trouble
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether an address can be reached from this computer only."""
+    return host == "localhost" or is_local(host)
+
+
+def is_local(address: str) -> bool:
+    """Tell whether an address is this computer's own."""
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return False

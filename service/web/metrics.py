@@ -1,0 +1,101 @@
+"""What Prometheus asks for: ``/metrics``, in its text format. Figures of the store, of the core, and of this process."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable, Iterator
+from typing import Protocol
+
+from fastapi import FastAPI
+from fastapi.responses import Response
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.process_collector import ProcessCollector
+from prometheus_client.registry import Collector
+
+from service.channel.messages import Moment
+from service.errors import CoreSilent
+from service.storage.records import VerificationRecord
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.core_line import CoreLine
+
+VERDICTS = ("pass", "fail", "cannot tell")
+
+
+class Counted(Protocol):
+    """The part of the store that is counted here."""
+
+    def verdict_counts(self, machine: str) -> dict[str, int]:
+        """Return how many checks ended with each verdict."""
+        ...
+
+    def slot_counts(self, machine: str) -> dict[str, int]:
+        """Return how many slots stand at each state."""
+        ...
+
+    def waiting_messages(self) -> int:
+        """Return how many messages wait for the broker."""
+        ...
+
+    def verifications_of(self, machine: str, limit: int = ...) -> list[VerificationRecord]:
+        """Return the latest checks, newest first."""
+        ...
+
+
+class _Figures(Collector):
+    def __init__(self, store: Counted, core: CoreLine, machine: str) -> None:
+        self._store, self._core, self._machine = store, core, machine
+
+    def collect(self) -> Iterable[Metric]:
+        yield from self._of_store()
+        try:
+            moment = self._core.moment()
+        except CoreSilent:
+            yield GaugeMetricFamily("abbe_core_up", "Whether the core process answers", 0.0)
+            return
+        yield GaugeMetricFamily("abbe_core_up", "Whether the core process answers", 1.0)
+        yield from _of_core(moment)
+
+    def _of_store(self) -> Iterator[Metric]:
+        checks = CounterMetricFamily("abbe_checks", "Checks of the whole history by verdict", labels=["verdict"])
+        counts = dict.fromkeys(VERDICTS, 0) | self._store.verdict_counts(self._machine)
+        for verdict, number in sorted(counts.items()):
+            checks.add_metric([verdict], number)
+        yield checks
+        slots = CounterMetricFamily("abbe_slots_not_run", "Slots of the timetable that were not run, by why", labels=["why"])
+        states = self._store.slot_counts(self._machine)
+        for why in ("missed", "skipped", "interrupted"):
+            slots.add_metric([why], sum(number for state, number in states.items() if state.startswith(why)))
+        yield slots
+        yield GaugeMetricFamily("abbe_outbox_waiting", "Messages that wait for the broker", self._store.waiting_messages())
+        last = next(iter(self._store.verifications_of(self._machine, 1)), None)
+        figures = GaugeMetricFamily("abbe_last_figure", "Figures of the last check; the unit is at the end of the name", labels=["figure"])
+        for name, value in sorted((last.doc.get("values") or {}).items()) if last is not None else ():
+            if value is not None:
+                figures.add_metric([name], value)
+        yield figures
+
+
+def _of_core(moment: Moment) -> Iterator[Metric]:
+    devices = GaugeMetricFamily("abbe_device_connected", "1: used or answered last, 0: fault or not used yet", labels=["role"])
+    for device in moment.devices:
+        devices.add_metric([device.role], float(device.state in {"in use", "answered"}))
+    yield devices
+    yield GaugeMetricFamily("abbe_measuring", "Whether a check runs", float(moment.check is not None))
+    yield GaugeMetricFamily("abbe_mqtt_connected", "Whether the broker is there", float(moment.mqtt_connected))
+    yield GaugeMetricFamily("abbe_attention", "How many things need a person", len(moment.attention))
+    yield GaugeMetricFamily("abbe_core_resident_memory_bytes", "Resident memory of the core process", moment.core_rss_bytes)
+    yield CounterMetricFamily("abbe_web_restarts", "How often the web process was started again", moment.web_restarts)
+
+
+def add_metrics(app: FastAPI, store: Counted, core: CoreLine, machine: str) -> None:
+    """Add the route to the application. Who may look at the page may ask for these; a program with a token of the scope ``read``."""
+    registry = CollectorRegistry()
+    registry.register(_Figures(store, core, machine))
+    ProcessCollector(namespace="abbe_web", registry=registry)
+
+    @app.get("/metrics", include_in_schema=False)
+    @needs(Permission.READ)
+    async def metrics() -> Response:
+        return Response(await asyncio.to_thread(generate_latest, registry), media_type=CONTENT_TYPE_LATEST)

@@ -1,0 +1,54 @@
+"""``/mtconnect/probe``, ``/current`` and ``/sample``, for programs that speak MTConnect; with the right that the page needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from fastapi import FastAPI, Request
+from fastapi.responses import Response
+
+from service.plant.facts import Facts, FactsSource
+from service.plant.mtconnect import Agent, Refused
+from service.users.roles import Permission
+from service.web.access import needs
+
+MEDIA_TYPE = "text/xml"
+
+
+class Door:
+    """The agent, and where its facts come from. It starts with the first question, which gives it its ``instanceId``."""
+
+    def __init__(self, source: FactsSource) -> None:
+        self._source = source
+        self._agent: Agent | None = None
+
+    async def answer(self, request: Request, write: Callable[[Agent, Facts, Mapping[str, str]], bytes]) -> Response:
+        """Return a document, or the Error document of what cannot be answered."""
+        facts = await self._source.facts()
+        if self._agent is None:
+            self._agent = Agent(int(facts.now_utc.timestamp()))
+        self._agent.update(facts)
+        try:
+            return Response(write(self._agent, facts, request.query_params), media_type=MEDIA_TYPE)
+        except Refused as refused:
+            return Response(self._agent.error(refused, facts.now_utc), refused.status, media_type=MEDIA_TYPE)
+
+
+def add_mtconnect(app: FastAPI, source: FactsSource) -> None:
+    """Mount the three questions. They are in no OpenAPI document: MTConnect describes them."""
+    door = Door(source)
+
+    @app.get("/mtconnect/probe", include_in_schema=False)
+    @needs(Permission.READ)
+    async def probe(request: Request) -> Response:
+        return await door.answer(request, lambda agent, facts, _: agent.probe(facts))
+
+    @app.get("/mtconnect/current", include_in_schema=False)
+    @needs(Permission.READ)
+    async def current(request: Request) -> Response:
+        return await door.answer(request, lambda agent, facts, query: agent.current(facts, query))
+
+    @app.get("/mtconnect/sample", include_in_schema=False)
+    @needs(Permission.READ)
+    async def sample(request: Request) -> Response:
+        return await door.answer(request, lambda agent, facts, query: agent.sample(facts, query))

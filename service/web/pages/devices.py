@@ -1,0 +1,82 @@
+"""The devices of the machine for the screen `/devices`: what core and store know of them. Nothing is asked of a device for it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+
+from service.secrets import mask_secrets
+from service.sequences.incident_account import Trouble, troubles
+from service.storage.records import CampaignRecord
+from service.storage.store import Store
+from service.web.schemas import Device
+from service.workflows.proved_levels import KIND
+
+CAMPAIGNS = 10
+"""So many of the latest campaigns are looked through for incidents."""
+INSTRUMENTS = ("ballbar", "laser")
+SOON_DAYS = 30
+CONTROLLER = "cnc"
+PROOFS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """The certificate of an instrument. ``until``: its last day, None: none is known; ``days``: left, negative: expired."""
+
+    until: date | None
+    days: int = 0
+
+    @property
+    def sign(self) -> str:
+        """Good, bad, or open: it ends within `SOON_DAYS`, or none is known."""
+        if self.until is None:
+            return "open"
+        return "bad" if self.days < 0 else "open" if self.days < SOON_DAYS else "ok"
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceLine:
+    """One device. ``url``: without passwords; ``certificate``: None for what is no instrument; ``firmware``: empty where nobody knows."""
+
+    device: Device
+    url: str
+    certificate: Certificate | None
+    firmware: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceScreen:
+    """Devices and the troubles of their links."""
+
+    lines: Sequence[DeviceLine]
+    incidents: Sequence[Trouble]
+    campaigns: int
+
+
+def device_screen(store: Store, machine: str, devices: Sequence[Device], until: Mapping[str, date] | None, today: date) -> DeviceScreen:
+    """The devices of a machine file, and what its latest campaigns noted of their links."""
+    own = {record.id for record in store.machines() if record.name == machine}
+    campaigns = latest_of(store, own)
+    latest, numbers = campaigns[-CAMPAIGNS:], {c.id for c in campaigns}
+    journal = [entry for campaign in latest for entry in store.checkpoints(campaign.id)]
+    proof = next((one.doc for one in store.latest_solutions(KIND, PROOFS) if one.campaign_id in numbers), {})
+    known = proof.get("identity") or {}
+    told = " ".join(str(known[k]) for k in ("model", "firmware") if known.get(k))
+    lines = [
+        DeviceLine(d, mask_secrets(d.url), _certificate(d.role, until or {}, today), told if d.role == CONTROLLER else "") for d in devices
+    ]
+    return DeviceScreen(lines, list(reversed(troubles(journal))), len(latest))
+
+
+def latest_of(store: Store, machines: Collection[int]) -> list[CampaignRecord]:
+    """Campaigns of these descriptions of a machine, oldest first."""
+    return [c for c in store.campaigns() if c.machine_id in machines]
+
+
+def _certificate(role: str, until: Mapping[str, date], today: date) -> Certificate | None:
+    if role not in INSTRUMENTS:
+        return None
+    last = until.get(role)
+    return Certificate(None) if last is None else Certificate(last, (last - today).days)

@@ -1,0 +1,105 @@
+"""What an admin looks at when something is wrong: versions, database, outbox; and the support bundle, in which no secret is."""
+
+from __future__ import annotations
+
+import io
+import json
+import platform
+import shutil
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from service.storage.store_health import Health
+from service.web.api.sources import Sources
+from service.web.pages.blanking import blanked_doc, blanked_line
+from service.web.schemas import Status
+from service.workflows.provenance import versions
+
+DAY_S = 86_400.0
+MEGA = 1e6
+FIXED = (2026, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """The state of the installation. Sizes in bytes, None where the database is on another computer; ``growth_b``: a day, on average."""
+
+    version: str
+    python: str
+    system: str
+    database: str
+    revision: str
+    wanted_revision: str
+    size_b: int
+    since_utc: str | None
+    growth_b: float | None
+    free_b: int | None
+    outbox: int
+    outbox_oldest_s: float | None
+
+    @property
+    def program(self) -> str:
+        """Which program runs where."""
+        return f"Abbe {self.version}, Python {self.python}, {self.system}"
+
+    @property
+    def current(self) -> bool:
+        """Whether the database has this program's schema."""
+        return self.revision == self.wanted_revision
+
+
+def diagnosis(sources: Sources, version: str) -> Diagnosis:
+    """Look at everything now."""
+    store, now = sources.store, sources.clock.utc()
+    found: Health = store.health()
+    since = None if found.since_utc is None else datetime.fromisoformat(found.since_utc)
+    days = 0.0 if since is None else (now - since).total_seconds() / DAY_S
+    oldest = None if found.outbox_oldest_utc is None else (now - datetime.fromisoformat(found.outbox_oldest_utc)).total_seconds()
+    free = shutil.disk_usage(Path(found.file).parent).free if found.file else None
+    return Diagnosis(
+        version, platform.python_version(), platform.platform(), store.url, found.revision, found.wanted_revision, found.size_b,
+        found.since_utc, found.size_b / days if days >= 1.0 else None, free, found.outbox, oldest,
+    )  # fmt: skip
+
+
+def megabytes(size_b: float) -> str:
+    """A size as people write it."""
+    return f"{size_b / MEGA:.1f} MB"
+
+
+def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
+    """What the core has told this process of the machine file. Keys and passwords were never in it, but for those in URLs."""
+    return {
+        "machine": sources.machine,
+        "database": sources.store.url,
+        "broker": broker,
+        "devices": {device.role: device.url for device in status.devices},
+        "schedules": [asdict(one) for one in sources.schedules],
+        "limits_um": dict(sources.rules.limits_um),
+        "calibrated_until": {k: v.isoformat() for k, v in (sources.rules.calibrated_until or {}).items()},
+        "temperature_c": sources.rules.temperature_c,
+    }
+
+
+def bundle(diagnosis: Diagnosis, config: Mapping[str, Any], status: Status, log: Sequence[str]) -> bytes:
+    """The support bundle as a zip file; no part of it without `service.web.pages.blanking`."""
+    members = {
+        "config.json": _json(config),
+        "diagnosis.json": _json(asdict(diagnosis)),
+        "log.txt": "\n".join(blanked_line(line) for line in log) + "\n",
+        "status.json": _json(status.model_dump(mode="json")),
+        "versions.json": _json(versions()),
+    }
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in members.items():
+            archive.writestr(zipfile.ZipInfo(name, FIXED), text, zipfile.ZIP_DEFLATED)
+    return out.getvalue()
+
+
+def _json(value: object) -> str:
+    return json.dumps(blanked_doc(value), indent=2, ensure_ascii=False) + "\n"

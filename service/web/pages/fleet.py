@@ -1,0 +1,103 @@
+"""All machines of the database for the screen `/fleet`: where each stands, its worst figure and its alarms, worst first.
+
+The screen shows no trend, so none is computed: those of ten machines of a month are most of the time of ``abbe fleet``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from service.scheduler.fleet import Figure, Stand, stands
+from service.scheduler.store import ServiceStore
+from service.storage.base import utc_text
+from service.workflows.alarm_states import folded, is_open
+
+SORTS = ("worst", "machine", "due")
+COLUMNS = (
+    "machine", "state", "last_check_utc", "verdict", "worst_figure", "value", "expanded_uncertainty_k2", "limit", "share_of_limit",
+    "next_due_utc", "next_recipe", "open_alarms",
+)  # fmt: skip
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+@dataclass(frozen=True, slots=True)
+class FleetLine:
+    """One machine: where it stands, its worst figure, and how many alarms are open."""
+
+    machine: Stand
+    worst: Figure | None
+    alarms: int
+
+    @property
+    def share(self) -> float | None:
+        """The worst figure over its limit; None without one."""
+        one = self.worst
+        return None if one is None or not one.limit else one.value / one.limit
+
+    @property
+    def share_u(self) -> float | None:
+        """Expanded uncertainty of `share` (k = 2); None where that of the figure is not known."""
+        one = self.worst
+        return None if one is None or not one.limit or one.expanded is None else one.expanded / one.limit
+
+    @property
+    def upper(self) -> float:
+        """What the machines are sorted by: the upper end of the share; without figures nobody knows, which comes first."""
+        return float("inf") if self.share is None else self.share + (self.share_u or 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a reader wants to see: part of a name, a verdict, and in which order."""
+
+    name: str = ""
+    verdict: str = ""
+    sort: str = SORTS[0]
+
+
+def fleet_lines(store: ServiceStore, now: datetime, asked: Asked) -> list[FleetLine]:
+    """The machines that fit, in the order that was asked for."""
+    lines = [_line(store, one) for one in stands(store, now) if _fits(one, asked)]
+    if asked.sort == "machine":
+        return sorted(lines, key=lambda one: one.machine.machine)
+    if asked.sort == "due":
+        return sorted(lines, key=lambda one: (_moment(one.machine.next_due_utc), one.machine.machine))
+    return sorted(lines, key=lambda one: (-one.upper, -one.alarms, one.machine.machine))
+
+
+def _moment(utc: str) -> str:
+    return utc_text(datetime.fromisoformat(utc)) if utc else "~"  # what is not due comes last
+
+
+def _fits(one: Stand, asked: Asked) -> bool:
+    return asked.name.casefold() in one.machine.casefold() and asked.verdict in {"", one.verdict}
+
+
+def _line(store: ServiceStore, one: Stand) -> FleetLine:
+    judged = [figure for figure in one.figures if figure.limit]
+    worst = max(judged, key=lambda f: (f.value + (f.expanded or 0.0)) / (f.limit or 1.0), default=None)
+    return FleetLine(one, worst, sum(is_open(alarm) for alarm in folded(store.alarm_entries(one.machine))))
+
+
+def fleet_csv(lines: Sequence[FleetLine]) -> str:
+    """The same for a spreadsheet: figures as stored, in the unit at the end of their name; times in UTC."""
+    out = io.StringIO()
+    write = csv.writer(out, lineterminator="\n")
+    write.writerow(COLUMNS)
+    for line in lines:
+        one, worst = line.machine, line.worst
+        figure = ("", "", "", "", "") if worst is None else (worst.name, worst.value, worst.expanded, worst.limit, line.share)
+        write.writerow([_cell(v) for v in (one.machine, one.state, one.check_utc, one.verdict, *figure, one.next_due_utc, one.next_recipe)]
+                       + [line.alarms])  # fmt: skip
+    return out.getvalue()
+
+
+def _cell(value: object) -> object:
+    """A text that a spreadsheet does not take for a formula."""
+    if value is None:
+        return ""
+    return "'" + value if isinstance(value, str) and value.startswith(_FORMULA) else value

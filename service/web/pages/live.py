@@ -1,0 +1,48 @@
+"""The live run: what is measured now, and the buttons that hold and end it. Everything that moves is drawn by ``static/live.js``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from fastapi import FastAPI
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment
+
+from service.channel.messages import JobSeen
+from service.users.roles import Permission
+from service.web import language
+from service.web.access import needs
+from service.web.door import Door
+from service.web.frame import current
+from service.web.pages.desk import Desk, Source
+
+SCRIPT_WORDS = (
+    "live.abort", "live.ended", "live.gone", "live.old", "live.pause", "live.resume", "live.stop", "live.no_path",
+    "live.of", "live.share_here",
+)  # fmt: skip
+"""What the script fills in; the states of a measurement, and how one ends, come on top."""
+
+
+def add_live_page(app: FastAPI, env: Environment, door: Door, source: Source, jobs: Callable[[], Sequence[JobSeen]] = tuple) -> None:
+    """Add the screen to the application. ``jobs``: those since the service began, newest first; how the last one ended is told."""
+    desk = Desk(env, door, source)
+
+    @app.get("/live", include_in_schema=False)
+    @needs(Permission.READ)
+    async def live() -> HTMLResponse:
+        status = await source.status()
+        return await desk.show(
+            "live.html",
+            moment=status,
+            last=next((job for job in jobs() if job.ended_utc is not None), None),
+            may_measure=current().may(Permission.MEASURE) and bool(current().csrf),
+            words=script_words(current().lang),
+            due_words=lambda one: language.due(current().lang, one.due_utc, status.now_utc),
+        )
+
+
+def script_words(lang: str) -> dict[str, str]:
+    """The texts that the script needs, by key."""
+    told = language.catalogue(lang)
+    states = {key: text for key, text in told.items() if key.startswith(("measuring.", "slot."))}
+    return {key: told[key] for key in SCRIPT_WORDS} | states

@@ -1,0 +1,61 @@
+"""A new test: choose a recipe, see what it would drive, go through the checklist, start it. Only the start moves anything."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from datetime import date
+from typing import Annotated
+
+from fastapi import FastAPI, Query
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment
+
+from service.channel.messages import RulesTold
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.door import Door
+from service.web.frame import current
+from service.web.pages.desk import Desk, Source
+from service.web.pages.rehearsal import CAMPAIGN, Rehearsals
+from service.workflows.shipped import USUAL_HZ
+
+Recipe = Annotated[str, Query(max_length=200)]
+Rate = Annotated[int, Query(ge=1, le=1000)]
+
+
+def add_new_page(app: FastAPI, env: Environment, door: Door, source: Source, plans: Rehearsals) -> None:
+    """Add the screen to the application."""
+    desk = Desk(env, door, source)
+
+    @app.get("/new", include_in_schema=False)
+    @needs(Permission.READ)
+    async def new(recipe: Recipe = "", rate_hz: Rate = USUAL_HZ) -> HTMLResponse:
+        status = await source.status()
+        rate_hz = rate_hz if rate_hz in plans.rates_hz else USUAL_HZ
+        choices = plans.choices()
+        chosen = recipe if recipe in choices else next(iter(choices), "")
+        dry = await asyncio.to_thread(plans.run, chosen, rate_hz, current().drawn("mm"))
+        return await desk.show(
+            "new.html",
+            moment=status,
+            choices=choices,
+            chosen=chosen,
+            rates_hz=plans.rates_hz,
+            rate_hz=rate_hz,
+            usual_hz=USUAL_HZ,
+            dry=dry,
+            led=chosen == CAMPAIGN,
+            max_feed=None if plans.told is None else plans.told.max_feed_mm_min,
+            may_measure=current().may(Permission.MEASURE) and bool(current().csrf),
+            may_propose=current().may(Permission.PROPOSE),
+            key=secrets.token_hex(16),
+            past_due=expired(plans.rules, status.now_utc.date()),
+            temperature_c=None if plans.rules is None else plans.rules.temperature_c,
+        )
+
+
+def expired(rules: RulesTold | None, today: date) -> list[tuple[str, date]]:
+    """Instruments whose certificate is over, and since when."""
+    told = {} if rules is None or rules.calibrated_until is None else rules.calibrated_until
+    return [(kind, until) for kind, until in sorted(told.items()) if until < today]

@@ -1,0 +1,111 @@
+"""The addresses of the plant: all machines, this one's devices, settings and diagnostics."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+from urllib.parse import urlencode
+
+from fastapi import FastAPI, Query, Request
+from fastapi.responses import HTMLResponse, Response
+from jinja2 import Environment
+from pydantic import AfterValidator
+
+from service.audit.chain import Event
+from service.users.roles import Permission
+from service.web import language
+from service.web.access import needs
+from service.web.api.sources import Sources
+from service.web.door import Door
+from service.web.frame import THEMES, current
+from service.web.guard import Visit
+from service.web.pages.desk import Desk, Source, can_be_stored
+from service.web.pages.devices import device_screen
+from service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
+from service.web.pages.fleet import SORTS, Asked, fleet_csv, fleet_lines
+from service.web.units import SYSTEMS
+
+Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
+Sort = Literal["worst", "machine", "due"]
+BUNDLE_ACTION = "support bundle"
+
+
+def add_plant_screens(app: FastAPI, env: Environment, door: Door, source: Source, sources: Sources) -> None:
+    """Add the screens."""
+    desk = Desk(env, door, source, sources.rules)
+    _add_fleet(app, desk, sources)
+    _add_devices(app, desk, sources)
+    _add_settings(app, desk, sources)
+
+
+def _add_fleet(app: FastAPI, desk: Desk, sources: Sources) -> None:
+    @app.get("/fleet", include_in_schema=False)
+    @needs(Permission.READ)
+    async def fleet(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> HTMLResponse:
+        asked, now, lang = Asked(name, verdict, sort), sources.clock.utc(), current().lang
+        lines = await desk.read(fleet_lines, sources.store, now, asked)
+
+        def named(key: str) -> tuple[str, str]:
+            words, unit = language.figure(lang, key)
+            return words, current().unit(unit)
+
+        return await desk.show(
+            "fleet.html",
+            lines=lines,
+            asked=asked,
+            sorts=SORTS,
+            csv=f"/fleet.csv?{urlencode({'name': name, 'verdict': verdict, 'sort': sort})}",
+            ago=lambda utc: language.ago(lang, datetime.fromisoformat(utc), now),
+            name=named,
+            measured=lambda value, key: current().length(value, language.figure(lang, key)[1]),
+        )
+
+    @app.get("/fleet.csv", include_in_schema=False)
+    @needs(Permission.READ)
+    async def as_csv(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> Response:
+        lines = await desk.read(fleet_lines, sources.store, sources.clock.utc(), Asked(name, verdict, sort))
+        headers = {"Content-Disposition": 'attachment; filename="fleet.csv"'}
+        return Response(fleet_csv(lines), media_type="text/csv; charset=utf-8", headers=headers)
+
+
+def _add_devices(app: FastAPI, desk: Desk, sources: Sources) -> None:
+    @app.get("/devices", include_in_schema=False)
+    @needs(Permission.READ)
+    async def devices() -> HTMLResponse:
+        status, now = await desk.source.status(), sources.clock.utc()
+        until = sources.rules.calibrated_until
+        screen = await desk.read(device_screen, sources.store, sources.machine, status.devices, until, now.date())
+        lang = current().lang
+        return await desk.show("devices.html", screen=screen, ago=lambda at: language.ago(lang, at, now))
+
+
+def _lines(sources: Sources) -> list[str]:
+    return [] if sources.tail is None else sources.tail.lines()
+
+
+def _add_settings(app: FastAPI, desk: Desk, sources: Sources) -> None:
+    @app.get("/settings", include_in_schema=False)
+    @needs(Permission.READ)
+    async def settings() -> HTMLResponse:
+        users = await desk.read(sources.store.users) if current().may(Permission.USERS) else []
+        return await desk.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, users=users)
+
+    @app.get("/diagnostics", include_in_schema=False)
+    @needs(Permission.CONFIGURE)
+    async def diagnostics() -> HTMLResponse:
+        found = await desk.read(diagnosis, sources, app.version)
+        return await desk.show("diagnostics.html", found=found, log=_lines(sources), megabytes=megabytes)
+
+    @app.get("/support.zip", include_in_schema=False)
+    @needs(Permission.CONFIGURE)
+    async def support(request: Request) -> Response:
+        visit: Visit = request.state.visit
+        status = await desk.source.status()
+        found = await desk.read(diagnosis, sources, app.version)
+        log = _lines(sources)
+        made = await desk.read(bundle, found, config_of(sources, status, status.mqtt.broker), status, log)
+        # It takes what is known of the plant out of the house: that stands in the audit, or it does not happen.
+        event = Event(visit.principal.name, BUNDLE_ACTION, sources.machine, "done", {"address": visit.address, "bytes": len(made)})
+        await desk.door.record(event)
+        headers = {"Content-Disposition": 'attachment; filename="abbe-support.zip"', "Cache-Control": "no-store"}
+        return Response(made, media_type="application/zip", headers=headers)

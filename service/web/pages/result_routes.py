@@ -1,0 +1,92 @@
+"""Addresses of the screens that look into results: map of the volume, what-if, budget, runs side by side."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import FastAPI, Query
+from fastapi.responses import HTMLResponse
+
+from service.storage.records import SolutionRecord
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.frame import current
+from service.web.pages.budget import budget_screen
+from service.web.pages.compare import compare_screen
+from service.web.pages.desk import Desk, found
+from service.web.pages.results import solution_lines
+from service.web.pages.volume import NODES, Asked, volume_screen
+from service.web.pages.whatif import whatif_screen
+
+LARGEST = 2**31 - 1
+Number = Annotated[int | None, Query(ge=1, le=LARGEST)]
+Names = Annotated[list[Annotated[str, Query(max_length=12)]], Query(max_length=30)]
+Runs = Annotated[list[Annotated[int, Query(ge=1, le=LARGEST)]], Query(max_length=20)]
+Plane = Literal["XY", "XZ", "YZ"]
+
+
+def add_result_pages(app: FastAPI, desk: Desk) -> None:
+    """Add the screens to the application."""
+    _add_volume(app, desk)
+    _add_whatif(app, desk)
+    _add_budget(app, desk)
+    _add_compare(app, desk)
+
+
+async def _solution(desk: Desk, number: int | None) -> SolutionRecord | HTMLResponse | None:
+    """The solution that was asked for, or the newest; None: there is none at all; or the answer that it is not there."""
+    if number is None:
+        newest = await desk.read(solution_lines, desk.store, 1)
+        if not newest:
+            return None
+        number = newest[0].id
+    record = await desk.read(found, desk.store.solution, number)
+    return record if record is not None else await desk.missing("solution", number)
+
+
+def _add_volume(app: FastAPI, desk: Desk) -> None:
+    @app.get("/volume", include_in_schema=False)
+    @needs(Permission.READ)
+    async def volume(
+        id: Number = None,
+        motion: Names = [],  # noqa: B006 - FastAPI copies it
+        plane: Plane = "XY",
+        at: Annotated[int, Query(ge=-1, le=99)] = -1,
+        nodes: Annotated[int, Query(ge=NODES[0], le=NODES[-1])] = NODES[-1],
+    ) -> HTMLResponse:
+        record = await _solution(desk, id)
+        if isinstance(record, HTMLResponse):
+            return record
+        asked = Asked(tuple(motion), plane, at, nodes)
+        screen = None if record is None else await desk.read(volume_screen, desk.store, record, asked, current().say)
+        return await desk.show("volume.html", screen=screen, counts=NODES)
+
+
+def _add_whatif(app: FastAPI, desk: Desk) -> None:
+    @app.get("/whatif", include_in_schema=False)
+    @needs(Permission.READ)
+    async def whatif(id: Number = None, take: Names = [], everything: bool = False) -> HTMLResponse:  # noqa: B006
+        record = await _solution(desk, id)
+        if isinstance(record, HTMLResponse):
+            return record
+        screen = None if record is None else await desk.read(whatif_screen, desk.store, record, take, everything, current().say)
+        return await desk.show("whatif.html", 409 if screen is not None and screen.trouble else 200, screen=screen)
+
+
+def _add_budget(app: FastAPI, desk: Desk) -> None:
+    @app.get("/budget", include_in_schema=False)
+    @needs(Permission.READ)
+    async def budget(id: Number = None) -> HTMLResponse:
+        record = await _solution(desk, id)
+        if isinstance(record, HTMLResponse):
+            return record
+        screen = None if record is None else await desk.read(budget_screen, desk.store, record, current().say)
+        return await desk.show("budget.html", screen=screen)
+
+
+def _add_compare(app: FastAPI, desk: Desk) -> None:
+    @app.get("/compare", include_in_schema=False)
+    @needs(Permission.READ)
+    async def compare(run: Runs = []) -> HTMLResponse:  # noqa: B006
+        screen = await desk.read(compare_screen, desk.store, run, current().say, desk.rules)
+        return await desk.show("compare.html", 409 if screen.trouble else 200, screen=screen)

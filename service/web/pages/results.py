@@ -1,0 +1,148 @@
+"""Solutions and discoveries for the screens: lists, and one with its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from markupsafe import Markup
+
+from models.machine import Machine
+from service.errors import AbbeError
+from service.report.document import Document, Sign
+from service.report.numbers import plain
+from service.report.plots.bars import contribution_bars
+from service.site import machine_from_doc
+from service.storage.records import DiscoveryRecord, SolutionRecord, StepRecord
+from service.storage.store import Store
+from service.web.frame import current
+from service.web.pages.ranking import Ranked, ranking
+from service.workflows.report_discovery import discovery_report
+from service.workflows.report_measured import SOLUTION_SIGNS
+from service.workflows.report_parts import Rules
+
+MOST = 50
+MOST_SOLUTIONS = 20
+"""Each is half a megabyte: more of them would make the list slow."""
+
+
+@dataclass(frozen=True, slots=True)
+class SolutionLine:
+    """One solution in the list."""
+
+    id: int
+    campaign: str
+    model: str
+    sign: Sign
+    word: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class ResultScreen:
+    """One solution. ``ranked``: empty where its document does not hold what it takes; ``picture``: of what the runs show."""
+
+    line: SolutionLine
+    text: str
+    ranked: Sequence[Ranked]
+    picture: Markup
+    not_observable: Sequence[str]
+    advice: Sequence[str]
+    budget: Sequence[tuple[str, str, str]]
+    runs: Sequence[tuple[str, str, str, str, str]]
+    flags: Sequence[str]
+
+    @property
+    def hidden(self) -> list[Ranked]:
+        """Motions that these runs do not show by themselves."""
+        return [r for r in self.ranked if r.hidden]
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoveryLine:
+    """One search in the list: the last state that it reached, and why."""
+
+    id: int
+    campaign: str
+    state: str
+    why: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoveryScreen:
+    """One search: its states in order, and its report, None while it has not ended (then ``trouble`` says so)."""
+
+    line: DiscoveryLine
+    steps: Sequence[StepRecord]
+    document: Document | None
+    trouble: str = ""
+
+
+def solution_lines(store: Store, limit: int = MOST_SOLUTIONS) -> list[SolutionLine]:
+    """Solutions of campaigns, newest first."""
+    names = {c.id: c.name for c in store.campaigns()}
+    newest = store.latest_solutions("joint", limit)
+    return [_line(s, names.get(s.campaign_id, "")) for s in newest if "mean_over_volume" in s.doc]
+
+
+def _line(record: SolutionRecord, campaign: str) -> SolutionLine:
+    told = record.doc.get("verdict") or {}
+    word = str(told.get("word", ""))
+    return SolutionLine(record.id, campaign, str(record.doc.get("model", "")), SOLUTION_SIGNS.get(word, "open"), word, record.created_utc)
+
+
+def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
+    """A solution with what contributes most to the machine's error."""
+    doc, campaign = record.doc, store.campaign(record.campaign_id)
+    ranked = _ranked(doc, store.machine(campaign.machine_id).doc)
+    shown = [r.contribution for r in ranked if not r.hidden]
+    # The SVG writer has escaped every text; escaping again would show the reader the tags.
+    picture = Markup(contribution_bars(shown, unit=current().drawn())) if shown else Markup("")  # noqa: S704
+    runs = doc.get("runs") or {}
+    return ResultScreen(
+        _line(record, campaign.name),
+        str((doc.get("verdict") or {}).get("text", "")),
+        ranked,
+        picture,
+        [str(v) for v in doc.get("not_observable") or []],
+        [str(v) for v in doc.get("advice") or []],
+        [(str(b["words"]), plain(b["u_um"], 2), f"{b['share']:.0%}") for b in (doc.get("uncertainty") or {}).get("budget") or []],
+        [(str(k), str(r["readings"]), plain(r["rms_um"]), plain(r["expected_um"]), str(r["outliers"])) for k, r in runs.items()],
+        [str(v) for v in doc.get("flags") or []],
+    )
+
+
+def _ranked(doc: dict[str, Any], machine: dict[str, Any]) -> list[Ranked]:
+    if "prediction" not in doc:
+        return []  # stored by a version that did not keep the covariance
+    geometry: Machine = machine_from_doc(machine)
+    return ranking(doc["prediction"], doc.get("motions") or {}, geometry)
+
+
+def discovery_lines(store: Store) -> list[DiscoveryLine]:
+    """Searches, newest first."""
+    names = {c.id: c.name for c in store.campaigns()}
+    newest = list(reversed(store.discoveries()))[:MOST]
+    return [_discovery_line(d, names.get(d.campaign_id, ""), store.discovery_steps(d.id)) for d in newest]
+
+
+def _discovery_line(record: DiscoveryRecord, campaign: str, steps: Sequence[StepRecord]) -> DiscoveryLine:
+    last = steps[-1] if steps else None
+    why = "" if last is None else str(last.doc.get("why", ""))
+    return DiscoveryLine(record.id, campaign, "" if last is None else last.state, why, record.created_utc)
+
+
+def discovery_screen(store: Store, record: DiscoveryRecord, rules: Rules) -> DiscoveryScreen:
+    """A search as it was stored; nothing is searched again."""
+    steps = store.discovery_steps(record.id)
+    line = _discovery_line(record, store.campaign(record.campaign_id).name, steps)
+    story = [(s.state, str(s.doc.get("why", ""))) for s in steps]
+    try:
+        told = discovery_report(store, record.id, rules)
+        # The states stand above with their times: the report's table of them would only say it again.
+        tables = [t for t in told.tables if [tuple(row) for row in t.rows] != story]
+        return DiscoveryScreen(line, steps, replace(told, tables=tables))
+    except AbbeError as error:
+        return DiscoveryScreen(line, steps, None, error.detail)

@@ -1,0 +1,200 @@
+"""The addresses of the operator's screens. Every one says what it needs; the guard lets through who has it."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import asdict
+from typing import Annotated
+from urllib.parse import parse_qs
+
+from fastapi import FastAPI, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from jinja2 import Environment
+from pydantic import AfterValidator
+
+from service.errors import StoreError, TableRefused
+from service.report.document_data import shown
+from service.report.palette import style_rules
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.door import Door
+from service.web.guard import Visit
+from service.web.pages import times
+from service.web.pages.colours import themed
+from service.web.pages.desk import Desk, Source, can_be_stored, found
+from service.web.pages.proposals import approve_as, proposal_lines, proposal_screen
+from service.web.pages.result_routes import add_result_pages
+from service.web.pages.results import discovery_lines, discovery_screen, result_screen, solution_lines
+from service.web.pages.runs import STATES, TESTS, Wanted, newest_run, run_list, run_screen
+from service.web.pages.table import ends
+from service.web.problems import problem
+from service.workflows.report_parts import Rules
+
+LONGEST_FORM = 1024
+HOURS = (1.0, 8.0, 24.0, 72.0)
+Number = Annotated[int | None, Query(ge=1, le=2**31 - 1)]
+Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
+PLOT_STYLE = themed(style_rules())
+
+
+def add_pages(app: FastAPI, env: Environment, door: Door, source: Source, rules: Rules) -> None:
+    """Add the screens to the application. ``rules``: limits and certificates of the machine file."""
+    desk = Desk(env, door, source, rules)
+
+    @app.get("/plots.css", include_in_schema=False)
+    @needs(Permission.READ)
+    async def plots() -> Response:
+        return Response(PLOT_STYLE, media_type="text/css")
+
+    _add_runs(app, desk)
+    _add_results(app, desk)
+    add_result_pages(app, desk)
+    _add_proposals(app, desk)
+    _add_approval(app, desk)
+    _add_times(app, desk)
+
+
+def _add_runs(app: FastAPI, desk: Desk) -> None:
+    @app.get("/runs", include_in_schema=False)
+    @needs(Permission.READ)
+    async def runs(campaign: Text = "", test: Text = "", state: Text = "") -> HTMLResponse:
+        wanted = Wanted(campaign, test, state)
+        listed = await desk.read(run_list, desk.store, wanted)
+        return await desk.show("runs.html", listed=listed, wanted=wanted, tests=TESTS, states=STATES)
+
+    @app.get("/run", include_in_schema=False)
+    @needs(Permission.READ)
+    async def run(id: Number = None) -> HTMLResponse:
+        if id is None:
+            record = await desk.read(newest_run, desk.store)
+        else:
+            record = await desk.read(found, desk.store.run, id)
+            if record is None:
+                return await desk.missing("run", id)
+        screen = None if record is None else await desk.read(run_screen, desk.store, record, desk.rules)
+        told = None if screen is None or screen.document is None else shown(screen.document)
+        return await desk.show("run.html", screen=screen, told=told)
+
+
+def _add_results(app: FastAPI, desk: Desk) -> None:
+    @app.get("/results", include_in_schema=False)
+    @needs(Permission.READ)
+    async def results() -> HTMLResponse:
+        return await desk.show("results.html", lines=await desk.read(solution_lines, desk.store))
+
+    @app.get("/result", include_in_schema=False)
+    @needs(Permission.READ)
+    async def result(id: Number = None) -> HTMLResponse:
+        newest = await desk.read(solution_lines, desk.store, 1) if id is None else []
+        number = newest[0].id if newest else id
+        record = None if number is None else await desk.read(found, desk.store.solution, number)
+        if record is None and number is not None:
+            return await desk.missing("solution", number)
+        screen = None if record is None else await desk.read(result_screen, desk.store, record)
+        return await desk.show("result.html", screen=screen)
+
+    @app.get("/discoveries", include_in_schema=False)
+    @needs(Permission.READ)
+    async def discoveries() -> HTMLResponse:
+        return await desk.show("discoveries.html", lines=await desk.read(discovery_lines, desk.store))
+
+    @app.get("/discovery", include_in_schema=False)
+    @needs(Permission.READ)
+    async def discovery(id: Number = None) -> HTMLResponse:
+        newest = (await desk.read(discovery_lines, desk.store))[:1] if id is None else []
+        number = newest[0].id if newest else id
+        record = None if number is None else await desk.read(found, desk.store.discovery, number)
+        if record is None and number is not None:
+            return await desk.missing("discovery", number)
+        screen = None if record is None else await desk.read(discovery_screen, desk.store, record, desk.rules)
+        told = None if screen is None or screen.document is None else shown(screen.document)
+        return await desk.show("discovery.html", screen=screen, told=told)
+
+
+def _add_proposals(app: FastAPI, desk: Desk) -> None:
+    @app.get("/proposals", include_in_schema=False)
+    @needs(Permission.READ)
+    async def proposals() -> HTMLResponse:
+        return await desk.show("proposals.html", lines=await desk.read(proposal_lines, desk.store))
+
+    @app.get("/proposal", include_in_schema=False)
+    @needs(Permission.READ)
+    async def proposal(id: Number = None) -> HTMLResponse:
+        newest = (await desk.read(proposal_lines, desk.store))[:1] if id is None else []
+        number = newest[0].number if newest else id
+        record = None if number is None else await desk.read(found, desk.store.proposal, number)
+        if number is None:
+            return await desk.show("proposal.html", screen=None)
+        if record is None:
+            return await desk.missing("proposal", number)
+        try:
+            screen = await desk.read(proposal_screen, desk.store, number)
+        except StoreError as error:
+            return await desk.show("changed.html", 409, number=number, text=error.detail)
+        return await desk.show("proposal.html", screen=screen, hours=HOURS, key=secrets.token_hex(8), words=ends("table.word"))
+
+
+def _add_approval(app: FastAPI, desk: Desk) -> None:
+    @app.post("/proposal/approve", include_in_schema=False)
+    @needs(Permission.APPROVE)
+    async def approve(request: Request) -> Response:
+        visit: Visit = request.state.visit
+        asked = _approval(await _form(request))
+        if asked is None:
+            return problem(422, "the form names no proposal, or hours that are not between 0.01 and 720")
+        number, hours = asked
+        visit.target = f"proposal {number}"
+        account = visit.principal.name
+        name = account.partition(":")[2].partition("/")[0]
+        try:
+            await desk.read(approve_as, desk.store, number, name, account, hours)
+        except TableRefused as error:
+            return problem(409, str(error), error.code)
+        except StoreError as error:
+            if error.detail.startswith("no "):
+                return problem(404, error.detail, error.code)
+            raise
+        return RedirectResponse(f"/proposal?id={number}", 303)
+
+
+def _approval(fields: dict[str, str]) -> tuple[int, float] | None:
+    """Number and hours of a form."""
+    try:
+        number, hours = int(fields.get("number", "")), float(fields.get("hours", ""))
+    except ValueError:
+        return None
+    return (number, hours) if 1 <= number < 2**31 and 0.01 <= hours <= 720.0 else None
+
+
+async def _form(request: Request) -> dict[str, str]:
+    """Fields of a short form; empty where it is too long."""
+    body = b""
+    async for piece in request.stream():
+        body += piece
+        if len(body) > LONGEST_FORM:
+            return {}
+    try:
+        return {key: values[0] for key, values in parse_qs(body.decode("utf-8", "replace"), max_num_fields=8).items()}
+    except ValueError:  # more fields than that
+        return {}
+
+
+def _add_times(app: FastAPI, desk: Desk) -> None:
+    @app.get("/trends", include_in_schema=False)
+    @needs(Permission.READ)
+    async def trends() -> HTMLResponse:
+        past = await desk.source.verifications(times.CHECKS)
+        moment = await desk.source.status()
+        return await desk.show("trends.html", **asdict(await desk.read(times.trend_screen, past, moment)))
+
+    @app.get("/schedule", include_in_schema=False)
+    @needs(Permission.READ)
+    async def schedule() -> HTMLResponse:
+        moment = await desk.source.status()
+        return await desk.show("schedule.html", lines=await desk.read(times.schedule_lines, desk.store, moment))
+
+    @app.get("/audit", include_in_schema=False)
+    @needs(Permission.AUDIT)
+    async def audit() -> HTMLResponse:
+        records = await desk.read(desk.store.audit, times.AUDIT_ROWS)
+        return await desk.show("audit.html", records=list(reversed(records)))

@@ -1,0 +1,87 @@
+"""Runs for the screens: the newest that fit a filter, and one run with its figures and pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from service.devices.urls import DeviceUrls
+from service.errors import AbbeError
+from service.report.document import Document
+from service.runs.cases import set_once
+from service.runs.columns import load_run
+from service.site import Site, machine_from_doc
+from service.storage.records import INCOMPLETE, RUNNING, RunRecord
+from service.storage.store import Store
+from service.workflows.campaign_folder import Campaign
+from service.workflows.report_measured import Measured, run_report
+from service.workflows.report_parts import Rules
+
+TESTS = ("ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear")
+STATES = ("complete", "running", "incomplete", "stopped", "aborted", "failed", "interrupted", "disk_full")
+MOST = 100
+MOST_CAMPAIGNS = 50
+MOST_RUNNING = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What a list of runs is limited to; empty: not limited."""
+
+    campaign: str = ""
+    test: str = ""
+    state: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RunList:
+    """The newest runs that fit, whether there are more, and the campaigns to choose from."""
+
+    runs: list[RunRecord]
+    more: bool
+    campaigns: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class RunScreen:
+    """One run. ``document``: its report, None where it cannot be read; ``trouble``: why."""
+
+    record: RunRecord
+    document: Document | None
+    trouble: str = ""
+
+
+def run_list(store: Store, wanted: Wanted) -> RunList:
+    """The newest runs that fit."""
+    names = [c.name for c in reversed(store.campaigns())][:MOST_CAMPAIGNS]
+    if wanted.state in (INCOMPLETE, RUNNING):  # both are written as running; which it is depends on whether its process still lives
+        running = store.latest_runs(MOST_RUNNING, campaign=wanted.campaign, test=wanted.test, status=RUNNING)
+        fitting = [run for run in running if run.visible_status == wanted.state]
+    else:
+        fitting = store.latest_runs(MOST + 1, campaign=wanted.campaign, test=wanted.test, status=wanted.state)
+    return RunList(fitting[:MOST], len(fitting) > MOST, names)
+
+
+def newest_run(store: Store) -> RunRecord | None:
+    """The run that was started last."""
+    return next(iter(store.latest_runs(1)), None)
+
+
+def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:
+    """A run as its report has it, by the limits and certificates of the machine file. Says why where it cannot be read."""
+    try:
+        return RunScreen(record, run_document(store, record, rules)[1])
+    except AbbeError as error:
+        return RunScreen(record, None, error.detail)
+    except (KeyError, TypeError, ValueError, IndexError) as error:  # a document of another version, or changed by hand
+        return RunScreen(record, None, f"{type(error).__name__}: {error}")
+
+
+def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[dict[str, Any], Document]:
+    """A run as an ``abbe-run/1`` object, and its report; errors of both."""
+    owner = store.campaign(record.campaign_id)
+    machine: dict[str, Any] = store.machine(owner.machine_id).doc
+    run = set_once([load_run(store, record.id)])[0]
+    site = Site(str(machine.get("name") or record.campaign), machine_from_doc(machine), machine, DeviceUrls())
+    known = owner.doc.get("imported") or owner.doc
+    return run, run_report(Measured(Campaign(record.campaign, site, [run], None, known)), record.label, rules)

@@ -1,0 +1,57 @@
+"""The screen of the table in force: which it is by the push journal, how it came there, what was pushed, and the order back."""
+
+from __future__ import annotations
+
+import secrets
+
+from fastapi import FastAPI
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment
+
+from service.errors import StoreError
+from service.users.roles import Permission
+from service.web.access import needs
+from service.web.api.sources import Sources
+from service.web.door import Door
+from service.web.frame import current
+from service.web.pages.desk import Desk, Source
+from service.workflows.table_story import story
+
+MOST = 50
+SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}
+ENDS = ("kept", "rolled back", "refused", "failed", "stopped", "open", "interrupted")
+"""How an order of a table ends."""
+
+
+def ends(group: str) -> dict[str, str]:
+    """The words of these ends for a reader, from a group of the catalogue."""
+    return {word: current().state(group, word) for word in ENDS}
+
+
+def add_table_screen(app: FastAPI, env: Environment, door: Door, source: Source, sources: Sources) -> None:
+    """Add the screen to the application."""
+    desk = Desk(env, door, source, sources.rules)
+
+    @app.get("/table", include_in_schema=False)
+    @needs(Permission.READ)
+    async def table() -> HTMLResponse:
+        try:
+            told = await desk.read(story, sources.store, sources.machine)
+        except StoreError as error:
+            if not error.detail.startswith("the push journal is not"):
+                raise
+            return await desk.show("table.html", 409, broken=error.detail, told=None)
+        status = await source.status()
+        return await desk.show(
+            "table.html",
+            told=told,
+            broken="",
+            pushes=told.pushes[:MOST],
+            attention=status.attention,
+            job=status.job,
+            may_order=current().may(Permission.APPROVE) and bool(current().csrf),
+            key=secrets.token_hex(8),
+            words=ends("table.back_word"),
+            sign=lambda word: SIGNS.get(word, "open"),
+            crc=lambda number: f"{number:08X}",
+        )

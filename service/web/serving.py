@@ -1,0 +1,99 @@
+"""The web process put together: channel, store, users, application, server; and its end when the core has ended."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from dataclasses import asdict
+
+import structlog
+
+from service.audit.book import AuditBook
+from service.channel.messages import PROTOCOL, Alive, Begin, Up, from_core
+from service.channel.wire import Wire
+from service.clock import SystemClock
+from service.errors import AbbeError, ChannelBroken
+from service.plant.gather import Gatherer
+from service.scheduler.slots import Needs, Schedule
+from service.scheduler.store import ServiceStore
+from service.users.people import People
+from service.web.api.sources import Sources
+from service.web.app import Parts, create_app
+from service.web.core_line import CoreLine
+from service.web.door import Door, Front
+from service.web.logtail import keep_log
+from service.web.pages.rehearsal import Rehearsals
+from service.web.server import Server, make_server
+from service.web.view import View
+from service.workflows.report_parts import Rules
+
+log = structlog.get_logger("abbe.web")
+
+ALIVE_S = 2.0
+
+
+async def serve_pages(channel: socket.socket, listening: socket.socket) -> int:
+    """Serve until the channel ends; return the exit code. What is wrong is one line in the log: the core starts a new process."""
+    wire = await Wire.over(channel)
+    try:
+        begin = await _begin(wire)
+        if begin is None:
+            return 0
+        store = await asyncio.to_thread(ServiceStore.open, begin.store_url)
+        try:
+            return await _serve(wire, begin, store, listening)
+        finally:
+            await asyncio.to_thread(store.close)
+    except AbbeError as error:
+        log.error("the web process cannot serve", code=error.code, cause=str(error))
+        return 1
+    finally:
+        wire.close()
+
+
+async def _begin(wire: Wire) -> Begin | None:
+    """What the core says first; None: it has ended before."""
+    body = await wire.receive()
+    if body is None:
+        return None
+    first = from_core(body)
+    if not isinstance(first, Begin) or first.protocol != PROTOCOL:
+        raise ChannelBroken("the core of the service speaks another version of the channel")
+    return first
+
+
+async def _serve(wire: Wire, begin: Begin, store: ServiceStore, listening: socket.socket) -> int:
+    clock = SystemClock()
+    people = People(store, clock)
+    people.passwords.prepare()
+    core = CoreLine(wire, clock)
+    view = View(begin.machine, begin.version, core, store, core.next_due, begin.broker, clock)
+    door = Door(store, people, AuditBook(store, begin.store_url), Front(begin.port, begin.behind_tls))
+    parts = Parts(core, store, begin.machine, begin.recipes, Rehearsals(begin.plan, begin.recipes, rules=begin.rules), begin.campaigns)
+    plant = Gatherer(view.status, store)
+    schedules = tuple(Schedule(**asdict(told) | {"needs": Needs(**asdict(told.needs))}) for told in begin.schedules)
+    api = Sources(store, begin.machine, clock, schedules, lambda: core.devices, Rules(**asdict(begin.rules)), keep_log())
+    app = create_app(view, version=begin.version, hosts=begin.hosts, door=door, parts=parts, plant=plant, api=api)
+    server = make_server(app, begin.certificate, begin.key)
+    heard = asyncio.create_task(core.listen(), name="core")
+    serving = asyncio.create_task(server.serve(sockets=[listening]), name="server")
+    alive = asyncio.create_task(_alive(wire, server), name="alive")
+    await asyncio.wait({heard, serving, alive}, return_when=asyncio.FIRST_COMPLETED)
+    server.should_exit = True
+    core.end()
+    await asyncio.wait({serving})
+    alive.cancel()
+    heard.cancel()
+    await asyncio.wait({alive, heard})
+    for task in (serving, heard, alive):
+        if not task.cancelled():
+            task.result()
+    return 0
+
+
+async def _alive(wire: Wire, server: Server) -> None:
+    await server.answers.wait()
+    wire.send(Up("up", PROTOCOL))
+    while True:
+        await asyncio.sleep(ALIVE_S)
+        wire.send(Alive("alive"))

@@ -1,0 +1,30 @@
+"""A core that says nothing: people get a screen that says so, programs a problem document. Nothing old is shown as if it were so now."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI, Request
+from fastapi.responses import HTMLResponse, Response
+from jinja2 import Environment
+
+from service.errors import CoreSilent
+from service.web.problems import problem_of
+
+RETRY_S = "5"
+
+
+def add_silence(app: FastAPI, env: Environment) -> None:
+    """Answer `CoreSilent` on every address, by what was asked for."""
+
+    async def silent(request: Request, error: Exception) -> Response:
+        assert isinstance(error, CoreSilent)
+        if not for_people(request):
+            return problem_of(error)
+        return HTMLResponse(env.get_template("silent.html").render(text=str(error)), 503, {"Retry-After": RETRY_S})
+
+    app.add_exception_handler(CoreSilent, silent)
+
+
+def for_people(request: Request) -> bool:
+    """Whether a browser asks for a screen. The home page is one whoever asks: its script fetches it anew without saying what it takes."""
+    path = request.url.path
+    return path == "/" or (not path.startswith("/api/") and "text/html" in request.headers.get("accept", ""))

@@ -1,0 +1,226 @@
+// The live run: two WebSockets (how things stand; what the path reads), two traces, and the buttons that hold and end the run.
+
+import { Traces, framesOf } from "./traces.js";
+
+const AGAIN_MS = 1000;
+const SILENT_MS = 6000;
+const OLD_MS = 2000;
+
+const root = document.getElementById("live");
+const words = JSON.parse(root.dataset.words);
+const spans = JSON.parse(document.body.dataset.words);
+const job = root.dataset.job ?? "";
+// A campaign that the service runs for itself has no number: it is shown, and nobody steers it from here.
+const shows = "job" in root.dataset;
+const lost = document.getElementById("live-lost");
+const find = (id) => document.getElementById(id);
+// What the reader sees deviations in, and how many µm it is; a µin is finer than the tenth of a µm that is shown.
+const unit = { sign: root.dataset.unit, size: Number(root.dataset.size) };
+const decimals = unit.size < 0.1 ? 0 : 1;
+
+function setText(id, text) {
+  const element = find(id);
+  if (element && element.textContent !== text) element.textContent = text;
+}
+
+function span(seconds) {
+  const [key, n] = seconds < 90 ? ["span.s", seconds] : seconds < 5400 ? ["span.min", seconds / 60] : ["span.h", seconds / 3600];
+  return spans[key].replace("{n}", Math.round(n));
+}
+
+// ---- connections: opened again for ever, and a line that says nothing is a lost one -------------------------------------------------
+
+const heard = new Map();
+
+function keepOpen(path, patienceMs, onMessage) {
+  const state = { at: performance.now(), gone: performance.now(), open: false };
+  heard.set(path, state);
+  const connect = () => {
+    const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`);
+    socket.binaryType = "arraybuffer";
+    const watch = setInterval(() => {
+      if (performance.now() - Math.max(state.at, begun) > patienceMs) socket.close();
+    }, 1000);
+    const begun = performance.now();
+    socket.onopen = () => { state.open = true; state.at = performance.now(); };
+    socket.onmessage = (event) => { state.at = performance.now(); onMessage(event.data); };
+    socket.onclose = () => {
+      clearInterval(watch);
+      // An attempt that is refused does not move it: refused again and again is lost.
+      if (state.open) state.gone = performance.now();
+      state.open = false;
+      setTimeout(connect, AGAIN_MS);
+    };
+  };
+  connect();
+}
+
+// ---- how things stand --------------------------------------------------------------------------------------------------------------
+
+let now = null;
+let traces = null;
+
+function showState(state) {
+  setText("live-state", words[`measuring.${state}`] ?? state);
+  const pause = document.querySelector("[data-how=pause], [data-how=resume]");
+  if (!pause) return;
+  const held = ["paused", "pausing", "suspended"].includes(state);
+  pause.dataset.how = held ? "resume" : "pause";
+  const text = held ? words["live.resume"] : words["live.pause"];
+  if (pause.textContent !== text) pause.textContent = text;
+}
+
+// The core tells how far the run is after each step; a path is one step of minutes, and how far it is its samples tell.
+function showProgress() {
+  if (!now || now === "over" || !(now.total > 0)) return;
+  const bar = find("live-bar");
+  const inPath = traces?.running ? traces.count / traces.path.rate_hz : 0;
+  bar.max = now.total;
+  bar.value = Math.min(now.total, now.done + inPath);
+}
+
+// What a person is to do. The number stands at the button: an answer is for what stood there when it was pressed.
+function showPrompt(number, text) {
+  const card = find("by-hand");
+  const button = card.querySelector("button");
+  card.hidden = !number;
+  if (!number || card.dataset.prompt === String(number)) return;
+  card.dataset.prompt = number;
+  setText("by-hand-text", text);
+  setText("by-hand-alert", "");
+  if (button) button.dataset.prompt = number;
+}
+
+async function showEnd() {
+  document.body.classList.add("over");
+  find("steer")?.remove();
+  find("by-hand")?.remove();
+  if (find("ask-stop")?.open) find("ask-stop").close();
+  const answer = job ? await fetch(`/api/v1/jobs/${job}`, { headers: { "X-Abbe-Active": "0" } }).catch(() => null) : null;
+  const told = answer?.ok ? await answer.json() : null;
+  setText("live-outcome", words["live.ended"].replace("{state}", told ? words[`slot.${told.state}`] ?? told.state : "–"));
+  setText("live-text", told?.text ?? "");
+  if (told?.proposal) {
+    find("live-made").hidden = false;
+    find("live-made").querySelector("a").href = `/proposal?id=${told.proposal}`;
+  }
+  setText("live-state", words["measuring.ended"]);
+  find("live-over").hidden = false;
+}
+
+function onMoment(text) {
+  const event = JSON.parse(text);
+  if (!shows) {
+    if (event.job) location.reload();
+    return;
+  }
+  if (now !== "over" && event.job?.id !== job) {
+    now = "over";
+    showEnd();
+    return;
+  }
+  if (now === "over") return;
+  now = event.job;
+  showState(now.state);
+  showProgress();
+  showPrompt(now.prompt, now.ask);
+  if (now.message) setText("live-message", now.message);
+  if (now.steps) setText("live-step", words["live.of"].replace("{n}", now.step).replace("{m}", now.steps));
+  setText("live-points", String(now.points));
+  setText("live-left", now.eta_s === null ? spans["job.unknown"] : spans["job.left"].replace("{span}", span(now.eta_s)));
+}
+
+keepOpen("/api/v1/live", SILENT_MS, onMoment);
+
+// ---- what the path reads ----------------------------------------------------------------------------------------------------------
+
+let asked = false;
+let newest = 0;
+let lastFrame = 0;
+
+function paint() {
+  asked = false;
+  traces.draw();
+  showProgress();
+  setText("live-samples", String(traces.count));
+  if (Number.isFinite(traces.last)) {
+    setText("live-value", traces.last.toFixed(decimals));
+    setText("live-range", `${traces.least.toFixed(decimals)} … ${traces.most.toFixed(decimals)}`);
+    setText("polar-scale", words["live.share_here"].replace("{n}", traces.scale).replace("{unit}", unit.sign));
+    setText("strip-scale", `20 s, ±${traces.scale} ${unit.sign}`);
+  }
+  dispatchEvent(new CustomEvent("live-drawn", { detail: { arrivedMs: newest, count: traces.count } }));
+}
+
+function onSamples(data) {
+  if (typeof data === "string") {
+    const path = JSON.parse(data);
+    setText("live-note", path.number ? "" : words["live.no_path"]);
+    if (path.number && path.number !== traces.path.number) {
+      traces.begin(path);
+      setText("live-run", path.run);
+      lastFrame = performance.now();
+    }
+    traces.running = path.number > 0;
+    return;
+  }
+  for (const frame of framesOf(data)) {
+    if (frame.path !== traces.path.number) continue;
+    traces.take(frame.first, frame.values);
+    newest = frame.arrivedMs;
+    lastFrame = performance.now();
+  }
+  if (!asked) {
+    asked = true;
+    requestAnimationFrame(paint);
+  }
+}
+
+if (shows) {
+  traces = new Traces(find("strip"), find("polar"), unit);
+  keepOpen("/api/v1/live/samples", Infinity, onSamples);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { traces.drawStrip(); traces.drawPolar(true); });
+}
+
+// ---- once a second: is all of this still so? ---------------------------------------------------------------------------------------
+
+setInterval(() => {
+  const old = [...heard.values()].some((state) => !state.open && performance.now() - state.gone > 2 * AGAIN_MS);
+  lost.hidden = !old;
+  if (!shows) return;
+  if (now !== "over") setText("live-elapsed", span(Number(root.dataset.elapsed) + performance.now() / 1000));
+  const stale = old || (traces.running && performance.now() - lastFrame > OLD_MS);
+  find("live-pair").classList.toggle("old", stale);
+  if (traces.running) setText("live-note", stale ? words["live.old"] : "");
+}, 1000);
+
+// ---- steering ----------------------------------------------------------------------------------------------------------------------
+
+async function steer(how) {
+  const headers = { "X-CSRF-Token": root.dataset.csrf };
+  const answer = await fetch(`/api/v1/jobs/${job}/${how}`, { method: "POST", headers }).catch((trouble) => trouble);
+  if (answer.ok) {
+    setText("steer-alert", "");
+    showState((await answer.json()).state);
+    return;
+  }
+  const problem = answer.json ? await answer.json().catch(() => ({})) : {};
+  setText("steer-alert", problem.detail || words["live.gone"]);
+}
+
+const dialog = find("ask-stop");
+if (dialog) {
+  for (const button of document.querySelectorAll("#steer button")) button.addEventListener("click", () => steer(button.dataset.how));
+  dialog.addEventListener("close", () => { if (dialog.returnValue === "stop") steer("stop"); });
+  addEventListener("keydown", (event) => {
+    if (dialog.open || now === "over" || event.altKey || event.ctrlKey || event.metaKey) return;
+    if (event.key === "Escape") {
+      event.preventDefault();
+      dialog.returnValue = "";
+      dialog.showModal();
+    } else if (event.key === " " && !event.target.closest("button, a, input, select, textarea, summary")) {
+      event.preventDefault();
+      if (!event.repeat) steer(document.querySelector("[data-how=pause], [data-how=resume]").dataset.how);
+    }
+  });
+}

@@ -1,0 +1,71 @@
+// Orders something of a table - the one in force back, an approved one pushed - after a person has said so twice, and follows the job until
+// it has ended. The key comes with the page: pressed twice, or asked again after a lost answer, it is one order.
+
+const form = document.getElementById("order");
+const dialog = document.getElementById("ask-order");
+const reason = form?.elements.reason;
+const POLL_MS = 1000;
+
+function say(text) {
+  form.querySelector("[role=alert]").textContent = text;
+}
+
+async function follow(place) {
+  const shown = document.getElementById("order-job");
+  const words = JSON.parse(shown.dataset.words);
+  shown.hidden = false;
+  for (;;) {
+    const answer = await fetch(place, { headers: { "X-Abbe-Active": "0" } }).catch(() => null);
+    if (answer?.ok) {
+      const job = await answer.json();
+      if (job.ended_utc) {
+        const word = job.state.replace(/^done: /, "");
+        document.getElementById("order-state").textContent = words[word] ?? word;
+        document.getElementById("order-text").textContent = job.text;
+        document.getElementById("order-over").hidden = false;
+        return;
+      }
+    } else if (answer) {
+      say(`${answer.status} ${answer.statusText}`);
+      document.getElementById("order-over").hidden = false;
+      return;
+    }
+    await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+  }
+}
+
+async function order() {
+  const { to, body, key, csrf } = form.dataset;
+  const answer = await fetch(to, {
+    method: "POST",
+    body: JSON.stringify(reason ? { ...JSON.parse(body), reason: reason.value.trim() } : JSON.parse(body)),
+    headers: { "Content-Type": "application/json", "X-CSRF-Token": csrf, "Idempotency-Key": key },
+  });
+  if (answer.ok) {
+    form.hidden = true;
+    await follow(answer.headers.get("Location"));
+    return;
+  }
+  const problem = await answer.json().catch(() => ({}));
+  say(problem.detail || `${answer.status} ${answer.statusText}`);
+}
+
+form?.addEventListener("submit", (event) => {
+  event.preventDefault();
+  if (reason && !reason.value.trim()) {
+    reason.focus();
+    return;
+  }
+  if (reason) document.getElementById("ask-reason").textContent = reason.value.trim();
+  dialog.returnValue = "";
+  dialog.showModal();
+});
+
+dialog?.addEventListener("close", async () => {
+  if (dialog.returnValue !== "order") return;
+  const button = form.querySelector("button");
+  button.disabled = true;
+  say("");
+  await order().catch((trouble) => say(String(trouble)));
+  button.disabled = false;
+});

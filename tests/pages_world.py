@@ -1,0 +1,265 @@
+"""A store with something for every screen, filled by the store's own functions, and the service's page over it on a real socket."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, date, datetime, timedelta
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from drivers.api import CompStatus, TableFormat
+from drivers.cnc.tables import crc32, encode
+from drivers.errors import LinkDown
+from models.compensation.tables import NineTables, nine_tables, predict_residual, quantise
+from service.audit.book import AuditBook
+from service.clock import SystemClock
+from service.events import ignore_progress
+from service.runs.exchange import import_folder
+from service.scheduler import record
+from service.scheduler.slots import Schedule
+from service.scheduler.store import ServiceStore
+from service.site import Site
+from service.storage.base import utc_text
+from service.users.passwords import Passwords
+from service.users.people import People
+from service.web.api.sources import Sources
+from service.web.app import create_app
+from service.web.board import Board
+from service.web.door import COOKIE, Door, csrf_token
+from service.web.guard import CSRF_HEADER
+from service.web.listening import bind
+from service.web.logtail import LogTail
+from service.web.server import make_server
+from service.web.view import View
+from service.workflows.base_table import Base
+from service.workflows.campaign_folder import from_folder
+from service.workflows.candidates import Promise, candidate_of
+from service.workflows.discover import discover, prepare
+from service.workflows.discovery_engine import catalogue
+from service.workflows.discovery_store import journal_of
+from service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from service.workflows.report_parts import Rules
+from service.workflows.solve import Solved, solve_runs
+from service.workflows.solve_report import solution_doc
+from service.workflows.tables import table_image
+from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
+from tests.scenarios.campaign_files import measured
+from tests.system.serve_check import Result
+from tests.unit.service.discovery_bench import Search, write_case
+
+PHRASE = "correct horse battery staple"
+SEED = 3
+GRID = (11, 9, 9)
+LSB_NM = 10
+PROPOSER = "petra"
+USERS = {"vera": "viewer", "olga": "operator", PROPOSER: "metrologist", "anna": "approver", "adam": "admin"}
+
+
+@dataclass
+class Filled:
+    """What is in the store. ``evil`` stands behind every name that comes from outside."""
+
+    url: str
+    machine: str
+    schedules: list[Schedule]
+    devices: dict[str, str]
+    campaign: str
+    solution: int
+    proposals: list[int]
+    discovery: int
+
+
+@cache
+def _solved() -> tuple[Solved, str]:
+    site, runs = measured(SEED)
+    solved = solve_runs(site, runs)
+    return solved, json.dumps(solution_doc(solved))
+
+
+def solved_campaign(machine: str) -> tuple[Site, list[dict[str, Any]], Solved, dict[str, Any]]:
+    """Seventeen simulated runs of one machine, what they say, and that as a document."""
+    site, runs = measured(SEED)
+    site = replace(site, name=machine, doc=site.doc | {"name": machine})
+    for run in runs:
+        run["machine"] = site.doc
+        run["columns"]["temp_air_C"] = [20.4] * len(run["columns"]["t_s"])
+    solved, doc = _solved()
+    return site, runs, solved, json.loads(doc)
+
+
+def fill(folder: Path, evil: str = "", checks: int = 24) -> Filled:
+    """Fill a new store with campaign, solution, discovery, proposals, checks and slots."""
+    url = f"sqlite:///{folder / 'abbe.sqlite3'}"
+    machine = f"mill-7{evil}"
+    schedules = [Schedule(f"weekly{evil}", "0 6 * * 1", "Europe/Berlin", f"quick-check{evil}"),
+                 Schedule("night", "30 2 * * *", "Europe/Berlin", "verify")]  # fmt: skip
+    devices = {"ballbar": f"serial:///dev/serial/by-id/usb-bar{evil}", "laser": "modbus://127.0.0.1:5021"}
+    with ServiceStore.open(url) as store:
+        _checks(store, machine, schedules[0], checks, evil)
+        _slots(store, machine, schedules, evil)
+        site, runs, solved, doc = solved_campaign(machine)
+        campaign = f"june{evil}"
+        _import(store, folder / "in", campaign, site, runs)
+        _broken_run(store, campaign, evil)
+        stored = store.campaign(campaign)
+        ids = [r.id for r in store.runs(stored.id) if r.visible_status == "complete"]
+        doc |= {"campaign": campaign, "machine": site.doc, "flags": [f"run r1: look at it{evil}"]}
+        doc["not_observable"] = [*doc["not_observable"], f"the colour of the machine{evil}"]
+        solution = store.add_solution(stored.id, "joint", ids, doc)
+        with ThreadPoolExecutor(1) as aside:  # a test with a browser has a loop in this thread
+            # Before the proposals: what is written afterwards supersedes them.
+            aside.submit(lambda: asyncio.run(_pushes(store, machine, evil))).result()
+        proposals = _proposals(store, site, runs, solved, campaign, solution, evil)
+        return Filled(url, machine, schedules, devices, campaign, solution, proposals, _discovery(store, folder / "c1", evil))
+
+
+def _checks(store: ServiceStore, machine: str, schedule: Schedule, count: int, evil: str) -> None:
+    now, number = datetime.now(UTC), store.add_machine(machine, {"name": machine})
+    for week in range(count):
+        at = now - timedelta(days=7 * (count - 1 - week), hours=3)
+        occasion = record.Occasion(machine, schedule, at)
+        if week == count - 3:
+            trouble = LinkDown(f"modbus+tcp://127.0.0.1:5021{evil}", "connect", f"refused{evil}", f"is the laser on?{evil}")
+            store.keep_verification(number, record.failed(occasion, trouble, at, 5.0), [])
+            continue
+        drift = 11.0 + 0.02 * week**2
+        verdict = "fail" if drift - 1.1 > 20 else "pass" if drift + 1.1 <= 20 else "cannot tell"
+        values = {"diagonal_ppp_um": drift - 3, "body_diagonal_um": drift, "helix_rms_um": 1.2 + 0.1 * week}
+        told = Result(verdict, values, text=f"{verdict}: worst body diagonal {drift:.1f} µm{evil}", started_utc=at, duration_s=312.0,
+                      campaign=f"quick-check {week}{evil}")  # fmt: skip
+        store.keep_verification(number, record.found(occasion, told), [])
+
+
+def _slots(store: ServiceStore, machine: str, schedules: list[Schedule], evil: str) -> None:
+    for day, (state, reason) in enumerate([("done: pass", ""), ("skipped: busy", f"weekly was still running{evil}"), ("done: fail", "")]):
+        at = datetime(2026, 11, 2 + 7 * day, 5, tzinfo=UTC)
+        for schedule in schedules:
+            store.claim_slot(f"{machine}/{schedule.name}", at)
+            store.finish_slot(f"{machine}/{schedule.name}", at, state, reason)
+
+
+def _import(store: ServiceStore, folder: Path, campaign: str, site: Site, runs: list[dict[str, Any]]) -> None:
+    folder.mkdir()
+    entries = []
+    for n, run in enumerate(runs):
+        (folder / f"r{n}.json").write_text(json.dumps(run | {"campaign": campaign}))
+        entries.append({"run_id": run["run_id"], "test": run["test"], "role": run["role"], "file": f"r{n}.json"})
+    head = {"format": "abbe-campaign/1", "campaign": campaign, "machine": site.doc, "temperature_sensors": False, "setups": {}}
+    head |= {"current_model": {"includes": ["rigid21"], "errors": None}, "instruments": {"ballbar": {"resolution_mm": 1e-4}}}
+    (folder / "campaign.json").write_text(json.dumps(head | {"runs": entries}))
+    import_folder(store, folder)
+
+
+def _broken_run(store: ServiceStore, campaign: str, evil: str) -> None:
+    number = store.start_run(store.campaign(campaign).id, f"late{evil}", "ballbar_circle", "identify", {"setup": {}})
+    store.finish_run(number, "stopped", f"SEQ-003: the door was opened{evil}", None)
+
+
+def _proposals(
+    store: ServiceStore, site: Site, runs: list[dict[str, Any]], solved: Solved, campaign: str, solution: int, evil: str
+) -> list[int]:
+    change = nine_tables(solved.joint, GRID)
+    predicted = predict_residual(solved.joint, change)
+    tables = quantise(change, LSB_NM * 1e-6)
+    x, y, z = (np.zeros_like(c) for c in tables.correction_mm)
+    image = encode(table_image(NineTables(tables.position_mm, (x, y, z), tables.u_mm), LSB_NM, 1))
+    base = Base(CompStatus(7, 3, 0, (crc32(image), 0), (3, 0), 0, 0), image)
+    now = datetime.now(UTC)
+    ended_s = (now - timedelta(hours=2)).timestamp()
+    promise = Promise(tables, change, predicted, None, ended_s, ended_s)
+    candidate = candidate_of(site, promise, base, runs, TableFormat(LSB_NM, 4096))
+    one = Proposed(
+        site.doc, campaign, solution, candidate, tables.u_mm, BaseMark(image, 0, 3, 7), 99, site.limits, True, PROPOSER,
+        utc_text(now), (), (f"backlash of X is not in a table{evil}",),
+    )  # fmt: skip
+    out = []
+    for proposed in (replace(one, reasons=(f"STALE: measured 80 h ago{evil}",)), replace(one, by=f"{PROPOSER}{evil}"), one):
+        doc = doc_of(proposed)
+        out.append(store.add_proposal(site.name, solution, doc, digest_of_doc(doc)))
+    return out
+
+
+async def _pushes(store: ServiceStore, machine: str, evil: str) -> None:
+    """A rollback that did not hold, and a push that was kept: that one can be taken back."""
+    back = {"kind": "rollback", "reason": f"worse on the gauge block{evil}", "by": f"user:anna{evil}"}
+    await as_if_pushed(store, SystemClock(), machine, back, (b"the table of May", b"the table of April"), TAKEN_BACK)
+    await as_if_pushed(store, SystemClock(), machine, {"proposal": 99}, (b"the table of May", b"the table of June"), KEPT)
+
+
+def _discovery(store: ServiceStore, folder: Path, evil: str) -> int:
+    write_case(folder, f"c1{evil}")
+    job = prepare(from_folder(folder), catalogue(), None)
+    journal = journal_of(store, job)
+    discover(job, journal, Search("named"), ignore_progress)
+    assert journal.id is not None
+    return journal.id
+
+
+@dataclass
+class Served:
+    """The running page."""
+
+    base: str
+    filled: Filled
+    store: ServiceStore
+    people: People
+    door: Door
+    board: Board
+    tail: LogTail
+
+
+@contextmanager
+def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
+    """The page over a filled store, on a real socket, in a thread with its own event loop."""
+    clock = SystemClock()
+    with ServiceStore.open(filled.url) as store:
+        people = People(store, clock, Passwords(memory_kib=64, passes=1))
+        for name, role in USERS.items() if users else ():
+            if store.user(name) is None:
+                people.add(name, role, PHRASE)
+        door = Door(store, people, AuditBook(store, filled.url), rate_hz=1e6, burst=1e6)
+        board = Board(filled.devices, clock)
+        soon = datetime.now(UTC) + timedelta(hours=30)
+        view = View(filled.machine, "0.1.0", board, store, lambda: [(s, soon) for s in filled.schedules], "", clock)
+        tail = LogTail()
+        rules = Rules({"circularity": 20.0}, {"ballbar": (soon + timedelta(days=90)).date(), "laser": date(2026, 1, 1)})
+        sources = Sources(store, filled.machine, clock, filled.schedules, lambda: board.devices, rules, tail)
+        listening = bind("127.0.0.1", 0)
+        server = make_server(create_app(view, version="0.1.0", door=door, api=sources))
+        thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listening])))
+        thread.start()
+        try:
+            yield Served(f"http://127.0.0.1:{listening.getsockname()[1]}", filled, store, people, door, board, tail)
+        finally:
+            server.should_exit = True
+            thread.join()
+            listening.close()
+
+
+def as_user(running: Served, name: str, **headers: str) -> httpx.Client:
+    """A client with a session of one of `USERS`."""
+    secret = running.people.begin(running.people.get(name))
+    known = {"Cookie": f"{COOKIE}={secret}", CSRF_HEADER: csrf_token(secret), "Origin": running.base}
+    return httpx.Client(base_url=running.base, headers=known | headers, timeout=60)
+
+
+def screens(filled: Filled) -> list[str]:
+    """Every address, with something on it: a helix, a diagonal, a run that was stopped; a refused and an open proposal."""
+    runs = [f"/run?id={n}" for n in (1, 8, 18)]
+    proposals = [f"/proposal?id={n}" for n in filled.proposals[::2]]
+    found = [f"/result?id={filled.solution}", f"/discovery?id={filled.discovery}"]
+    found += [f"/volume?id={filled.solution}", f"/volume?id={filled.solution}&motion=EYY&plane=XZ", f"/budget?id={filled.solution}"]
+    found += [f"/whatif?id={filled.solution}&take=mean.C0Y&take=EYY", "/compare", "/compare?run=1&run=2"]
+    plant = ["/fleet", "/devices", "/settings"]
+    first = ["/", "/new", "/runs", *runs, "/results", "/discoveries", *found]
+    return [*first, "/proposals", *proposals, "/table", "/trends", "/schedule", "/audit", *plant]

@@ -1,0 +1,53 @@
+"""What the interface asks of the store is answered alike by both databases; of two processes one gets a key."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from service.storage.store import Store
+from service.storage.store_decisions import RejectionRecord
+from service.storage.store_pages import LISTINGS
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    return request.getfixturevalue("postgres")() if request.param == "postgresql" else f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
+
+
+def test_pages_of_everything(url: str) -> None:
+    with Store.open(url) as store:
+        machine = store.add_machine("m", {"name": "m"})
+        for name in ("a", "b"):
+            campaign = store.add_campaign(machine, name, {"big": "x"})
+            for k in range(5):
+                store.finish_run(store.start_run(campaign, f"r{k}", "laser_linear", "identify", {}), "complete", "", None)
+        assert [row["label"] for row in store.page("runs", {"campaign": "b", "machine": "m"}, None, 3)] == ["r4", "r3", "r2"]
+        assert [row["id"] for row in store.page("runs", {"role": "identify"}, 4, 100)] == [3, 2, 1]
+        assert store.page("runs", {"campaign": "' OR 1=1 --"}, None, 3) == []
+        for kind in LISTINGS:
+            assert isinstance(store.page(kind, dict.fromkeys(LISTINGS[kind].filters, None), None, 10), list)
+            assert store.row(kind, 77) is None
+        assert store.row("campaigns", 1)["doc"] == {"big": "x"}
+        solution = store.add_solution(1, "joint", [1], {})
+        number = store.add_proposal("m", solution, {"n": 1}, "d")
+        store.add_rejection(RejectionRecord(0, number, "somebody", "user:somebody", "too warm", ""))
+        assert [one.reason for one in store.rejections(number)] == ["too warm"]
+        assert store.rejections(number + 1) == []
+
+
+def test_of_two_services_one_gets_a_key(url: str) -> None:
+    with Store.open(url) as one, Store.open(url) as two, ThreadPoolExecutor(2) as pool:
+        for k in range(20):
+            claims = [pool.submit(store.claim_reply, "user:x", f"k{k}", "d") for store in (one, two)]
+            found = [claim.result() for claim in claims]
+            assert sum(reply is None for reply in found) == 1
+            assert {(reply.digest, reply.status) for reply in found if reply is not None} == {("d", None)}
+        one.drop_reply("user:x", "k0")
+        assert two.claim_reply("user:x", "k0", "other") is None
+        two.keep_reply("user:x", "k0", 409, "{}")
+        two.drop_reply("user:x", "k0")
+        again = one.claim_reply("user:x", "k0", "other")
+        assert (again.status, again.body) == (409, "{}")

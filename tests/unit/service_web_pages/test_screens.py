@@ -1,0 +1,202 @@
+"""The screens over a real store by HTTP: who may see and approve what, how heavy they are, and what is not there."""
+
+from __future__ import annotations
+
+import re
+
+import httpx
+import pytest
+
+from service.clock import SystemClock
+from service.users.roles import ALLOWED, Permission, Role
+from service.web.access import cells
+from service.web.app import create_app
+from service.web.guard import CSRF_HEADER
+from service.web.page import HERE
+from service.web.view import View
+from tests.pages_world import PROPOSER, USERS, Filled, Served, as_user, screens
+
+SVG = re.compile(r"<svg.*?</svg>", re.DOTALL)
+HEAVIEST = 150_000
+
+
+@pytest.fixture
+def filled(running: Served) -> Filled:
+    return running.filled
+
+
+def addresses(running: Served) -> list[str]:
+    return [*screens(running.filled), "/run", "/result", "/volume", "/whatif", "/budget", "/discovery", "/proposal", "/plots.css"]
+
+
+@pytest.mark.parametrize("name", USERS)
+def test_every_screen_by_every_role(running: Served, name: str) -> None:
+    allowed = ALLOWED[Role(USERS[name])]
+    with as_user(running, name) as client:
+        for path in addresses(running):
+            need = Permission.AUDIT if path == "/audit" else Permission.READ
+            assert client.get(path).status_code == (200 if need in allowed else 403), path
+        links = re.findall(r'<a href="(/[a-z]*)"', client.get("/").text)
+        assert ("/audit" in links) == (Permission.AUDIT in allowed)
+
+
+def test_every_screen_has_one_place_in_the_bar(running: Served) -> None:
+    with as_user(running, "adam") as client:
+        for path in [*screens(running.filled), "/live", "/result", "/diagnostics"]:
+            bar = client.get(path).text.partition("</nav>")[0]
+            assert bar.count('aria-current="page"') == 1, path
+
+
+def test_nobody_sees_a_screen_without_logging_in(running: Served) -> None:
+    with httpx.Client(base_url=running.base, timeout=60) as client:
+        for path in addresses(running):
+            assert client.get(path).status_code == 401, path
+            assert client.get(path, headers={"Accept": "text/html"}).headers["location"] == "/login"
+
+
+@pytest.mark.parametrize("name", USERS)
+def test_who_may_approve(running: Served, filled: Filled, name: str) -> None:
+    may = Permission.APPROVE in ALLOWED[Role(USERS[name])]
+    form = {"number": str(filled.proposals[2]), "hours": "1"}
+    before = len(running.store.approvals(filled.proposals[2]))
+    with as_user(running, name) as client:
+        answer = client.post("/proposal/approve", data=form)
+        assert answer.status_code == (303 if may else 403)
+        for wrong in ({CSRF_HEADER: "0" * 64}, {"Origin": "http://evil.example"}):
+            assert client.post("/proposal/approve", data=form, headers=wrong).status_code == 403
+    told = running.store.approvals(filled.proposals[2])
+    assert len(told) == before + may
+    if may:
+        assert (told[-1].name, told[-1].login, answer.headers["location"]) == (name, f"user:{name}", f"/proposal?id={filled.proposals[2]}")
+
+
+@pytest.mark.parametrize(
+    ("form", "status"),
+    [
+        ({}, 422),
+        ({"number": "x", "hours": "1"}, 422),
+        ({"number": "1", "hours": "nan"}, 422),
+        ({"number": "1", "hours": "0"}, 422),
+        ({"number": "1", "hours": "721"}, 422),
+        ({"number": "-1", "hours": "1"}, 422),
+        ({"number": "99", "hours": "1"}, 404),
+        ({"number": "1", "hours": "1"}, 409),  # it has reasons against it
+        ({"number": "1", "hours": "1", "more": "x" * 5000}, 422),
+        ({str(k): "x" for k in range(20)}, 422),
+    ],
+)
+def test_what_cannot_be_approved_says_why(running: Served, form: dict[str, str], status: int) -> None:
+    with as_user(running, "anna") as client:
+        answer = client.post("/proposal/approve", data=form)
+    assert answer.status_code == status
+    assert answer.json()["detail"]
+    assert running.store.approvals(1) == []
+
+
+def test_the_proposer_cannot_be_the_second_person(running: Served, filled: Filled) -> None:
+    """By the rule of the command line; here he has even got the role of an approver since."""
+    running.people.set_role(PROPOSER, "approver")
+    try:
+        with as_user(running, PROPOSER) as client:
+            answer = client.post("/proposal/approve", data={"number": str(filled.proposals[2]), "hours": "1"})
+    finally:
+        running.people.set_role(PROPOSER, "metrologist")
+    assert answer.status_code == 409
+    assert "second person" in answer.json()["detail"]
+    assert all(a.name != PROPOSER for a in running.store.approvals(filled.proposals[2]))
+
+
+@pytest.mark.parametrize(
+    "path", ["/run?id=999", "/result?id=999", "/volume?id=999", "/whatif?id=999", "/budget?id=999", "/discovery?id=999", "/proposal?id=999"]
+)
+def test_what_is_not_there_is_told_on_a_screen(running: Served, path: str) -> None:
+    with as_user(running, "vera") as client:
+        answer = client.get(path)
+        assert (answer.status_code, "999" in answer.text, "<nav" in answer.text) == (404, True, True)
+        assert client.get(path.replace("999", "x")).status_code == 422
+        assert client.get(path.replace("999", "0")).status_code == 422
+
+
+def test_runs_are_filtered(running: Served) -> None:
+    with as_user(running, "vera") as client:
+
+        def labels(query: str) -> list[str]:
+            return re.findall(r'data-run="\d+"><th scope="row"><a href="[^"]*">([^<]*)<', client.get(f"/runs{query}").text)
+
+        everything = labels("")
+        assert len(everything) == 17 + 1 + 4
+        assert labels("?test=laser_linear") == ["lineZ0", "lineY0", "lineX0"]
+        assert labels("?state=stopped") == ["late"]
+        assert set(labels("?campaign=c1")) == {"r01", "r02", "r03", "r04"}
+        assert labels("?campaign=nothing") == []
+
+
+def test_the_result_names_all_21_motions_and_those_that_do_not_show(running: Served, filled: Filled) -> None:
+    with as_user(running, "vera") as client:
+        page = client.get(f"/result?id={filled.solution}").text
+    motions = re.findall(r'data-motion="(\w+)"', page)
+    assert len(set(motions)) == len(motions) == 21
+    doc = running.store.solution(filled.solution).doc
+    hidden = [name for name, told in doc["motions"].items() if told["status"] == "not observable"]
+    assert page.count("not observable</td>") == len(hidden) > 3
+    named = re.search(r"Not shown by themselves: ([^.]*)\.", page)
+    assert named is not None
+    assert set(named.group(1).split(", ")) == set(hidden)
+    picture = SVG.findall(page)[0]
+    assert not any(f">{name}<" in picture for name in hidden)
+
+
+def test_a_changed_proposal_is_shown_as_changed(running: Served) -> None:
+    doc = running.store.proposal(running.filled.proposals[0]).doc
+    number = running.store.add_proposal(running.filled.machine, running.filled.solution, doc | {"by": "somebody"}, "0" * 64)
+    with as_user(running, "anna") as client:
+        answer = client.get(f"/proposal?id={number}")
+        assert (answer.status_code, "changed after it was stored" in answer.text) == (409, True)
+        assert client.get("/proposals").status_code == 200
+        assert client.post("/proposal/approve", data={"number": str(number), "hours": "1"}).status_code == 503
+
+
+def static_bytes(client: httpx.Client) -> int:
+    """What the heaviest screen needs beside its HTML."""
+    names = ("page.css", "result.css", "status.js", "send.js", "volume.js", "volume_gl.js", "volume_shape.js")
+    static = sum((HERE / "static" / name).stat().st_size for name in names)
+    return static + len(client.get("/plots.css").content) + len(client.get("/icon.svg").content)
+
+
+def test_screens_are_light_and_hold_no_inline_code(running: Served) -> None:
+    heaviest = {}
+    with as_user(running, "anna") as client:
+        static = static_bytes(client)
+        for path in screens(running.filled):
+            page = client.get(path).text
+            heaviest[path] = static + len(SVG.sub("", page).encode())
+            assert " style=" not in page, path
+            assert "<style" not in page, path
+            assert re.findall(r"\son\w+=", page) == [], path
+            assert re.findall(r"<script(?![^>]* src=\"/static/)", page) == [], path
+            assert set(re.findall(r"https?://[^\"\s<]+", page)) <= {"http://www.w3.org/2000/svg"}, path
+    assert max(heaviest.values()) < HEAVIEST, heaviest
+
+
+def test_a_language_is_kept_by_a_cookie(running: Served) -> None:
+    with as_user(running, "vera", **{"Accept-Language": "ja"}) as client:
+        assert '<html lang="ja"' in client.get("/runs").text
+        answer = client.get("/runs?campaign=june&lang=de")
+        assert '<html lang="de"' in answer.text
+        assert "campaign=june&amp;lang=ko" in answer.text  # the switch keeps what was asked for
+        cookie = answer.headers["set-cookie"]
+        assert cookie.startswith("abbe_lang=de;")
+        assert "HttpOnly" in cookie
+        evil = client.get("/runs?lang=%22%3E%3Cscript%3E")
+        assert '<html lang="ja"' in evil.text
+        assert "set-cookie" not in evil.headers
+
+
+def test_every_address_says_what_it_needs(running: Served) -> None:
+    view = View("m", "0", running.board, running.store, list, "", SystemClock())
+    app = create_app(view, version="0", door=running.door)
+    own = {path: need for _, path, need in cells(app.routes)}
+    assert all(need is not None for need in own.values())
+    assert own["/run"] is Permission.READ
+    assert own["/audit"] is Permission.AUDIT
+    assert own["/proposal/approve"] is Permission.APPROVE
