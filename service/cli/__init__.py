@@ -53,14 +53,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
     if sys.stdout is None:
         sys.stdout = _Closed()
+    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:  # as every program has it
+        arguments = ["version"]
     try:
         code = int(app(args=arguments, prog_name="abbe", standalone_mode=False) or 0)
         sys.stdout.flush()
         return code
+    except (AbbeError, DriverError) as err:  # before OSError: a device that does not answer is a TimeoutError, and with it one
+        return complain(err.code, "; ".join([str(err), *getattr(err, "__notes__", [])]))
     except OSError as err:
         return _unwritten(err)
-    except (AbbeError, DriverError) as err:
-        return complain(err.code, "; ".join([str(err), *getattr(err, "__notes__", [])]))
     except typer.Abort:
         return INTERRUPTED
     except typer.TyperException as err:
@@ -107,8 +109,8 @@ def complain(code: str, text: str) -> int:
     int
         Exit code for bad input.
     """
-    from service.secrets import mask_secrets
+    from service.secrets import mask_secrets, visible
 
     if sys.stderr is not None:  # closed: only the exit code is left
-        sys.stderr.write(f"error {code}: {mask_secrets(' '.join(text.split()))}\n")
+        sys.stderr.write(f"error {code}: {visible(mask_secrets(' '.join(text.split())))}\n")
     return BAD_INPUT

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import typer
 
+from service.cli.alarm import alarm
 from service.cli.audit import audit
 from service.cli.audited import record_all
+from service.cli.backup import backup, restore
 from service.cli.comp import comp
 from service.cli.comp_commission import commission
-from service.cli.comp_proposals import approve, diff, propose, show_proposals
+from service.cli.comp_proposals import approve, diff, propose, reject, show_proposals
 from service.cli.comp_push import push, rollback
 from service.cli.configuration import check_config, schema
 from service.cli.demo import demo
@@ -16,6 +18,7 @@ from service.cli.discover import discover
 from service.cli.effects import effects
 from service.cli.errors import errors
 from service.cli.exchange import export_campaign, import_campaign
+from service.cli.fleet import fleet
 from service.cli.key import key
 from service.cli.listen import listen
 from service.cli.measure import correct, measure
@@ -27,6 +30,7 @@ from service.cli.serve import serve
 from service.cli.show import runs, show
 from service.cli.simulate import simulate
 from service.cli.solve import solve
+from service.cli.solve_all import solve_all
 from service.cli.system import SIM_SETTINGS, sim, version
 from service.cli.table import accept_table
 from service.cli.trend import trend
@@ -47,6 +51,7 @@ app.command("plan")(plan)
 app.command("measure")(measure)
 app.command("listen")(listen)
 app.command("solve")(solve)
+app.command("solve-all")(solve_all)
 app.command("simulate")(simulate)
 app.command("discover")(discover)
 app.add_typer(model, name="model")
@@ -58,15 +63,20 @@ comp.command("propose")(propose)
 comp.command("show")(show_proposals)
 comp.command("diff")(diff)
 comp.command("approve")(approve)
+comp.command("reject")(reject)
 comp.command("push")(push)
 comp.command("rollback")(rollback)
 app.add_typer(comp, name="comp")
 app.command("report")(report)
 app.command("serve")(serve)
 app.command("trend")(trend)
+app.command("fleet")(fleet)
+app.add_typer(alarm, name="alarm")
 app.add_typer(key, name="key")
 app.add_typer(user, name="user")
 app.add_typer(audit, name="audit")
+app.command("backup")(backup)
+app.command("restore")(restore)
 app.command("accept-table")(accept_table)
 app.command("check-config")(check_config)
 app.command("runs")(runs)

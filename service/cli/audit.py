@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
 
 audit = typer.Typer(help="The audit: who did what, when, on what, and how it ended.", no_args_is_help=True)
 SHOWN = 10
@@ -21,12 +21,15 @@ def show_audit(
     as_json: JsonOption = False,
 ) -> None:
     """Show the newest records, oldest first."""
+    from service.secrets import visible
+
     with open_store(database_url(db, machine)) as store:
         found = store.audit(last)
     if as_json:
         print_json([asdict(record) for record in found])
         return
-    rows = [(str(r.id), r.utc[:19], r.who, r.action, r.target, r.outcome) for r in found]
+    # Not only as tables show everything: a line break in a target must not make a record that is none.
+    rows = [tuple(map(visible, (str(r.id), r.utc[:19], r.who, r.action, r.target, r.outcome))) for r in found]
     print_table(("record", "when (UTC)", "who", "what", "on", "outcome"), rows)
 
 
@@ -34,9 +37,11 @@ def show_audit(
 def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """Prove that no record was changed, removed, exchanged or cut off at the end (exit code 1: one was)."""
     from service.audit.book import AuditBook
+    from service.secrets import visible
 
     url = database_url(db, machine)
     with open_store(url) as store:
+        warn_of_readers(url)
         faults = AuditBook(store, url).verify()
         last = store.audit(1)
     head = f"{last[0].id} {last[0].digest}" if last else ""
@@ -44,7 +49,7 @@ def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: Js
         print_json({"records": last[0].id if last else 0, "head": head, "faults": faults})
     else:
         for text in faults[:SHOWN]:
-            typer.echo(text)
+            typer.echo(visible(text))
         if len(faults) > SHOWN:
             typer.echo(f"{len(faults) - SHOWN} more; --json lists all")
         if not faults:

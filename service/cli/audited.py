@@ -1,8 +1,12 @@
-"""Every command that changes something leaves one record in the audit of the database it worked on, however it ended."""
+"""Every command that changes something leaves one record in the audit of the database it worked on, however it ended.
+
+Before it begins it is made sure that the record can be written: what cannot be recorded is not done.
+"""
 
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +40,7 @@ def _recorded(words: str, work: Any) -> Any:
     def around(*args: Any, **given: Any) -> Any:
         if args or not is_recorded(words, given):
             return work(*args, **given)
+        _make_sure(words, given)
         try:
             result = work(**given)
         except typer.Exit as ended:  # how most commands end that answer by an exit code: as good as a return
@@ -43,7 +48,7 @@ def _recorded(words: str, work: Any) -> Any:
             raise
         except BaseException as error:
             try:
-                _record(words, given, outcome_of(error))
+                _record(words, given, outcome_of(error), error)
             except Exception as second:  # noqa: BLE001 - what the command itself has to say comes first
                 error.add_note(f"not recorded: {second}")
             raise
@@ -63,21 +68,50 @@ def outcome_of(error: BaseException) -> str:
     return str(code) if isinstance(code, str) else type(error).__name__
 
 
-def _record(words: str, given: Mapping[str, Any], outcome: str) -> None:
+def _make_sure(words: str, given: Mapping[str, Any]) -> None:
+    """Refuse a command that could not be recorded, before it does anything.
+
+    Raises
+    ------
+    AbbeError
+        What the machine file or the database would be refused for anyway; or the audit, with the remedy.
+    """
+    from service.audit.book import HEADS, KEY, AuditBook, files_ready, place
+    from service.cli.common import database_url, open_store
+    from service.errors import AuditBroken
+
+    url = _database(given, database_url)
+    missing = _missing(url)
+    if missing is not None and not missing.parent.is_dir():
+        return  # the command makes the folder, or refuses it
+    try:
+        if missing is not None:
+            base = place(None, url)
+            files_ready(Path(f"{base}{KEY}"), Path(f"{base}{HEADS}"))
+            return
+        with open_store(url) as store:
+            AuditBook(store, url).ready()
+    except AuditBroken as error:
+        raise AuditBroken(f"abbe {words} was not begun, since it could not be recorded: {error.detail}", error.remedy) from None
+
+
+def _record(words: str, given: Mapping[str, Any], outcome: str, error: BaseException | None = None) -> None:
     from service.audit.book import AuditBook
     from service.cli.common import database_url, open_store
     from service.errors import AbbeError, AuditBroken
 
+    url = _database(given, database_url)
+    missing = _missing(url)
+    if missing is not None:
+        # Refused by itself before there was a database: nothing was changed in one. All else has to be said.
+        if not isinstance(getattr(error, "code", None), str) and sys.stderr is not None:
+            sys.stderr.write(f"not recorded in an audit: there is no database {missing}\n")
+        return
     try:
-        url = _database(given, database_url)
-        store = open_store(url)
-    except AbbeError:
-        return  # no machine file or no database that could be told: then nothing was changed in one
-    with store:
-        try:
+        with open_store(url) as store:
             AuditBook(store, url).write(event_of(words, given, outcome))
-        except AbbeError as error:
-            raise AuditBroken(f"abbe {words} ended ({outcome}), but it could not be recorded: {error.detail}", error.remedy) from None
+    except AbbeError as trouble:
+        raise AuditBroken(f"abbe {words} ended ({outcome}), but it could not be recorded: {trouble.detail}", trouble.remedy) from None
 
 
 def _database(given: Mapping[str, Any], url_of: Any) -> str:
@@ -85,6 +119,17 @@ def _database(given: Mapping[str, Any], url_of: Any) -> str:
         return f"sqlite:///{Path(given['keep']) / 'abbe.sqlite3'}"
     file = given.get("machine_file") or given.get("machine")
     return str(url_of(given.get("db"), file if isinstance(file, Path) else None))
+
+
+def _missing(url: str) -> Path | None:
+    """The SQLite file of a database that is not there (yet); None: it is there, or is no file."""
+    from service.storage.engine import parse_url
+
+    parsed = parse_url(url)
+    if parsed.drivername != "sqlite" or parsed.database in {None, "", ":memory:"}:
+        return None
+    path = Path(str(parsed.database))
+    return None if path.exists() else path
 
 
 def event_of(words: str, given: Mapping[str, Any], outcome: str) -> Event:

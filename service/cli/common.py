@@ -96,6 +96,14 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
     return Store.open(url)
 
 
+def warn_of_readers(url: str) -> None:
+    """Say on stderr if others than its owner may read the file of a database: hashes of passwords are in it."""
+    from service.storage.private import database_seen_by_others
+
+    if (words := database_seen_by_others(url)) and sys.stderr is not None:
+        sys.stderr.write(f"warning: {words}\n")
+
+
 def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
     """What is called so; a run before a campaign.
 
@@ -123,7 +131,9 @@ def print_json(value: Any) -> None:
     value : object
         JSON value.
     """
-    sys.stdout.write(json.dumps(value, indent=2, ensure_ascii=False) + "\n")
+    from service.secrets import visible_json
+
+    sys.stdout.write(visible_json(json.dumps(value, indent=2, ensure_ascii=False)) + "\n")
 
 
 def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> None:
@@ -143,8 +153,11 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: s
     from rich.table import Table
     from rich.text import Text
 
+    from service.secrets import visible
+
     console = Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=400)
     table = Table(*headings, title=title, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for row in rows:
-        table.add_row(*(Text(cell, overflow="fold") for cell in row))  # Text: brackets of file names are not markup
+        # Text: brackets of file names are not markup. Visible: names and targets come from anywhere.
+        table.add_row(*(Text("\n".join(map(visible, cell.split("\n"))), overflow="fold") for cell in row))
     console.print(table)

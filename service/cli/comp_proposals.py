@@ -1,4 +1,4 @@
-"""`abbe comp propose | show | diff | approve`: tables as proposals, looked at and agreed to before anything is written."""
+"""`abbe comp propose | show | diff | approve | reject`: tables as proposals, looked at and agreed to before anything is written."""
 
 from __future__ import annotations
 
@@ -164,6 +164,31 @@ def approve(
             typer.echo(f"not approved: {error}")
             raise typer.Exit(1) from None
     typer.echo(f"proposal {proposal} is approved by {done.name} until {done.expiry}")
+
+
+def reject(
+    proposal: ProposalArgument,
+    reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="Why; the proposer reads it.", show_default=False)],
+    name: Annotated[str, typer.Option("--as", metavar="NAME", help="Who rejects. Default: the account.", show_default=False)] = "",
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Reject a proposal for good: it cannot be approved or pushed any more (exit code 1: it cannot be rejected any more)."""
+    from service.clock import SystemClock
+    from service.errors import TableRefused
+    from service.workflows.proposal_checks import reject as work_reject
+    from service.workflows.proposal_doc import load
+    from service.workflows.proposal_states import check_waiting
+    from service.workflows.proposals import login
+
+    with open_store(database_url(db, machine)) as store:
+        try:
+            check_waiting(store, proposal, load(store, proposal), SystemClock().utc().timestamp())
+            done = work_reject(store, proposal, name.strip() or login(), reason)
+        except TableRefused as error:
+            typer.echo(f"not rejected: {error}")
+            raise typer.Exit(1) from None
+    typer.echo(f"proposal {proposal} is rejected by {done.name}: {done.reason}")
 
 
 def _promise(proposed: Proposed) -> str:

@@ -37,6 +37,8 @@ READS = frozenset(
         "model diff",
         "report",
         "trend",
+        "fleet",
+        "alarm list",
         "comp formats",
         "comp show",
         "comp diff",
@@ -48,17 +50,19 @@ READS = frozenset(
 )
 """They show, or write a file that they were asked for."""
 
-RECORDS_ITSELF = frozenset({"serve"})
-"""Runs for months: its record is written when it begins, by the service."""
+RECORDS_ITSELF = frozenset({"serve", "backup", "restore"})
+"""The service runs for months: its record is written when it begins. A restored database has the record of its restoring."""
 
 CHANGES: dict[str, Callable[[Given], bool]] = {
     "demo": lambda given: bool(given.get("keep")),
     "measure": _moves,
     "listen": _always,
     "solve": _always,
+    "solve-all": lambda given: bool(given.get("store_solutions")),
     "discover": _always,
     "correct": _always,
     "accept-table": _always,
+    "alarm acknowledge": _always,
     "import": _always,
     "model revert": _always,
     "comp commission": _always,
@@ -66,6 +70,7 @@ CHANGES: dict[str, Callable[[Given], bool]] = {
     "comp import": _always,
     "comp propose": _always,
     "comp approve": _always,
+    "comp reject": _always,
     "comp push": _always,
     "comp rollback": _always,
     "key new": _always,

@@ -31,10 +31,14 @@ def demo(
         int | None,
         typer.Option("--hidden", metavar="SEED", min=0, help="Find what this machine hides, if anything.", show_default=False),
     ] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Let the service watch the machine, with its page, until Ctrl-C.")] = False,
+    port: Annotated[int, typer.Option(help="Port of the page, with --serve; another one if it is taken.", min=0, max=65535)] = 8080,
 ) -> None:
     """Measure a simulated machine tool over real wires, correct it, and prove that it became better.
 
-    With --hidden: find the physical effect that the simulation of the machine lacks, prove it on a new measurement, and open the truth.
+    With --serve: the service checks the machine by a timetable; it drifts, an alarm says so, and a proposal waits in the page for a person;
+    once it is approved the service pushes and verifies it. With --hidden: find the physical effect that the simulation of the machine
+    lacks, prove it on a new measurement, and open the truth.
     """
     if hidden is not None:
         hidden_demo(hidden, speed, as_json, keep)
@@ -46,10 +50,14 @@ def demo(
     from service.report.html import render_report
     from service.workflows.demo import run_demo
     from service.workflows.demo_report import demo_json, demo_report
+    from service.workflows.demo_serve import run_served_demo
 
-    folder = keep or Path(DEFAULT_FOLDER)
-    folder.mkdir(parents=True, exist_ok=True)
-    log = Console(stderr=True)
+    folder = _folder(keep)
+
+    if serve:
+        with work_folder(folder, keep) as work:
+            run_job(run_served_demo(seed, speed, work, port, typer.echo))
+        return
     with display() as sink, work_folder(folder, keep) as work:
         result = run_job(run_demo(seed, speed, work, sink))
     report = folder / "report.html"
@@ -58,7 +66,7 @@ def demo(
         sys.stdout.write(json.dumps(demo_json(result), indent=2) + "\n")
     else:
         print_result(Console(), result)
-    log.print(f"report: {report}")
+    Console(stderr=True).print(f"report: {report}")
 
 
 def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> None:
@@ -71,8 +79,7 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     from service.workflows.demo_hidden import run_hidden_demo
     from service.workflows.demo_hidden_words import hidden_json, story
 
-    folder = keep or Path(DEFAULT_FOLDER)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = _folder(keep)
     with display() as sink, work_folder(folder, keep) as work:
         result = run_job(run_hidden_demo(["--hidden", str(seed)], speed, work, sink))
     report = folder / "discovery.html"
@@ -94,6 +101,25 @@ def hidden_page(result: HiddenDemo) -> str:
     assert result.journal is not None
     facts = page_facts(result.job, result.journal, result.started_utc)
     return render_discovery(discovery_page(result.finding, result.job.runs, *facts))
+
+
+def _folder(keep: Path | None) -> Path:
+    """Make the folder of the report.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be one.
+    """
+    from service.errors import ConfigError
+
+    folder = keep or Path(DEFAULT_FOLDER)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = "it is no folder" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
+        raise ConfigError(f"{folder} cannot hold the demonstration: {why}", "name another folder with --keep") from None
+    return folder
 
 
 @contextmanager

@@ -76,9 +76,11 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
     from service.workflows.discovery_engine import catalogue
     from service.workflows.discovery_store import journal_of
     from service.workflows.model_book import current
+    from service.workflows.table_out import NO_TABLE, table_then
 
     base = None if store is None else current(store, campaign.site.name)
-    job = prepare(campaign, catalogue(), base)
+    table = NO_TABLE if store is None else table_then(store, campaign)
+    job = prepare(campaign, catalogue(), base, table=table)
     return job, Journal() if store is None else journal_of(store, job)
 
 

@@ -214,7 +214,7 @@ def _plan(machine: Machine, source: dict[str, Any]) -> CampaignPlan:
             raise ConfigError(f"--helix {helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
         return CampaignPlan("helix", (Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz).plan(machine),))
     plans = {"identification": identification, "verification": verification, "quick-check": quick_check}
-    if recipe.endswith(".toml"):
+    if source.get("text") is not None:
         from service.sequences.recipe_file import parse_recipe
 
         name, recipes = parse_recipe(str(source["text"]), recipe)

@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
-import logging
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.errors import AbbeError
+
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from service.capture.live import LiveFeed
+    from service.channel.messages import MachineTold
     from service.config import Loaded
+    from service.config_timetable import AlarmSection
+    from service.core.campaigns import CampaignOrder, MeasureCampaign
+    from service.core.orders import Hands
+    from service.core.setup import Setup
     from service.events import ProgressSink
+    from service.mqtt.broker import Broker
+    from service.plant.opcua.setup import OpcUaSetup
+    from service.scheduler.desk import Duties
     from service.scheduler.ports import Check, CheckResult
     from service.scheduler.slots import Schedule
     from service.scheduler.store import ServiceStore
-    from service.serve import Setup
+    from service.sequences.control import Control
+    from service.sequences.steps import CampaignPlan
     from service.site import Site
+    from service.workflows.alarm_states import Alarm
+    from service.workflows.bring_back import BackOrder
+    from service.workflows.investigate import Note
+    from service.workflows.led_campaign import Led
+    from service.workflows.push_approved import Order
+    from service.workflows.push_word import Outcome
+
+
+LONGEST_NAME = 180
+"""Of a recipe that a person starts: page and core exchange words of 200 characters, and a rate stands behind the name."""
 
 
 def serve(
@@ -28,6 +50,7 @@ def serve(
 ) -> None:
     """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
     from service.config import load_machine
+    from service.logs import configure_logs
     from service.serve import serve as run
 
     setup = setup_of(load_machine(machine), port)
@@ -50,30 +73,41 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     AbbeError
         A schedule names no recipe, or its paths leave the machine's strokes: better now than at the first slot, at night.
     """
-    from service.mqtt.broker import parse
+    from service.capture.live import LiveFeed
+    from service.core.setup import Setup
     from service.mqtt.topics import Topics
     from service.scheduler.ready import Ready, look_at
     from service.scheduler.timetable import schedules_of, windows_of
-    from service.serve import Setup
+    from service.sequences.check import dry_run_campaign, paced
+    from service.sequences.steps import CampaignPlan
     from service.site import site_of
+    from service.workflows.at_start import recover_at_start
     from service.workflows.check import run_check
+    from service.workflows.in_force import look_at_table
+    from service.workflows.investigate import campaign_plan
+    from service.workflows.report import rules_of
+    from service.workflows.shipped import RECIPES
 
     config = loaded.machine
-    site = site_of(config)
+    site, live = site_of(config), LiveFeed()
 
     def check_on(store: ServiceStore) -> Check:
-        async def check(recipe: str, progress: ProgressSink) -> CheckResult:
-            return await run_check(config, store, recipe, progress)
+        async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:
+            return await run_check(config, store, recipe, progress, control=control, live=live)
 
         return check
 
+    plan, folder = CampaignPlan("", ()), loaded.path.resolve().parent
+    if any(entry.on_alarm == "propose" for entry in config.schedule):
+        plan = paced(campaign_plan(config.alarm.campaign, site.machine, folder), site.max_feed_mm_min)
+        dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     return Setup(
         machine=config.name,
         doc=site.doc,
         devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
         schedules=_measurable(schedules_of(config), site),
         store_url=loaded.database_url,
-        broker=None if config.mqtt.url is None else parse(config.mqtt.url),
+        broker=_broker(loaded),
         topics=Topics(config.mqtt.topic_prefix, config.name),
         host=config.web.host,
         port=config.web.port if port is None else port,
@@ -83,7 +117,134 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         names=tuple(config.web.names),
         certificate=_beside(loaded.path, config.web.certificate),
         key=_beside(loaded.path, config.web.key),
+        opcua=_opcua(loaded),
+        recipes=tuple(name for name in sorted(RECIPES) if _fits(name, site)),
+        recover=lambda store: lambda: recover_at_start(store, site),
+        behind_tls=config.web.behind_tls,
+        rules=rules_of(config),
+        duties=duties_on(config.alarm, site, plan, live=live),
+        table=(lambda store: look_at_table(site, store)) if config.alarm.watch_table else None,
+        live=live,
+        told=_told(site),
+        hands=None if site.urls.cnc is None else hands_on(config.alarm, site),
+        campaigns=_campaigns(config.alarm.campaign, site, folder),
+        campaign=None if site.urls.cnc is None else campaign_on(site, folder, live),
     )
+
+
+def _told(site: Site) -> MachineTold:
+    from service.channel.messages import MachineTold
+
+    doc = site.doc
+    axes = {axis: (float(low), float(high)) for axis, (low, high) in doc["stroke_mm"].items()}
+    pivots = {axis: (float(x), float(y), float(z)) for axis, (x, y, z) in doc["pivots_mm"].items()}
+    x, y, z = doc["tool_mm"]
+    return MachineTold(doc["chain"], axes, pivots, (float(x), float(y), float(z)), site.max_feed_mm_min)
+
+
+def _broker(loaded: Loaded) -> Broker | None:
+    from dataclasses import replace
+
+    from service.mqtt.broker import parse
+
+    mqtt = loaded.machine.mqtt
+    if mqtt.url is None:
+        return None
+    ca, certificate, key = (_beside(loaded.path, name) for name in (mqtt.ca, mqtt.certificate, mqtt.key))
+    broker = replace(parse(mqtt.url), ca=ca, certificate=certificate, key=key)
+    broker.tls_context()  # better now than at every attempt to connect
+    return broker
+
+
+def _opcua(loaded: Loaded) -> OpcUaSetup | None:
+    from service.plant.opcua.setup import OpcUaSetup
+
+    given = loaded.machine.opcua
+    if not given.enabled:
+        return None
+    clients = tuple(_beside(loaded.path, name) for name in given.clients)
+    setup = OpcUaSetup(given.host, given.port, _beside(loaded.path, given.certificate), _beside(loaded.path, given.key), clients)
+    setup.check()
+    return setup
+
+
+def duties_on(
+    alarm: AlarmSection, site: Site, plan: CampaignPlan, rate_hz: int = 100, live: LiveFeed | None = None
+) -> Callable[[ServiceStore], Duties]:
+    """Return what the service does about alarms, given its store.
+
+    ``plan``: the full campaign; ``rate_hz``: of verifications; ``live``: is shown what the campaign's paths read.
+    """
+    from service.clock import SystemClock
+    from service.scheduler.desk import Duties
+    from service.workflows.investigate import Bench, investigate
+    from service.workflows.push_approved import push_approved
+
+    def duties(store: ServiceStore) -> Duties:
+        clock = SystemClock()
+
+        async def look_into(one: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
+            await investigate(Bench(site, store, plan, clock, progress, control, live), one, note)
+
+        async def push(order: Order) -> Outcome:
+            return await push_approved(site, store, order, clock=clock, rate_hz=rate_hz)
+
+        return Duties(alarm.warn_days, alarm.campaign, look_into, push if alarm.push == "approved" else None)
+
+    return duties
+
+
+def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]:
+    """Return what a person can order of tables, given the service's store: a push only where the service does not push by itself."""
+    from service.clock import SystemClock
+    from service.core.orders import Hands
+    from service.workflows.bring_back import bring_back
+    from service.workflows.push_approved import push_approved
+
+    def on(store: ServiceStore) -> Hands:
+        async def back(order: BackOrder) -> Outcome:
+            return await bring_back(site, store, order, clock=SystemClock())
+
+        async def push(order: Order) -> Outcome:
+            return await push_approved(site, store, order, clock=SystemClock())
+
+        return Hands(back, push if alarm.push == "never" else None)
+
+    return on
+
+
+def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[ServiceStore], MeasureCampaign]:
+    """Return how a full campaign is measured that a person starts, given the service's store."""
+    from service.clock import SystemClock
+    from service.workflows.investigate import Bench
+    from service.workflows.led_campaign import full_campaign, led_campaign, named_now
+
+    def on(store: ServiceStore) -> MeasureCampaign:
+        async def measure(order: CampaignOrder) -> Led:
+            plan, source = full_campaign(order.recipe, site.machine, folder)
+            bench = named_now(Bench(site, store, plan, SystemClock(), order.progress, order.control, live), order.recipe)
+            return await led_campaign(bench, source, order.by)
+
+        return measure
+
+    return on
+
+
+def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
+    """The full campaigns that can be started on this machine: the shipped one, and what the machine file names for alarms."""
+    from service.sequences.check import dry_run_campaign, paced
+    from service.workflows.led_campaign import full_campaign
+    from service.workflows.shipped import IDENTIFICATION
+
+    def fits(name: str) -> bool:
+        try:
+            plan = paced(full_campaign(name, site.machine, folder)[0], site.max_feed_mm_min)
+            dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
+        except AbbeError:
+            return False
+        return len(name) <= LONGEST_NAME
+
+    return tuple(filter(fits, dict.fromkeys((IDENTIFICATION, named))))
 
 
 def _beside(machine_file: Path, name: str) -> str:
@@ -91,45 +252,23 @@ def _beside(machine_file: Path, name: str) -> str:
     return str(machine_file.resolve().parent / name) if name else ""
 
 
-def _measurable(schedules: tuple[Schedule, ...], site: Site) -> tuple[Schedule, ...]:
+def _fits(recipe: str, site: Site) -> bool:
+    """Whether a recipe can be offered on this machine at all: its paths lie inside the strokes."""
+    try:
+        _dry_run(recipe, site)
+    except AbbeError:
+        return False
+    return True
+
+
+def _dry_run(recipe: str, site: Site) -> None:
     from service.sequences.check import dry_run_campaign
-    from service.workflows.check import recipe_plan
+    from service.workflows.shipped import recipe_plan
 
+    dry_run_campaign(site.machine, recipe_plan(recipe, site.machine), site.max_feed_mm_min)
+
+
+def _measurable(schedules: tuple[Schedule, ...], site: Site) -> tuple[Schedule, ...]:
     for schedule in schedules:
-        dry_run_campaign(site.machine, recipe_plan(schedule.recipe, site.machine), site.max_feed_mm_min)
+        _dry_run(schedule.recipe, site)
     return schedules
-
-
-def configure_logs() -> None:
-    """Log to stderr: one JSON object a line for machines, readable lines in a terminal."""
-    import structlog
-
-    terminal = sys.stderr.isatty()
-    shared: list[structlog.typing.Processor] = [
-        structlog.contextvars.merge_contextvars,
-        structlog.stdlib.add_log_level,
-        structlog.stdlib.add_logger_name,
-        structlog.processors.TimeStamper(fmt="iso", utc=True),
-    ]
-    structlog.configure(
-        processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
-        logger_factory=structlog.stdlib.LoggerFactory(),
-        wrapper_class=structlog.stdlib.BoundLogger,
-        cache_logger_on_first_use=True,
-    )
-    last: list[structlog.typing.Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta]
-    if terminal:
-        last.append(structlog.dev.ConsoleRenderer())
-    else:
-        last += [structlog.processors.format_exc_info, structlog.processors.JSONRenderer(ensure_ascii=False)]
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=last))
-    logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
-    # Libraries that have something to say at each request or each lost connection: we say it ourselves, once.
-    for name, level in (
-        ("mqtt", logging.CRITICAL),
-        ("uvicorn", logging.WARNING),
-        ("asyncio", logging.WARNING),
-        ("alembic", logging.WARNING),
-    ):
-        logging.getLogger(name).setLevel(level)

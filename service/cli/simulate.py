@@ -34,10 +34,12 @@ def simulate(
     from service.workflows.model_book import current
     from service.workflows.simulate import simulate as work
     from service.workflows.simulate import simulation_doc
+    from service.workflows.table_out import NO_TABLE, table_then
 
     with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
         sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
-        job = prepare(found, catalogue(), None if store is None else current(store, found.site.name))
+        base, table = (None, NO_TABLE) if store is None else (current(store, found.site.name), table_then(store, found))
+        job = prepare(found, catalogue(), base, table=table)
         sink(Progress("simulate", 1.0, 2.0, None, "present model fitted to the identify runs"))
         told = work(job)
         sink(Progress("simulate", 2.0, 2.0, 0.0, "done"))

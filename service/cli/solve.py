@@ -62,6 +62,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     A folder's result is stored only if --db or --machine names a database. A run that cannot be what it says is refused (exit code 2).
     """
     from service.workflows.campaign_folder import from_folder, is_folder, keep
+    from service.workflows.table_out import table_then
     from service.workflows.taken_out import taken_out
 
     wanted = _Wanted(model, tables, grid, nodes, unit_um * 1e-3, trials)
@@ -73,7 +74,8 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
                 doc |= keep(store, found, doc)
     else:
         with stored_campaign(campaign, database_url(db, machine)) as (store, found):
-            known = taken_out(store, found.without(without or []))
+            chosen = found.without(without or [])
+            known = taken_out(store, chosen, table_then(store, chosen))
             told, doc = _solved(known.campaign, wanted)
             doc |= known.doc
             doc |= keep(store, found, doc)
@@ -169,6 +171,7 @@ def _write_report(told: Account, doc: dict[str, Any], campaign: Campaign, target
 
 def _print(told: Account, doc: dict[str, Any]) -> None:
     from service.workflows.solve_report import noise_lines, outlier_lines, residual_lines, worst_line
+    from service.workflows.table_out import TABLE_OUT, table_line
 
     typer.echo(f"campaign {doc['campaign']}: model {doc['model']}, {len(doc['runs'])} runs")
     _lines("look at these runs:", doc["flags"])
@@ -180,6 +183,10 @@ def _print(told: Account, doc: dict[str, Any]) -> None:
     typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.seen.effective_rank} of them well.")
     typer.echo(worst_line(told))
     _tables(doc)
+    if TABLE_OUT in doc:
+        typer.echo(table_line(doc[TABLE_OUT]))
+    if "table_not_taken_out" in doc:
+        typer.echo(f"look at this: {doc['table_not_taken_out']}")
     if "machine_model" in doc:
         _lines("model book, not for tables (taken out of the readings where it lasts):", doc["machine_model"]["not_for_tables"])
     _lines("noise found:", noise_lines(told.joint))

@@ -14,7 +14,13 @@ from service.cli.common import JsonOption, print_json, print_table
 def trend(
     machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
     after: Annotated[
-        str | None, typer.Option("--after", metavar="UTC", help="Only checks after this, e.g. the last push.", show_default=False)
+        str | None,
+        typer.Option(
+            "--after",
+            metavar="UTC",
+            help="Only checks after this, e.g. a repair; default: the last kept push.",
+            show_default=False,
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -22,12 +28,14 @@ def trend(
     from service.cli.common import open_store
     from service.config import load_machine
     from service.scheduler.store import ServiceStore
+    from service.workflows.alarms import series_begins
     from service.workflows.trend_table import HEADINGS, as_doc, row, trends
 
     loaded = load_machine(machine)
     since = _moment(after)
     open_store(loaded.database_url).close()  # a missing file is one line, and none is made
     with ServiceStore.open(loaded.database_url) as store:
+        since = since or series_begins(store, loaded.machine.name)
         found = trends(store.verifications_of(loaded.machine.name, limit=100_000), since)
     if as_json:
         print_json(as_doc(loaded.machine.name, found))

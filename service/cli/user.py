@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
 
 if TYPE_CHECKING:
     from service.storage.store import Store
@@ -123,7 +123,9 @@ def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) ->
     from service.clock import SystemClock
     from service.users.people import People
 
-    with open_store(database_url(db, machine), must_exist=must_exist) as store:
+    url = database_url(db, machine)
+    with open_store(url, must_exist=must_exist) as store:
+        warn_of_readers(url)
         yield People(store, SystemClock()), store
 
 

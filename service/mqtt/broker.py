@@ -25,6 +25,10 @@ class Broker:
         User name, if the broker wants one.
     password : str or None
         Never shown in a ``repr`` or in an error.
+    ca : str
+        PEM file of the authority that signed the broker's certificate; empty: those this computer trusts.
+    certificate, key : str
+        PEM files by which we prove who we are, if the broker asks for a certificate; empty: none.
     """
 
     host: str
@@ -32,6 +36,9 @@ class Broker:
     tls: bool = False
     username: str | None = None
     password: str | None = None
+    ca: str = ""
+    certificate: str = ""
+    key: str = ""
 
     def __repr__(self) -> str:
         return f"Broker({self})"
@@ -40,8 +47,27 @@ class Broker:
         return f"{'mqtts' if self.tls else 'mqtt'}://{self.host}:{self.port}"
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """Return the system's trust store as a context, or None without TLS."""
-        return ssl.create_default_context() if self.tls else None
+        """Return what the broker is checked by: authority, host name, TLS 1.2 or newer. None without TLS.
+
+        Raises
+        ------
+        ConfigError
+            A file cannot be read, or is not what it should be.
+        """
+        if not self.tls:
+            return None
+        try:
+            context = ssl.create_default_context(cafile=self.ca or None)
+            context.minimum_version = ssl.TLSVersion.TLSv1_2
+            if self.certificate:
+                context.load_cert_chain(self.certificate, self.key, password="")
+        except OSError as trouble:  # ssl.SSLError is one
+            why = trouble.strerror or str(trouble)
+            files = ", ".join(name for name in (self.ca, self.certificate, self.key) if name)
+            raise ConfigError(
+                f"[mqtt] ca, certificate, key ({files}): {why}", "give PEM files; certificate and key belong together"
+            ) from None
+        return context
 
 
 def parse(url: str) -> Broker:

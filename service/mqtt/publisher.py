@@ -16,7 +16,7 @@ import aiomqtt
 import structlog
 
 from service.clock import Clock
-from service.errors import StoreError
+from service.errors import ConfigError, StoreError
 from service.mqtt.broker import Broker
 from service.mqtt.outbox import Outbox, encode, with_id
 from service.mqtt.topics import Topics, client_id
@@ -31,8 +31,10 @@ STEADY_S = 5.0
 LOOK_S = 30.0
 """How often to look into the outbox without being woken: other processes write into it too."""
 FAREWELL_S = 1.0
+TIDY_EVERY = 500
+"""Messages between two looks at what was delivered long ago."""
 
-_TROUBLE = (aiomqtt.MqttError, StoreError, OSError)
+_TROUBLE = (aiomqtt.MqttError, StoreError, ConfigError, OSError)
 
 
 class Publisher:
@@ -50,16 +52,26 @@ class Publisher:
         Pauses, and the time in the state message.
     on_change : callable, optional
         Told True when connected and False when not.
+    on_drop : callable, optional
+        Told how many waiting messages were dropped, because the broker was away for too long.
     """
 
     def __init__(
-        self, broker: Broker, topics: Topics, outbox: Outbox, clock: Clock, on_change: Callable[[bool], None] = lambda connected: None
+        self,
+        broker: Broker,
+        topics: Topics,
+        outbox: Outbox,
+        clock: Clock,
+        on_change: Callable[[bool], None] = lambda connected: None,
+        on_drop: Callable[[int], None] = lambda dropped: None,
     ) -> None:
         self._broker = broker
         self._topics = topics
         self._outbox = outbox
         self._clock = clock
         self._on_change = on_change
+        self._on_drop = on_drop
+        self._untidy = TIDY_EVERY  # the first look is at the start: an older version kept everything
         self._state: dict[str, Any] = {"state": "online"}
         self._wake = asyncio.Event()
         self._stopping = asyncio.Event()
@@ -93,6 +105,7 @@ class Publisher:
             if not self._warned:
                 log.warning("broker not reachable; messages wait in the store", broker=str(self._broker), reason=reason)
                 self._warned = True
+            await self._tidy()
             await self._pause()
 
     async def _connection(self) -> str:
@@ -109,9 +122,13 @@ class Publisher:
         return ended
 
     async def _knock(self) -> None:
-        """Fail early and cancellably if nobody listens: aiomqtt connects in a thread that nothing can interrupt."""
+        """Fail early and cancellably if nobody listens, or somebody who is not our broker.
+
+        aiomqtt connects in a thread that nothing can interrupt, and leaves a socket open where the broker's certificate is refused.
+        """
+        tls = self._broker.tls_context()
         async with asyncio.timeout(REPLY_S / 2):
-            _, writer = await asyncio.open_connection(self._broker.host, self._broker.port)
+            _, writer = await asyncio.open_connection(self._broker.host, self._broker.port, ssl=tls)
         writer.close()
         with suppress(OSError):
             await writer.wait_closed()
@@ -151,12 +168,27 @@ class Publisher:
             for row in rows:
                 await client.publish(row.topic, with_id(row), qos=1)
                 await self._outbox.done(row.id)
+                self._untidy += 1
                 if self._stopping.is_set():
                     break
+            if self._untidy >= TIDY_EVERY:
+                await self._tidy()
             if not rows:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(LOOK_S):
                         await self._wake.wait()
+
+    async def _tidy(self) -> None:
+        """Keep the outbox bounded, with a broker and without."""
+        try:
+            dropped = await self._outbox.tidy()
+        except StoreError as trouble:
+            log.warning("outbox not tidied up; trying again later", reason=trouble.detail)
+            return
+        self._untidy = 0
+        if dropped:
+            log.warning("broker away for too long; oldest alarms dropped, results wait", broker=str(self._broker), dropped=dropped)
+            self._on_drop(dropped)
 
     def _connected(self) -> None:
         self._on_change(True)

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from typing import TypeGuard
 
 NOT_AVAILABLE = "n/a"
 COVERAGE = 2.0
 """Coverage factor k of every expanded uncertainty in a report."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """What a length is shown in: the sign behind its numbers, and how many of ours one of them is (µm of an error, mm of a place)."""
+
+    sign: str
+    size: float = 1.0
+
+
+UM, MM = Unit("µm"), Unit("mm")
 
 # XML 1.0 has no way to write these at all, not even escaped.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
@@ -36,6 +48,14 @@ def tidy(value: float | None) -> str:
         return NOT_AVAILABLE
     text = plain(value, 6)
     return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+
+
+def placed(value_mm: float, unit: Unit) -> str:
+    """A commanded place: to a thousandth of a mm or a ten-thousandth of an inch (2.5 µm), as the 3-D map says it; no zeros at the end."""
+    if not finite(value_mm):
+        return NOT_AVAILABLE
+    text = fixed(value_mm / unit.size, 3 if unit.size == 1.0 else 4)
+    return text.rstrip("0").rstrip(".")
 
 
 def fixed(value: float, decimals: int) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from service.report.axes import Panel, data_range
 from service.report.model import Contribution, ParameterRow
-from service.report.numbers import COVERAGE, finite, plain, with_uncertainty
+from service.report.numbers import COVERAGE, UM, Unit, finite, plain, with_uncertainty
 from service.report.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM = 500.0, 22.0, 34.0, 46.0
@@ -15,8 +15,10 @@ FIGURES = 130.0
 """Room for value and uncertainty at the right of a ranking."""
 
 
-def contribution_bars(rows: Sequence[Contribution], *, key: str = "ranking", heading: str = "Rank of error contributions") -> str:
-    """Contributions in µm, largest first, with their expanded uncertainty (k = 2).
+def contribution_bars(
+    rows: Sequence[Contribution], *, key: str = "ranking", heading: str = "Rank of error contributions", unit: Unit = UM
+) -> str:
+    """Contributions, largest first, with their expanded uncertainty (k = 2).
 
     Parameters
     ----------
@@ -26,24 +28,32 @@ def contribution_bars(rows: Sequence[Contribution], *, key: str = "ranking", hea
         Identifier, unique in the page.
     heading : str, optional
         Words above the picture.
+    unit : Unit, optional
+        What the reader sees them in.
     """
-    ranked = sorted(rows, key=lambda r: -abs(r.value_um) if finite(r.value_um) else 1.0)
-    words = "; ".join(f"{r.name} {_rounded(r)} µm" for r in ranked)
+    ranked = sorted((_seen(r, unit) for r in rows), key=lambda r: -abs(r.value_um) if finite(r.value_um) else 1.0)
+    words = "; ".join(f"{r.name} {_rounded(r)} {unit.sign}" for r in ranked)
     svg = Svg(WIDTH, TOP + ROW * max(len(ranked), 1) + BOTTOM, key, heading, f"{heading}: {words}.")
     svg.text((10.0, 18.0), heading, "t-head")
     ends = [abs(r.value_um) + COVERAGE * (r.u_um if finite(r.u_um) else 0.0) for r in ranked if finite(r.value_um)]
     panel = Panel(LABELS, TOP, WIDTH - LABELS - FIGURES, ROW * max(len(ranked), 1), (0.0, data_range(ends, zero=True)[1]), (0.0, 1.0))
-    panel.draw_x(svg, "contribution in µm", count=4)
+    panel.draw_x(svg, f"contribution in {unit.sign}", count=4)
     for i, row in enumerate(ranked):
         y = TOP + ROW * (i + 0.5)
         svg.text((LABELS - 8.0, y + 4.0), row.name[:24], anchor="end")
-        svg.text((WIDTH - FIGURES + 14.0, y + 4.0), f"{_rounded(row)} µm", "t-soft")
+        svg.text((WIDTH - FIGURES + 14.0, y + 4.0), f"{_rounded(row)} {unit.sign}", "t-soft")
         if finite(row.value_um):
             end = panel.x(abs(row.value_um))
             svg.rect((LABELS, y - 7.0), (end - LABELS, 14.0), "f-c2")
             if finite(row.u_um) and row.u_um > 0.0:
                 _whisker(svg, panel, row, y)
     return svg.render()
+
+
+def _seen(row: Contribution, unit: Unit) -> Contribution:
+    """The same numbers in what the reader sees."""
+    value, u = (v / unit.size if finite(v) else v for v in (row.value_um, row.u_um))
+    return Contribution(row.name, value, u)
 
 
 def _rounded(row: Contribution) -> str:

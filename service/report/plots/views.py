@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.report.axes import Panel
+from service.report.numbers import MM, Unit
 from service.report.svg import Svg
 
 F2 = NDArray[np.float64]
@@ -19,7 +20,7 @@ SIDE = 300.0
 MAX_POINTS = 600
 """Points per drawn path: more cannot be told apart."""
 STYLES = {"bar": "c1", "laser": "c2"}
-VIEWS = ((0, 1, "from above", "X mm", "Y mm"), (0, 2, "from the front", "X mm", "Z mm"), (1, 2, "from the side", "Y mm", "Z mm"))
+VIEWS = ((0, 1, "from above"), (0, 2, "from the front"), (1, 2, "from the side"))
 CORNERS = ((70.0, 40.0), (70.0, 420.0), (450.0, 420.0))
 
 
@@ -53,7 +54,7 @@ class DrawnTest:
     mounts: bool
 
 
-def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views") -> str:
+def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views", unit: Unit = MM) -> str:
     """The drawing: paths of all tests in three views with one scale, the strokes as frames, set-ups numbered in the order of measuring.
 
     Parameters
@@ -62,16 +63,17 @@ def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views"
         First and last position of X, Y, Z.
     tests : sequence of DrawnTest
         In the order of measuring.
+    unit : Unit, optional
+        What the reader sees places in.
     """
     words = "; ".join(f"{t.order}: {t.words}" for t in tests)
     svg = Svg(WIDTH, HEIGHT, key, f"Paths of {len(tests)} tests in three views", words)
     size = float((stroke_mm[:, 1] - stroke_mm[:, 0]).max()) * 1.04
-    for (a, b, title, across, up), corner in zip(VIEWS, CORNERS, strict=True):
+    for (a, b, title), corner in zip(VIEWS, CORNERS, strict=True):
         middle = stroke_mm.mean(axis=1)
         low = middle - 0.5 * size
         panel = Panel(*corner, SIDE, SIDE, (low[a], low[a] + size), (low[b], low[b] + size))
-        panel.draw_x(svg, across)
-        panel.draw_y(svg, up)
+        _draw_scales(svg, panel, (a, b), unit)
         svg.text((corner[0], corner[1] - 8.0), title, "t-head")
         first, last = panel.at(stroke_mm[a, 0], stroke_mm[b, 1]), panel.at(stroke_mm[a, 1], stroke_mm[b, 0])
         svg.rect(first, (last[0] - first[0], last[1] - first[1]), "ring-zero", "strokes")
@@ -89,6 +91,14 @@ def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views"
         svg.legend((450.0, 92.0), [(f"s-{STYLES[used[1]]}", names[used[1]])])
     svg.text((450.0, 120.0), "grey frame: strokes of the axes", "t-small")
     return svg.render()
+
+
+def _draw_scales(svg: Svg, panel: Panel, plane: tuple[int, int], unit: Unit) -> None:
+    """Grid and numbers at round values of the reader's unit."""
+    (x_low, x_high), (y_low, y_high) = ((low / unit.size, high / unit.size) for low, high in (panel.x_range, panel.y_range))
+    scaled = replace(panel, x_range=(x_low, x_high), y_range=(y_low, y_high))
+    scaled.draw_x(svg, f"{'XYZ'[plane[0]]} {unit.sign}")
+    scaled.draw_y(svg, f"{'XYZ'[plane[1]]} {unit.sign}")
 
 
 def _draw(svg: Svg, panel: Panel, test: DrawnTest, plane: tuple[int, int]) -> None:

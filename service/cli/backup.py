@@ -1,0 +1,91 @@
+"""`abbe backup` and `abbe restore`: everything that is kept, as a folder to put away, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.common import JsonOption, print_json
+
+if TYPE_CHECKING:
+    from service.workflows.backup import Source
+
+StoreOption = Annotated[
+    str | None, typer.Option("--store", "--db", metavar="URL", help="Database, instead of a machine file's.", show_default=False)
+]
+
+
+def backup(
+    places: Annotated[
+        list[Path], typer.Argument(metavar="[MACHINE.toml] TARGET", help="Machine file, and a new folder.", show_default=False)
+    ],
+    store: StoreOption = None,
+    without_key: Annotated[bool, typer.Option("--without-key", help="Leave the audit's key out; keep it elsewhere.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Copy database, samples that it does not have yet and audit into a new folder, while the service goes on. The copy is checked."""
+    from service.clock import SystemClock
+    from service.workflows.backup import back_up
+
+    source, target = _places(places, store, "TARGET")
+    doc = back_up(source, target, SystemClock().utc, with_key=not without_key)
+    if as_json:
+        print_json(doc)
+    else:
+        rows, size = doc["rows"], sum(one["bytes"] for one in doc["files"].values())
+        typer.echo(
+            f"{target}: {rows['runs']} runs, {rows['verifications']} checks, {doc['segments']} segments, {size / 1e6:.1f} MB, checked"
+        )
+        for text in doc["audit"]["faults"][:3]:
+            typer.echo(f"audit: {text}")
+        if doc["audit"]["records"] and not doc["audit"]["key"]:
+            typer.echo("without the key of the audit: abbe restore will ask for it (--audit-key)")
+    raise typer.Exit(1 if doc["audit"]["faults"] else 0)
+
+
+def restore(
+    places: Annotated[
+        list[Path], typer.Argument(metavar="[MACHINE.toml] BACKUP", help="Machine file, and the folder of a backup.", show_default=False)
+    ],
+    store: StoreOption = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Put a database that is there aside; it is renamed, not deleted.")] = False,
+    audit_key: Annotated[
+        Path | None, typer.Option("--audit-key", metavar="FILE", help="Key of the audit, for a backup without it.", show_default=False)
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Bring a backup back, after its files, its schema and its audit were checked. Refused over a database that exists or is in use."""
+    from service.clock import SystemClock
+    from service.workflows.restore import restore as bring_back
+
+    into, folder = _places(places, store, "BACKUP")
+    done = bring_back(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
+    aside = [str(path) for path in done.aside]
+    if as_json:
+        print_json({"database": str(done.database), "backup": done.backup.doc, "audit_records": done.records, "aside": aside})
+        return
+    rows = done.backup.doc["rows"]
+    typer.echo(f"{done.database}: as of {done.backup.doc['made_utc']}, {rows['runs']} runs, {rows['verifications']} checks")
+    typer.echo(f"audit: {done.records} records, all there and as written")
+    if done.segments:
+        typer.echo(f"{done.segments} segments: the next command that connects to the machine takes them over")
+    for path in aside:
+        typer.echo(f"put aside: {path}")
+
+
+def _places(places: list[Path], store: str | None, last: str) -> tuple[Source, Path]:
+    """Database and folder that the words name."""
+    from service.capture.settings import CaptureSettings
+    from service.config import load_machine
+    from service.errors import ConfigError
+    from service.site import site_of
+    from service.workflows.backup import Source
+
+    if len(places) != (2 if store is None else 1):
+        raise ConfigError("a database and one folder are needed", f"write MACHINE.toml {last}, or --store URL {last}")
+    if store is not None:
+        return Source(store, CaptureSettings()), places[0]
+    loaded = load_machine(places[0])
+    return Source(loaded.database_url, site_of(loaded.machine).capture, places[0]), places[1]

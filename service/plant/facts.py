@@ -1,0 +1,139 @@
+"""What the plant is told of the machine at one moment: the same for OPC UA and MTConnect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit: how it is written, its UNECE code (OPC UA), and its name in MTConnect with the factor to it."""
+
+    symbol: str
+    unece: str
+    mtconnect: str = ""
+    factor: float = 1.0
+
+    @property
+    def number(self) -> int:
+        """UNECE code as OPC UA numbers it (Part 8, 5.6.3.3): its characters, one a byte."""
+        return int.from_bytes(self.unece.encode(), "big")
+
+
+UNITS = {
+    "um": Unit("µm", "4H", "MILLIMETER", 1e-3),
+    "mm": Unit("mm", "MMT", "MILLIMETER"),
+    "urad": Unit("µrad", "B97"),
+    "ppm": Unit("ppm", "59"),
+    "s": Unit("s", "SEC", "SECOND"),
+    "c": Unit("°C", "CEL", "CELSIUS"),
+    "percent": Unit("%", "P1", "PERCENT"),
+}
+
+
+def unit_of(key: str) -> Unit | None:
+    """Unit of a figure, which stands at the end of its name; None: it has none."""
+    return UNITS.get(key.rpartition("_")[2]) if "_" in key else None
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure of a check. ``expanded``: its uncertainty, k = 2. What is None is not known."""
+
+    key: str
+    value: float | None
+    expanded: float | None
+    limit: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One check that has ended."""
+
+    number: int
+    schedule: str
+    recipe: str
+    started_utc: datetime
+    duration_s: float
+    verdict: str
+    text: str
+    figures: tuple[Figure, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """The check that runs now."""
+
+    schedule: str
+    recipe: str
+    since_utc: datetime
+    stage: str
+    message: str
+    percent: float | None
+    eta_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """Something a person should look at."""
+
+    code: str
+    text: str
+    at_utc: datetime
+    device: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TableInForce:
+    """Which compensation table the push journal knows to be active. It is what we last saw, not a question to the controller."""
+
+    bank: int
+    crc: int
+    push: int
+    since_utc: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceState:
+    """A device, and when it was last heard of."""
+
+    role: str
+    state: str
+    text: str
+    at_utc: datetime | None
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Everything at one moment; checks and alarms newest first. ``table``: None when the journal does not know."""
+
+    machine: str
+    version: str
+    now_utc: datetime
+    running: Running | None
+    next_utc: datetime | None
+    checks: tuple[Check, ...]
+    alarms: tuple[Alarm, ...]
+    devices: tuple[DeviceState, ...]
+    table: TableInForce | None = None
+
+    @property
+    def state(self) -> str:
+        """``measuring`` or ``idle``."""
+        return "idle" if self.running is None else "measuring"
+
+
+class FactsSource(Protocol):
+    """Where the facts come from. Reads only."""
+
+    async def facts(self) -> Facts:
+        """Return the facts of this moment.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        ...

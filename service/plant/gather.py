@@ -1,0 +1,126 @@
+"""Puts the facts together from what the status page knows, the slots that were not run, and the journal of pushes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from datetime import datetime
+from typing import Any, Protocol
+
+from service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce
+from service.storage.records import PushEntryRecord, SlotRecord
+
+SHOWN_ALARMS = 20
+_NOT_RUN = {"missed": "SCH-001", "skipped": "SCH-002", "interrupted": "SCH-007"}
+
+
+class Archive(Protocol):
+    """The part of the store that is read here beside the status."""
+
+    def slots_not_run(self, machine: str, limit: int = ..., /) -> Sequence[SlotRecord]:
+        """Return the latest slots of a machine that were missed, skipped or interrupted, newest first."""
+        ...
+
+    def last_push(self, machine: str, /) -> Sequence[PushEntryRecord]:
+        """Return the journal of the last push of a machine; empty if there was none."""
+        ...
+
+
+class Gatherer:
+    """Reads; never writes.
+
+    Parameters
+    ----------
+    status : callable
+        Gives what the status page shows (`service.web.schemas.Status`): machine, job, devices, next due and last checks.
+    archive : Archive, optional
+        Slots and pushes. Without it there are only the alarms of failed checks, and no table.
+    """
+
+    def __init__(self, status: Callable[[], Awaitable[Any]], archive: Archive | None = None) -> None:
+        self._status, self._archive = status, archive
+        self._revision = ""
+        self._slow: tuple[tuple[Alarm, ...], TableInForce | None] = ((), None)
+
+    async def facts(self) -> Facts:
+        """Return the facts of this moment. Slots and pushes are read anew when the status has changed, or the minute.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        status = await self._status()
+        revision = f"{status.revision} {status.now_utc:%H:%M}"
+        if self._archive is not None and revision != self._revision:
+            self._slow = await asyncio.to_thread(self._read, self._archive, status.machine)
+            self._revision = revision
+        failed = [_alarm_of(check) for check in status.last if check.cause is not None]
+        alarms = sorted([*failed, *self._slow[0]], key=lambda alarm: alarm.at_utc, reverse=True)
+        return Facts(
+            machine=status.machine,
+            version=status.version,
+            now_utc=status.now_utc,
+            running=_running(status.job),
+            next_utc=min((due.due_utc for due in status.next_due), default=None),
+            checks=tuple(_check(one) for one in status.last),
+            alarms=tuple(alarms[:SHOWN_ALARMS]),
+            devices=tuple(DeviceState(device.role, device.state, device.text, device.at_utc) for device in status.devices),
+            table=self._slow[1],
+        )
+
+    @staticmethod
+    def _read(archive: Archive, machine: str) -> tuple[tuple[Alarm, ...], TableInForce | None]:
+        slots = archive.slots_not_run(machine, SHOWN_ALARMS)
+        return tuple(_slot_alarm(slot) for slot in slots), table_in_force(archive.last_push(machine))
+
+
+def _running(job: Any) -> Running | None:
+    if job is None:
+        return None
+    percent = 100.0 * job.done / job.total if job.total > 0 else None
+    return Running(job.schedule, job.recipe, job.since_utc, job.stage, job.message, percent, job.eta_s)
+
+
+def _check(one: Any) -> Check:
+    figures = (Figure(key, value, one.uncertainties.get(key), one.limits.get(key)) for key, value in one.values.items())
+    return Check(one.id, one.schedule, one.recipe, one.started_utc, one.duration_s, one.verdict, one.text, tuple(figures))
+
+
+def _alarm_of(check: Any) -> Alarm:
+    return Alarm(check.cause.code, check.cause.what, check.started_utc, check.cause.device)
+
+
+def _slot_alarm(slot: SlotRecord) -> Alarm:
+    text = slot.reason or f"{slot.schedule}: slot {slot.slot_utc} was {slot.state}"
+    return Alarm(_NOT_RUN.get(slot.state.partition(":")[0], "SCH-001"), text, datetime.fromisoformat(slot.finished_utc or slot.claimed_utc))
+
+
+def table_in_force(journal: Sequence[PushEntryRecord]) -> TableInForce | None:
+    """Which table is active after a push, as far as its journal knows.
+
+    Before activation and after one that came to nothing it is the old one, after KEEP the new one, after a person's word the one that
+    he vouched for. Between activation and the end, and where a person has to look, nobody knows: None.
+    """
+    if not journal:
+        return None
+    known: dict[str, Any] = {}
+    for entry in journal:
+        known.update(entry.doc)
+    last = journal[-1]
+    found = _bank_and_crc(last.state, known)
+    if found is None or not all(isinstance(part, int) for part in found):
+        return None
+    return TableInForce(found[0], found[1], last.push, datetime.fromisoformat(last.utc))
+
+
+def _bank_and_crc(state: str, known: Mapping[str, Any]) -> tuple[Any, Any] | None:
+    if state == "ACCEPTED":
+        return known.get("accepted_bank"), known.get("accepted_crc")
+    if state == "KEEP":
+        return known.get("target"), known.get("crc")
+    if state == "ROLLED_BACK":
+        return known.get("bank"), known.get("base_crc")
+    if state in {"SNAPSHOT", "REJECTED", "VALIDATED", "APPROVED", "LEASED", "STAGING", "STAGED", "ABORTED"}:
+        return known.get("base_bank"), known.get("base_crc")
+    return None

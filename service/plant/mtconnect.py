@@ -1,0 +1,235 @@
+"""MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure but for the numbers it gives out.
+
+In the manner of an agent; left out are assets, the agent as a device of its own, XPath (``path``) and streaming (``interval``).
+Observations are made when somebody asks: what a running check did between two questions is not seen, but every check that ended is, up
+to ten at once.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from service.plant.facts import Check, Facts
+
+VERSION = "1.8"
+BUFFER = 4096
+UNAVAILABLE = "UNAVAILABLE"
+Entries = tuple[tuple[str, str], ...]
+
+# id, category, type, representation: the data items, in the order of the documents.
+ITEMS = (
+    ("avail", "EVENT", "AVAILABILITY", ""),
+    ("exec", "EVENT", "EXECUTION", ""),
+    ("prog", "EVENT", "PROGRAM", ""),
+    ("msg", "EVENT", "MESSAGE", ""),
+    ("result", "EVENT", "VARIABLE", "DATA_SET"),
+    ("table", "EVENT", "VARIABLE", "DATA_SET"),
+    ("system", "CONDITION", "SYSTEM", ""),
+)
+_NAMES = {"result": "last_check", "table": "compensation_table"}
+
+
+class Refused(Exception):  # noqa: N818 - reads as what it is
+    """A request that cannot be answered: the code of the Error document, its text, and the HTTP status."""
+
+    def __init__(self, code: str, text: str, status: int = 400) -> None:
+        self.code, self.text, self.status = code, text, status
+        super().__init__(text)
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One value of one data item. ``level``: of a condition; ``native``: its code."""
+
+    sequence: int
+    item: str
+    utc: datetime
+    value: str | Entries
+    level: str = ""
+    native: str = ""
+
+    def same(self, other: Observation | None) -> bool:
+        """Whether another one says the same."""
+        return other is not None and (self.value, self.level, self.native) == (other.value, other.level, other.native)
+
+
+class Agent:
+    """Buffer of observations of one machine, numbered without gaps from 1 for each start (``instanceId``)."""
+
+    def __init__(self, instance: int, buffer: int = BUFFER) -> None:
+        self._instance, self._size = instance, buffer
+        self._buffer: deque[Observation] = deque()
+        self._before: dict[str, Observation] = {}  # what held when the oldest one in the buffer came
+        self._latest: dict[str, Observation] = {}
+        self._next = 1
+        self._seen = 0
+
+    def update(self, facts: Facts) -> None:
+        """Take in what is new."""
+        now, job = facts.now_utc, facts.running
+        self._put("avail", now, "AVAILABLE")
+        self._put("exec", now, "ACTIVE" if job else "READY")
+        self._put("prog", now, job.recipe if job else UNAVAILABLE)
+        self._put("msg", now, f"{job.stage}: {job.message}" if job and job.stage else UNAVAILABLE)
+        if not facts.checks:
+            self._put("result", now, UNAVAILABLE)
+        for check in sorted(facts.checks, key=lambda one: one.number):
+            if check.number > self._seen:
+                self._put("result", now, _result(check))
+                self._seen = check.number
+        table = facts.table
+        known = (("bank", str(table.bank)), ("crc32", f"{table.crc:08x}"), ("push", str(table.push))) if table else UNAVAILABLE
+        self._put("table", now, known)
+        self._put("system", now, *_condition(facts))
+
+    def _put(self, item: str, utc: datetime, value: str | Entries, level: str = "", native: str = "") -> None:
+        one = Observation(self._next, item, utc, value, level, native)
+        if one.same(self._latest.get(item)):
+            return
+        self._next += 1
+        self._latest[item] = one
+        self._buffer.append(one)
+        if len(self._buffer) > self._size:
+            gone = self._buffer.popleft()
+            self._before[gone.item] = gone
+
+    def probe(self, facts: Facts) -> bytes:
+        """Return the Devices document."""
+        root = _root("MTConnectDevices", self._header(facts.now_utc, assetBufferSize="0", assetCount="0"))
+        name = _clean(facts.machine)
+        device = ET.SubElement(ET.SubElement(root, "Devices"), "Device", id="dev", name=name, uuid=f"abbe-{name}")
+        ET.SubElement(device, "Description", manufacturer="Abbe").text = f"Abbe {facts.version}"
+        items = ET.SubElement(device, "DataItems")
+        for item, category, kind, representation in ITEMS:
+            attributes = {"id": item, "category": category, "type": kind}
+            attributes |= {"representation": representation} if representation else {}
+            attributes |= {"name": _NAMES[item]} if item in _NAMES else {}
+            ET.SubElement(items, "DataItem", attributes)
+        return _bytes(root)
+
+    def current(self, facts: Facts, query: Mapping[str, str]) -> bytes:
+        """Return the Streams document of what holds now, or held when observation ``at`` was made."""
+        _only(query, {"at"})
+        at = self._number(query, "at", self._next - 1, self._first, self._next - 1)
+        held = self._before | {one.item: one for one in self._buffer if one.sequence <= at}
+        return self._streams(facts, list(held.values()), at + 1)
+
+    def sample(self, facts: Facts, query: Mapping[str, str]) -> bytes:
+        """Return the Streams document of up to ``count`` observations from number ``from`` on."""
+        _only(query, {"from", "count"})
+        start = self._number(query, "from", self._first, self._first, self._next)
+        count = self._number(query, "count", 100, 1, self._size)
+        found = [one for one in self._buffer if one.sequence >= start][:count]
+        return self._streams(facts, found, found[-1].sequence + 1 if found else self._next)
+
+    @property
+    def _first(self) -> int:
+        return self._buffer[0].sequence
+
+    def _number(self, query: Mapping[str, str], name: str, default: int, least: int, most: int) -> int:
+        text = query.get(name)
+        if text is None:
+            return default
+        try:
+            number = int(text)
+        except ValueError:
+            raise Refused("INVALID_REQUEST", f"{name} is {text[:40]!r}, expected a whole number") from None
+        if not least <= number <= most:
+            raise Refused("OUT_OF_RANGE", f"{name} is {text[:40]}, expected {least} to {most}", 404)
+        return number
+
+    def _streams(self, facts: Facts, found: list[Observation], following: int) -> bytes:
+        numbers = {"nextSequence": following, "firstSequence": self._first, "lastSequence": self._next - 1}
+        root = _root("MTConnectStreams", self._header(facts.now_utc, **{key: str(value) for key, value in numbers.items()}))
+        name = _clean(facts.machine)
+        device = ET.SubElement(ET.SubElement(root, "Streams"), "DeviceStream", name=name, uuid=f"abbe-{name}")
+        component = ET.SubElement(device, "ComponentStream", component="Device", name=name, componentId="dev")
+        for group, category in (("Events", "EVENT"), ("Condition", "CONDITION")):
+            of_it = [one for one in sorted(found, key=lambda one: one.sequence) if _item(one.item)[1] == category]
+            if of_it:
+                parent = ET.SubElement(component, group)
+                for one in of_it:
+                    _write(parent, one)
+        return _bytes(root)
+
+    def error(self, refused: Refused, now: datetime) -> bytes:
+        """Return the Error document of a request that was refused."""
+        root = _root("MTConnectError", self._header(now))
+        ET.SubElement(ET.SubElement(root, "Errors"), "Error", errorCode=refused.code).text = _clean(refused.text)
+        return _bytes(root)
+
+    def _header(self, now: datetime, **more: str) -> dict[str, str]:
+        head = {"creationTime": _stamp(now), "sender": "abbe", "instanceId": str(self._instance), "version": VERSION}
+        changed = datetime.fromtimestamp(self._instance, UTC)
+        return head | {"bufferSize": str(self._size), "deviceModelChangeTime": _stamp(changed)} | more
+
+
+def _item(name: str) -> tuple[str, str, str, str]:
+    return next(item for item in ITEMS if item[0] == name)
+
+
+def _write(parent: ET.Element, one: Observation) -> None:
+    _, category, kind, representation = _item(one.item)
+    tag = one.level if category == "CONDITION" else kind.title().replace("_", "") + ("DataSet" if representation else "")
+    attributes = {"dataItemId": one.item, "timestamp": _stamp(one.utc), "sequence": str(one.sequence)}
+    attributes |= {"name": _NAMES[one.item]} if one.item in _NAMES else {}
+    attributes |= {"type": kind} if category == "CONDITION" else {}
+    attributes |= {"nativeCode": _clean(one.native)} if one.native else {}
+    if isinstance(one.value, str):
+        ET.SubElement(parent, tag, attributes | ({"count": "0"} if representation else {})).text = _clean(one.value)
+        return
+    written = ET.SubElement(parent, tag, attributes | {"count": str(len(one.value))})
+    for key, value in one.value:
+        ET.SubElement(written, "Entry", key=_clean(key).replace(" ", "_")).text = _clean(value)
+
+
+def _result(check: Check) -> Entries:
+    """Figures with their unit at the end of the key; beside each its expanded uncertainty (k = 2) and its limit."""
+    head = {"number": str(check.number), "verdict": check.verdict, "schedule": check.schedule, "recipe": check.recipe}
+    for figure in check.figures:
+        three = {figure.key: figure.value, f"{figure.key}.expanded": figure.expanded, f"{figure.key}.limit": figure.limit}
+        head |= {key: repr(float(value)) for key, value in three.items() if value is not None}
+    return (*head.items(), ("started_utc", _stamp(check.started_utc)))
+
+
+def _condition(facts: Facts) -> tuple[str, str, str]:
+    """Text, level and code of what the last check says of the machine."""
+    if not facts.checks:
+        return "", "Unavailable", ""
+    last = facts.checks[0]
+    if last.verdict == "pass":
+        return "", "Normal", ""
+    code = next((alarm.code for alarm in facts.alarms if alarm.at_utc == last.started_utc), last.verdict.replace(" ", "-"))
+    return last.text, "Fault" if last.verdict == "fail" else "Warning", code
+
+
+def _only(query: Mapping[str, str], allowed: set[str]) -> None:
+    for name in query:
+        if name in {"path", "interval", "heartbeat", "to"}:
+            raise Refused("UNSUPPORTED", f"{name} is not supported here")
+        if name not in allowed:
+            raise Refused("INVALID_REQUEST", f"{name[:40]!r} is not known here")
+
+
+def _root(kind: str, header: Mapping[str, str]) -> ET.Element:
+    root = ET.Element(kind, {"xmlns": f"urn:mtconnect.org:{kind}:{VERSION}"})
+    ET.SubElement(root, "Header", dict(header))
+    return root
+
+
+def _bytes(root: ET.Element) -> bytes:
+    document: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
+    return document
+
+
+def _stamp(moment: datetime) -> str:
+    return moment.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _clean(text: str) -> str:
+    """XML has no control characters, and device strings may."""
+    return "".join(c if c.isprintable() else " " for c in text)[:500]
