@@ -73,4 +73,5 @@ $(BENCH_READY): requirements-bench.lock | $(BIN)/python
 	@echo "setting up $(BENCH_VENV) from requirements-bench.lock, about a minute"
 	@$(BIN)/python -m venv $(BENCH_VENV)
 	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements-bench.lock
+	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --no-deps --no-build-isolation -e .
 	@touch $@

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from drivers.api import Controller
 from drivers.registry import open_controller
+from service.push.levels import Capabilities
 from service.site import Site
 from service.storage.store import Store
 from service.workflows.commission import KIND
-from service.workflows.proved_levels import identity
+from service.workflows.proved_levels import KIND as LEVELS
+from service.workflows.proved_levels import flags_of, identity
 
 NAME = f"{KIND} pretended"
 
@@ -28,3 +30,11 @@ async def as_if_commissioned_at(url: str, store: Store, site: Site) -> None:
         await as_if_commissioned(controller, store, site)
     finally:
         await controller.close()
+
+
+async def as_if_proved_for_nobody_there(controller: Controller, store: Store, site: Site) -> None:
+    """The same for what the control does for a push that nobody attends."""
+    machine = store.add_machine(site.name, site.doc)
+    campaign = store.add_campaign(machine, f"{LEVELS} pretended", {})
+    flags = flags_of(Capabilities(*[True] * 6)) | {"can_disable": True}
+    store.add_solution(campaign, LEVELS, [], {"identity": identity(await controller.identify()), "flags": flags})

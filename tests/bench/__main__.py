@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from models.geometry.chain import deviation_mm, exact_deviation_mm
-from tests.bench import capture, discovery, discovery_case, parsers, report
+from tests.bench import capture, discovery, discovery_case, history, parsers, reanalysis, report
 from tests.bench.case import CASES, make
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS, contestants
 from tests.bench.facts import facts
@@ -24,7 +24,7 @@ from tests.bench.trials_contestants import TRIAL_CASES
 from tests.bench.trials_judge import judged
 from tests.bench.worker import NO_RESULT
 
-PARTS = ("map", "trials", "discovery", "capture", "parsers")
+PARTS = ("map", "trials", "discovery", "capture", "parsers", "history", "reanalysis")
 ROUNDING_MM = 1e-12
 SECOND_ORDER_MM = 1e-5
 """What exact kinematics may add to rule G on this machine: measured 1.6e-6. Leaving out any one of the 18 tables changes 5.6e-4 or more
@@ -39,12 +39,12 @@ def main() -> int:
     parser.add_argument(
         "--only",
         choices=PARTS,
-        help="error map; or trials, propagation, joint solution; or naming of effects; or the way of samples into the database",
+        help="error map; trials, propagation, joint solution; naming of effects; samples into the database; a month of checks; solving",
     )
     parser.add_argument("--cases", type=int, default=discovery_case.CASES, help=f"campaigns to name (default {discovery_case.CASES})")
     given = parser.parse_args()
     parts = [given.only] if given.only else PARTS
-    found = {"facts": facts(), "cases": {}, "trials": {}, "discovery": {}, "capture": {}, "parsers": {}}
+    found = {"facts": facts(), "cases": {}, "trials": {}, "discovery": {}, "capture": {}, "parsers": {}, "history": {}, "reanalysis": {}}
     with tempfile.TemporaryDirectory() as folder:
         for name in CASES if "map" in parts else ():
             names = list(contestants(name))
@@ -59,15 +59,18 @@ def main() -> int:
             found["trials"][name] = _trials(name, list(names), given.rounds, Path(folder))
         if "discovery" in parts:
             found["discovery"] = discovery.compared(Path(folder), max(1, given.cases), _progress)
-        if "capture" in parts:
-            found["capture"] = capture.compared(given.rounds, _progress)
-        if "parsers" in parts:
-            found["parsers"] = parsers.compared(given.rounds, _progress)
+        whole_parts = {
+            "capture": lambda: capture.compared(given.rounds, _progress),
+            "parsers": lambda: parsers.compared(given.rounds, _progress),
+            "history": lambda: history.compared(_progress),
+            "reanalysis": lambda: reanalysis.compared(_progress),
+        }
+        found |= {name: compared() for name, compared in whole_parts.items() if name in parts}
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(report.text(found))  # noqa: T201
     whole = [*found["cases"].values(), *found["trials"].values()]
-    right = all(one["right"] for part in ("capture", "parsers") for one in found[part].values())
+    right = all(one["right"] for part in ("capture", "parsers", "history", "reanalysis") for one in found[part].values())
     return 0 if right and all(a["ok"] for case in whole for a in case["agreement"].values()) else 1
 
 

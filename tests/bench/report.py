@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.bench import capture, discovery_report, parsers, trials_report
+from tests.bench import capture, discovery_report, history, parsers, reanalysis, trials_report
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS
 from tests.bench.facts import LIBRARIES
 
@@ -51,6 +51,10 @@ def text(found: dict) -> str:
         lines += capture.lines(found["capture"])
     if found["parsers"]:
         lines += parsers.lines(found["parsers"])
+    if found["history"]:
+        lines += history.lines(found["history"])
+    if found["reanalysis"]:
+        lines += reanalysis.lines(found["reanalysis"])
     return "\n".join([*lines, "", "Times never fail this run, differing results do."])
 
 

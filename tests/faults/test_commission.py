@@ -20,7 +20,7 @@ from service.workflows.recover import recover
 from simulators.cnc import bank
 from tests.faults.sequencer_world import bench
 
-SPEED = 100.0
+SPEED = 50.0
 
 
 @pytest.fixture

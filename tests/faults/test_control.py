@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import Aborted, Stopped
+from service.errors import Aborted, DoorOpen, Stopped
 from service.sequences.control import Control, State
 from service.sequences.steps import CampaignPlan, FollowPath, ReadBar, RecordPath, TestPlan
 from service.storage.store import Store
@@ -253,3 +253,21 @@ async def test_what_is_not_safe_keeps_the_pause(place):
     _, error = await task
     assert error is None
     assert (State.PAUSED, "cannot go on: the door is open") in seen
+
+
+async def test_where_nobody_may_pause_a_pause_does_not_go_on(place):
+    """A table that nobody has verified is in force: what would wait for a closed door would move by itself when it is closed."""
+    b, store = place
+    control = acting(b, 7, Control.pause, moving=False)
+    task = asyncio.create_task(run(b, store, small("Linear"), control))
+    async for now in control.watch():
+        if now.state == State.PAUSED:
+            b.sim.world.controller.set_door(is_open=True)
+            control.hurry = "not now"
+            control.resume()
+            break
+    with pytest.raises(DoorOpen):
+        await task
+    b.sim.world.controller.set_door(is_open=False)
+    assert not b.sim.world.controller.moving
+    assert store.runs(store.campaigns()[-1].id)[-1].status == "failed"

@@ -117,7 +117,7 @@ async def test_a_campaign_whose_process_lives_is_not_gone_on_with(place):
 
 
 def test_a_machine_is_one_process_s(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("ABBE_LOCK_FOLDER", str(tmp_path))
     with alone("modbus+tcp://127.0.0.1:1?unit=1"):
         second = alone("modbus+tcp://127.0.0.1:1")
         with pytest.raises(UnsafeToMove, match=r"the machine at modbus\+tcp://127\.0\.0\.1:1 is in use by process \d+"):

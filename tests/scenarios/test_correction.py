@@ -128,6 +128,7 @@ async def stops_take_it_back(shop: Shop) -> None:
     assert len(read_entries(shop.store, "sim")) == pushes
 
 
+@pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="two whole identifications: ABBE_TEST_LONG=1 runs it")
 async def test_a_stop_and_a_wrong_sign_take_the_table_back_and_the_right_one_stays_and_adds_up(shop, monkeypatch):
     """One after the other on one machine: its identification takes longer than all the rest."""
     await stops_take_it_back(shop)

@@ -107,10 +107,13 @@ def test_sigkill_loses_at_most_100_ms_and_damages_nothing_else(abbe, tmp_path):
 
 def test_a_folder_that_holds_a_demonstration_is_not_overwritten(abbe, tmp_path):
     (tmp_path / "kept").mkdir()
-    (tmp_path / "kept" / "abbe.sqlite3").write_bytes(b"precious")
+    kept = tmp_path / "kept" / "abbe.sqlite3"
+    with Store.open(f"sqlite:///{kept}") as store:
+        store.add_machine("precious", {"name": "precious"})
     process = abbe("demo", "--keep", str(tmp_path / "kept"))
     _, err = process.communicate(timeout=30)
     assert process.returncode == 2
     assert len(err.strip().splitlines()) == 1
     assert "already holds a demonstration" in err
-    assert (tmp_path / "kept" / "abbe.sqlite3").read_bytes() == b"precious"
+    with Store.open(f"sqlite:///{kept}") as store:
+        assert [machine.name for machine in store.machines()] == ["precious"]

@@ -113,5 +113,6 @@ def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monk
 def test_what_cannot_go_on_live_is_refused_before_anything_moves(run, tmp_path):
     assert run("discover", "june", "--live")[2].startswith("error CFG-001: --live needs the machine")
     (tmp_path / "c1").mkdir()
-    (tmp_path / "m.toml").write_text("")
+    strokes = "".join(f"{axis} = [0, 400]\n" for axis in "XYZ")
+    (tmp_path / "m.toml").write_text(f'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\n{strokes}')
     assert "not with a folder" in run("discover", tmp_path / "c1", "--live", "--machine", tmp_path / "m.toml")[2]

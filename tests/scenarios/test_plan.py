@@ -1,6 +1,7 @@
 """`abbe plan` to `abbe solve`: what the planner writes runs on a machine, and what is measured can be solved."""
 
 import json
+import os
 
 import pytest
 
@@ -14,6 +15,7 @@ def run(abbe, *words: str) -> str:
     return out
 
 
+@pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="a whole planned campaign: ABBE_TEST_LONG=1 runs it")
 def test_a_planned_campaign_is_measured_and_solved(abbe, start_sims, tmp_path):
     sims = start_sims("--seed", "5", "--speed", "60")
     machine = str(sims.machine_file)
@@ -40,6 +42,7 @@ def setup_minutes(steps: list[dict]) -> float:
     return total
 
 
+@pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="a measured campaign: ABBE_TEST_LONG=1 runs it")
 def test_tests_that_share_a_set_up_run_one_after_the_other(abbe, start_sims, tmp_path):
     """Another bar at the standing cup and back with it; two step orders and the straight diagonal on one mirror; one edge line."""
     sims = start_sims("--seed", "6", "--speed", "60")

@@ -22,6 +22,7 @@ from service.errors import StoreError, TableRefused
 from service.events import ignore_progress
 from service.push.book import read_entries
 from service.sequences.campaigns import identification, verification
+from service.sequences.control import Control
 from service.sequences.interlocks import Watching
 from service.sequences.steps import CampaignPlan
 from service.site import Site, site_of
@@ -29,10 +30,11 @@ from service.storage.records import ApprovalRecord
 from service.storage.store import Store
 from service.workflows.correct import Correction, push
 from service.workflows.measure import measure
-from service.workflows.proposal_checks import approve
+from service.workflows.proposal_checks import approve, hold
 from service.workflows.proposal_doc import digest_of_doc, load
 from service.workflows.proposal_states import standing, standing_of
 from service.workflows.proposals import load_runs, login
+from service.workflows.push_approved import Approved, Order, next_approved, push_approved
 from tests.pretended import as_if_commissioned
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import registers
@@ -143,6 +145,39 @@ def test_what_is_not_as_it_was_refuses_the_push_and_writes_nothing(shop, what):
             approve(store, number, load(store, number), "anna", 24.0, SystemClock())
         with pytest.raises(TableRefused, match=reason):
             try_push(shop, store, number, site=change(shop.site), hours=hours)
+        assert store.push_entries("sim") == []
+    assert shop.words() == shop.untouched
+
+
+def test_where_nobody_is_there_more_is_asked_for(shop):
+    """By the service: a control that was proved for it, an approval in any case, and no table that walks away."""
+
+    async def unattended(site: Site, number: int) -> list[str]:
+        async with open_session(site.urls) as session:
+            return (await hold(session.controller, store, site, number, load(store, number), SystemClock(), attended=False)).reasons()
+
+    with Store.open(shop.url) as store:
+        number = shop.copy(store)
+        alone = replace(shop.site, limits=replace(shop.site.limits, walk_mm=0.001))
+        against = asyncio.run(unattended(alone, number))
+        assert any(reason.startswith("APPROVAL: nobody has approved it") for reason in against)
+        assert any(reason.startswith("POLICY WALK: ") for reason in against)
+        before = next_approved(store, "sim", [], SystemClock().utc().timestamp())
+        assert before is None or before.proposal != number  # of this file's other tests
+        row = approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+        found = next_approved(store, "sim", [], SystemClock().utc().timestamp())
+        assert found == Approved(number, row.id, 0)
+        begun: list[int] = []
+
+        async def tell_begun() -> None:
+            begun.append(number)
+
+        order = Order(number, tell_begun, ignore_progress, Control())
+        ended = asyncio.run(push_approved(shop.site, store, order, clock=SystemClock()))
+        assert begun == [number]
+        assert (ended.word, "a person who approves has to be at the machine" in ended.text) == ("refused", True)
+        tried = store.add_alarm_entry("sim", 0, 0, "pushing", {"proposal": number, "approval": row.id})
+        assert next_approved(store, "sim", [tried], SystemClock().utc().timestamp()) is None
         assert store.push_entries("sim") == []
     assert shop.words() == shop.untouched
 

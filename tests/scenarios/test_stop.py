@@ -41,7 +41,7 @@ def test_ctrl_c_stops_at_a_safe_place_and_the_same_campaign_goes_on(abbe, start_
 
 
 def test_sigusr1_pauses_and_lets_go_on(abbe, start_sims):
-    sims = start_sims("--speed", "60")
+    sims = start_sims("--speed", "30")
     process = abbe("measure", str(sims.machine_file), *HELIX, "--name", "june")
     wait_for(lambda: bar_chunks(sims.machine_file.parent) > 1, 60, "samples of the helix")
     process.send_signal(signal.SIGUSR1)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,10 @@ class Process:
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        return self._child.pid
 
     def _read(self) -> None:
         assert self._child.stdout is not None
@@ -112,15 +117,18 @@ class Process:
 class Broker:
     """A real Mosquitto that keeps its subscribers' sessions on disk, on a port that stays the same."""
 
-    def __init__(self, folder: Path) -> None:
-        self.port = free_port()
+    def __init__(self, folder: Path, *tls: str) -> None:
+        """``tls``: lines of a second, encrypted listener."""
+        self.port, self.tls_port = free_port(), free_port()
         self._program = require("mosquitto", "/usr/sbin/mosquitto")
         self._config = folder / "mosquitto.conf"
         data = folder / "broker"
         data.mkdir()
+        self._kept = data / "mosquitto.db"
         self._config.write_text(
             f"listener {self.port} 127.0.0.1\nallow_anonymous true\nuser root\n"
             f"persistence true\npersistence_location {data}/\nautosave_on_changes true\nautosave_interval 1\n"
+            + "\n".join([f"listener {self.tls_port} 127.0.0.1", *tls, ""] if tls else [])
         )
         self.process = self.start()
 
@@ -133,13 +141,23 @@ class Broker:
         self.process.expect("running")
         return self.process
 
-    def subscriber(self) -> Process:
+    def subscriber(self, name: str = "receiver") -> Process:
         """Return a real client with a session of its own: what is published while it reconnects is kept for it."""
         program = require("mosquitto_sub")
         at = ("-h", "127.0.0.1", "-p", str(self.port))
-        receiver = Process(program, *at, "-q", "1", "-c", "-i", "receiver", "-t", "plant/#", "-F", "MSG %t %p")
-        self.process.expect("Sending SUBACK to receiver")
+        receiver = Process(program, *at, "-q", "1", "-c", "-i", name, "-t", "plant/#", "-F", "MSG %t %p")
+        self.process.expect(f"Sending SUBACK to {name}")
+        # The answer comes before the file: killed between the two, the broker would not know this session when it comes back, and what is
+        # published before the client subscribes anew would be nobody's.
+        self.wait_for_file(lambda kept: b"plant/#" in kept and kept.count(name.encode()) >= 2)
         return receiver
+
+    def wait_for_file(self, wanted: Callable[[bytes], bool]) -> None:
+        """Wait until what the broker would read after being killed is as ``wanted`` (it writes the file anew after each change)."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not (self._kept.exists() and wanted(self._kept.read_bytes())):
+            assert time.monotonic() < deadline_s, f"the broker did not keep what was waited for within {PATIENCE_S} s"
+            threading.Event().wait(0.01)
 
 
 def service(folder: Path, **config: Any) -> Process:

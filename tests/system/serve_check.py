@@ -14,12 +14,15 @@ from typing import Any
 
 import aiomqtt
 
-from service.cli.serve import configure_logs
+from service.core.setup import Setup
 from service.events import Progress, ProgressSink
+from service.logs import configure_logs
 from service.mqtt.broker import parse
 from service.mqtt.topics import Topics
+from service.plant.opcua.setup import OpcUaSetup
 from service.scheduler.slots import Schedule
-from service.serve import Setup, serve
+from service.sequences.control import Control, State
+from service.serve import serve
 
 
 @dataclass(frozen=True)
@@ -33,16 +36,18 @@ class Result:
     started_utc: datetime = field(default_factory=lambda: datetime.now(UTC))
     duration_s: float = 0.2
     text: str = "Every figure lies inside its limit."
+    comparable: bool = True
 
 
-async def check(recipe: str, progress: ProgressSink) -> Result:
-    """What the recipe says: ``quick`` takes a moment, ``defect`` is a fault of this program, ``endless`` runs until it is cancelled."""
+async def check(recipe: str, progress: ProgressSink, control: Control) -> Result:
+    """What the recipe says: ``quick`` takes a moment, ``defect`` is a fault of this program, ``endless`` runs until it is stopped."""
     progress(Progress("helix", 1, 2, 0.1, "revolution 1 of 2"))
     if recipe == "defect":
         raise KeyError("a defect")
     if recipe == "endless":
+        control.now(State.RUNNING)
         try:
-            await asyncio.Event().wait()
+            await control.unless_stopped(asyncio.Event().wait())
         finally:
             sys.stdout.write("held\n")
             sys.stdout.flush()
@@ -83,6 +88,7 @@ def main() -> int:
             "127.0.0.1",
             given["port"],
             lambda _: check,
+            opcua=OpcUaSetup(port=given["opcua"]) if "opcua" in given else None,
         )
     )
 

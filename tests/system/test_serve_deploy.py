@@ -72,3 +72,22 @@ def test_containers_stay_on_this_computer() -> None:
     images = re.findall(r"(?m)^\s*image: (\S+)", compose) + re.findall(r"(?m)^FROM (\S+)", (DEPLOY / "Dockerfile").read_text())
     assert not any("." in image.split("/")[0] for image in images if "/" in image), "a registry's address"
     assert "password" not in re.sub(r"postgres_password|POSTGRES_PASSWORD_FILE|/secrets/\S+", "", compose).lower()
+
+
+def test_the_rules_are_what_udev_reads() -> None:
+    """Keys, operators and quoted values; also those that are to be uncommented."""
+    text = (DEPLOY / "99-abbe.rules").read_text()
+    rules = [line.lstrip("# ") for line in text.splitlines() if line.lstrip("# ").startswith(("SUBSYSTEM==", "ACTION"))]
+    assert len(rules) == 4
+    for rule in rules:
+        assert re.fullmatch(r'[A-Z]+(\{\w+\})?(==|!=|\+=|=)"[^"]*"(, [A-Z]+(\{\w+\})?(==|!=|\+=|=)"[^"]*")*', rule), rule
+
+
+def test_the_wheelhouse_refuses_what_it_would_overwrite(tmp_path: Path) -> None:
+    """The way itself fetches a hundred megabytes; it is tried by hand."""
+    for words, told in (([], "usage: "), ([str(tmp_path)], "exists; give the name of a new folder")):
+        done = subprocess.run([DEPLOY / "wheelhouse.sh", *words], capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert told in done.stderr
+    for name in re.findall(r"deploy/([\w.-]+\.(?:lock|service|toml|rules))", (DEPLOY / "wheelhouse.sh").read_text()):
+        assert (DEPLOY / name).is_file()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,6 +20,7 @@ from service.scheduler.slots import Schedule
 from service.scheduler.store import ServiceStore
 from tests.system.serve_bench import free_port, require, service
 from tests.system.serve_check import Result
+from tests.system.test_serve_users import PHRASE, add_user
 
 pytestmark = pytest.mark.browser
 
@@ -158,3 +160,36 @@ def test_empty_page(tmp_path: Path) -> None:
         assert "No check has been made yet" in seen.page.locator("main").inner_text()
         shot(seen.page, "serve-empty.png")
         assert seen.errors == []
+
+
+@pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="two services and a browser: ABBE_TEST_LONG=1 runs it")
+def test_logged_in_to_two_services_and_out_of_one(tmp_path: Path) -> None:
+    """By the form and the button, in one browser: its cookies go to every port of a host."""
+    ports = free_port(), free_port()
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for folder in folders:
+        folder.mkdir()
+        add_user(folder)
+    with ExitStack() as stack:
+        for folder, port in zip(folders, ports, strict=True):
+            running = stack.enter_context(closing(service(folder, schedules=TIMETABLE, port=port)))
+            running.expect("planned")
+        seen = stack.enter_context(browser())
+        for port in ports:
+            seen.page.goto(f"http://127.0.0.1:{port}/")
+            seen.page.fill("#name", "ana")
+            seen.page.fill("#password", PHRASE)
+            seen.page.click("button[type=submit]")
+            seen.page.wait_for_selector("#logout")
+        open_page(seen, ports[0])
+        assert seen.page.locator("#logout").is_visible()
+        shot(seen.page, "serve-logged-in.png")
+        open_page(seen, ports[1])
+        seen.page.click("#logout")
+        seen.page.wait_for_url(f"http://127.0.0.1:{ports[1]}/login")
+        seen.page.goto(f"http://127.0.0.1:{ports[1]}/")
+        assert seen.page.url.endswith("/login")
+        open_page(seen, ports[0])
+        assert seen.page.locator(".logout .quiet").inner_text() == "ana"
+        assert seen.errors == []
+        assert only_us(seen)

@@ -57,12 +57,21 @@ def test_open_to_everybody_is_refused_in_one_line(tmp_path: Path) -> None:
         assert len(process.lines) == 1
         return process.lines[0]
 
-    assert "there is no user" in refusal('host = "0.0.0.0"\n')
+    assert "there is no user who is admin" in refusal('host = "0.0.0.0"\n')
     assert not (tmp_path / "abbe.sqlite3").exists()  # the question has left no database behind
     add_user(tmp_path)
     assert "in clear" in refusal('host = "0.0.0.0"\n')
     assert "belong together" in refusal('certificate = "abbe.crt"\n')
     assert "error CFG-001: [web] certificate" in refusal('certificate = "abbe.crt"\nkey = "abbe.key"\n')
+
+
+def test_an_audit_that_cannot_be_written_is_said_when_the_service_starts(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text(MACHINE + "port = 0\n")
+    (tmp_path / "abbe.sqlite3.audit-key").mkdir()
+    with closing(abbe("serve", tmp_path / "m.toml")) as process:
+        assert process.wait() == 2
+    assert process.lines[-1].startswith(f"error AUD-001: the audit cannot be used: {tmp_path}/abbe.sqlite3.audit-key: ")
+    assert not any("Traceback" in line for line in process.lines)
 
 
 def test_a_login_over_tls(tmp_path: Path) -> None:
@@ -81,7 +90,7 @@ def test_a_login_over_tls(tmp_path: Path) -> None:
             answer = client.post("/login", data=form, headers={"Origin": base})
             assert answer.status_code == 303
             cookie = answer.headers["set-cookie"]
-            assert cookie.startswith("__Host-abbe=")
+            assert cookie.startswith(f"__Host-abbe-{port}=")
             for word in ("Secure", "HttpOnly", "SameSite=strict", "Path=/"):
                 assert word in cookie
             assert client.get("/api/v1/status").json()["machine"] == "mill-7"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import LinkDown
+from drivers.errors import LinkDown, ReplyTimeout
 from service import cli
 from service.storage.engine import wal_is_safe
 from service.storage.store import Store
@@ -187,6 +187,7 @@ def test_schema_writes_where_it_is_told(abbe: Abbe, tmp_path: Path) -> None:
 
 def test_version(abbe: Abbe) -> None:
     out = abbe("version").out
+    assert abbe("--version").out == out
     assert out.startswith("abbe 0.")
     assert ("WAL-reset bug" in out) is not wal_is_safe()
 
@@ -197,6 +198,16 @@ def test_driver_error_is_one_line(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr("service.cli.show.database_url", broken)
     assert abbe.fails("runs") == "error DRV-002: mqtt://me:***@h: open: refused by peer (plug it in)\n"
+
+
+def test_a_device_that_does_not_answer_is_one_line_too(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is a TimeoutError, and so an OSError: not one of the output that cannot be written."""
+
+    def silent(_: str | None, __: Path | None = None) -> str:
+        raise ReplyTimeout("serial:///dev/ttyUSB0", "read samples", "no sample for 1 s", "box switched off?")
+
+    monkeypatch.setattr("service.cli.show.database_url", silent)
+    assert abbe.fails("runs") == "error DRV-003: serial:///dev/ttyUSB0: read samples: no sample for 1 s (box switched off?)\n"
 
 
 def test_interrupt_exits_with_130(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -> None:

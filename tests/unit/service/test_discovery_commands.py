@@ -18,7 +18,8 @@ from service.workflows.campaign_folder import from_folder, from_store
 from service.workflows.discover import prepare
 from service.workflows.discovery_engine import catalogue
 from service.workflows.model_book import current, no_table_lines
-from service.workflows.taken_out import stored_without
+from service.workflows.table_out import NO_TABLE
+from service.workflows.taken_out import taken_out
 from tests.unit.service.discovery_bench import WIDTH_MM, Search, write_case
 
 DB = "sqlite:///book.sqlite3"
@@ -167,7 +168,7 @@ def test_tables_are_made_without_what_they_cannot_take_out(abbe: Call, finds: Ca
     abbe("discover", write_case(tmp_path / "june"), "--db", DB)
     abbe("import", write_case(tmp_path / "july", campaign="july"), "--db", DB)
     with Store.open(DB) as store:
-        told = stored_without(store, "july")
+        told = taken_out(store, from_store(store, "july"), NO_TABLE)
         raw = from_store(store, "july")
     assert (told.labels, told.version) == (("backlash:X",), 1)
     assert told.doc["machine_model"]["not_for_tables"] == list(told.lines)
@@ -192,7 +193,8 @@ def test_a_model_of_another_geometry_is_not_used(abbe: Call, finds: Callable[[Se
     assert "another geometry" in job.flags[-1]
     abbe("import", other, "--db", DB)
     with Store.open(DB) as store:
-        told, raw = stored_without(store, "july"), from_store(store, "july")
+        raw = from_store(store, "july")
+        told = taken_out(store, raw, NO_TABLE)
     line = "model version 1 of VMC-1 is of another geometry and was not used"
     assert (told.lines, told.labels, told.campaign.runs) == ((line,), (), raw.runs)
     assert told.doc["machine_model"]["not_for_tables"] == [line]

@@ -317,3 +317,18 @@ def test_this_process_is_not_gone() -> None:
     me = this_process()
     assert me.pid == os.getpid()
     assert not me.is_gone()
+
+
+def test_the_newest_runs_and_solutions_come_first_and_only_those_asked_for(store: Store, campaign_id: int) -> None:
+    other = store.add_campaign(store.add_machine("VMC-1", {"name": "VMC-1"}), "c2", {})
+    for owner, label, test in ((campaign_id, "a", "laser_linear"), (other, "b", "ballbar_helix"), (campaign_id, "c", "laser_linear")):
+        store.finish_run(store.start_run(owner, label, test, "identify", {}), "complete", "", None)
+    store.start_run(other, "d", "laser_linear", "identify", {})
+    assert [r.label for r in store.latest_runs(3)] == ["d", "c", "b"]
+    assert [r.label for r in store.latest_runs(9, campaign="c2")] == ["d", "b"]
+    assert [r.label for r in store.latest_runs(9, test="laser_linear", status="complete")] == ["c", "a"]
+    assert store.latest_runs(9, campaign="c3") == []
+    for kind in ("joint", "levels", "joint"):
+        store.add_solution(campaign_id, kind, [1], {})
+    assert [s.id for s in store.latest_solutions("joint", 9)] == [3, 1]
+    assert [s.id for s in store.latest_solutions("joint", 1)] == [3]

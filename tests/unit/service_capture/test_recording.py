@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from drivers.api import BarBatch, BarSample
+from service.capture import ingest as ingest_module
 from service.capture.recorder import CaptureRecorder, recording
 from service.capture.records import CHUNK, CLOSE, OPEN
 from service.capture.recovery import ledger_of, read_segment
@@ -135,6 +136,22 @@ async def test_a_locked_database_delays_nothing_but_itself(store: Store, tmp_pat
         other.execute("ROLLBACK")
         other.close()
     assert [one.seq for one in stored(store, run_id)] == list(range(2000))
+
+
+async def test_the_database_gets_many_chunks_in_one_transaction_and_the_end_waits_for_no_more(store: Store, monkeypatch) -> None:
+    monkeypatch.setattr(ingest_module, "TOGETHER_S", 3600.0)
+    monkeypatch.setattr(ingest_module, "BATCH", 8)
+    given = []
+    monkeypatch.setattr(store, "ingest_chunks", lambda chunks, give=store.ingest_chunks: (given.append(len(chunks)), give(chunks)))
+    run_id = new_run(store)
+    async with asyncio.timeout(60), recording(store, run_id, KEEP, SystemClock()) as recorder:
+        tap = recorder.tap()
+        for first in range(0, 200, 20):
+            tap.take(batch(first, 20))
+            await recorder.flush()
+        assert recorder.durable_seq == 199
+    assert given == [7, 3]  # the opening record came with the first, and is no chunk
+    assert [one.seq for one in stored(store, run_id)] == list(range(200))
 
 
 def test_the_same_chunk_again_is_accepted_and_another_one_refused(store: Store) -> None:

@@ -144,6 +144,7 @@ class Result:
     started_utc: datetime = datetime(2026, 6, 1, 4, tzinfo=UTC)
     duration_s: float = 61.0
     text: str = "Every figure lies inside its limit."
+    comparable: bool = True
 
 
 STEP = Progress("helix", 3, 10, 42.0, "revolution 3 of 10")

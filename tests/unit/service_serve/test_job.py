@@ -14,6 +14,7 @@ from drivers.errors import LinkDown
 from service.errors import MeasurementFault
 from service.scheduler.job import CheckJob
 from service.scheduler.slots import Schedule
+from service.sequences.control import Control
 from tests.unit.service_serve.fakes import STEP, FakeClock, FakeShelf, FakeWatcher, Result, settle, utc
 
 SCHEDULE = Schedule("weekly", "0 6 * * 1", "Europe/Berlin", "verify")
@@ -27,7 +28,7 @@ class Bench:
         self.watcher = FakeWatcher()
         self.job = CheckJob("mill-7", self.check, self.shelf, [self.watcher], FakeClock(SLOT))
 
-    async def check(self, recipe: str, progress: Callable[[Any], None]) -> Result:
+    async def check(self, recipe: str, progress: Callable[[Any], None], control: Control) -> Result:
         assert recipe == "verify"
         progress(STEP)
         if isinstance(self.outcome, BaseException):
@@ -84,7 +85,7 @@ async def test_a_stop_is_not_a_result() -> None:
     bench = Bench(Result())
     started = asyncio.Event()
 
-    async def check(recipe: str, progress: Callable[[Any], None]) -> Result:
+    async def check(recipe: str, progress: Callable[[Any], None], control: Control) -> Result:
         started.set()
         await asyncio.Event().wait()
         raise AssertionError

@@ -70,7 +70,7 @@ async def test_a_slot_that_falls_due_during_a_job_is_skipped_with_a_reason() -> 
     async with bench.working():
         await bench.clock.pass_time(3600)
     assert bench.ledger.of("skipped") == [utc(2026, 6, 1, 0, 20), utc(2026, 6, 1, 0, 40), utc(2026, 6, 1, 1, 0)]
-    assert bench.codes() == ["SCH-002"] * 3
+    assert bench.codes() == ["SCH-002"] * 3 + ["SCH-007"]  # the last: the job that ran when this ended
     assert "'quick' was still running" in bench.shelf.alarms[0]["what"]
 
 
@@ -149,7 +149,7 @@ async def test_an_absurd_jump_is_one_alarm() -> None:
     async with bench.working():
         bench.clock.utc_now += timedelta(days=3650)
         await bench.clock.pass_time(30)
-    assert bench.codes() == ["SCH-003", "SCH-004"]
+        assert bench.codes() == ["SCH-003", "SCH-004"]
     assert len(bench.ledger.states) <= MAX_BACKLOG
 
 
@@ -158,7 +158,10 @@ async def test_stopping_interrupts_the_job_and_says_so() -> None:
     async with bench.working():
         await bench.clock.pass_time(60)
         assert bench.ledger.of("RUNNING") == [utc(2026, 6, 1, 4)]
+        assert bench.codes() == []
     assert bench.ledger.of("interrupted") == [utc(2026, 6, 1, 4)]
+    assert bench.codes() == ["SCH-007"]
+    assert bench.shelf.alarms[0]["what"] == "weekly: slot 2026-06-01 04:00 UTC was interrupted: the service was stopped while it ran"
 
 
 async def test_next_due_is_sorted() -> None:

@@ -32,6 +32,9 @@ class FakeOutbox:
     async def done(self, number: int) -> None:
         raise AssertionError(number)
 
+    async def tidy(self) -> int:
+        return 0
+
 
 def test_topics() -> None:
     topics = Topics("plant/abbe", "Mill 7/East+#")

@@ -123,8 +123,8 @@ async def test_what_a_lost_service_left_open_is_decided_by_the_next() -> None:
     async with later.working():
         await later.clock.pass_time(60)
         assert bench.ledger.of("interrupted") == [utc(2026, 6, 1, 8)]
+        assert later.codes() == ["SCH-007"]
     assert later.ran == [(utc(2026, 6, 1, 8), utc(2026, 6, 1, 8, 20))]
-    assert later.codes() == ["SCH-007"]
 
 
 def test_intervals_are_counted_from_a_fixed_instant() -> None:

@@ -72,7 +72,7 @@ async def test_status_of_a_fresh_service(site: Site) -> None:
     assert status["job"] is None
     assert [device["state"] for device in status["devices"]] == ["not used yet"] * 2
     assert status["next_due"][0]["words"] == "Monday 23 November 06:00, in 2 days"
-    assert status["mqtt"] == {"configured": True, "broker": "mqtt://127.0.0.1:1883", "connected": False, "waiting": 0}
+    assert status["mqtt"] == {"configured": True, "broker": "mqtt://127.0.0.1:1883", "connected": False, "waiting": 0, "dropped": 0}
     assert status["last"] == []
 
 
@@ -92,6 +92,14 @@ async def test_a_running_check_and_a_device_that_fails(site: Site) -> None:
     status = (await site.client.get("/api/v1/status")).json()
     assert [device["state"] for device in status["devices"]] == ["not used yet", "fault"]
     assert status["job"] is None
+
+
+async def test_dropped_alarms_are_shown(site: Site) -> None:
+    assert "dropped" not in (await site.client.get("/")).text
+    site.board.messages_dropped(1000)
+    site.board.messages_dropped(7)
+    assert "old alarms dropped: 1007" in (await site.client.get("/")).text
+    assert (await site.client.get("/api/v1/status")).json()["mqtt"]["dropped"] == 1007
 
 
 async def test_verifications_newest_first(site: Site) -> None:
@@ -141,7 +149,7 @@ async def test_headers_on_every_answer(site: Site, path: str) -> None:
 async def test_the_page_needs_nothing_from_elsewhere_and_no_inline_code(site: Site) -> None:
     site.keep(Result())
     page = (await site.client.get("/")).text
-    assert re.findall(r'(?:src|href)="(?!/)[^"]*"', page) == []
+    assert re.findall(r'(?:src|href)="(?![/#])[^"]*"', page) == []
     assert set(re.findall(r"https?://[^\"\s<]+", page)) == {"http://www.w3.org/2000/svg"}
     assert " style=" not in page
     assert "<style" not in page
@@ -221,3 +229,28 @@ def test_words() -> None:
     assert words.figure_name("odd") == ("Odd", "")
     assert [words.number(v) for v in (123.4, 11.84, 0.123, None)] == ["123", "11.8", "0.12", "–"]
     assert [words.span(s) for s in (5, 600, 7200, 200000)] == ["5 s", "10 min", "2 h", "2 days"]
+
+
+async def test_a_skipped_slot_changes_the_revision(site: Site) -> None:
+    async def revision() -> str:
+        return str((await site.client.get("/api/v1/status")).json()["revision"])
+
+    before, slot = await revision(), utc(2026, 11, 21, 5)
+    site.store.claim_slot("another mill/weekly", slot)
+    assert await revision() == before, "what happens to another machine is none of this page's business"
+    site.store.claim_slot("mill-7/weekly", slot)
+    claimed = await revision()
+    site.store.finish_slot("mill-7/weekly", slot, "skipped: busy", "something else ran")
+    assert len({before, claimed, await revision()}) == 3
+    assert await revision() == await revision()
+
+
+async def test_a_device_says_since_when_so_that_an_open_page_can_go_on_counting(site: Site) -> None:
+    site.board.job_started(WEEKLY, NOW)
+    site.board.job_ended({"cause": None})
+    assert page_of(await site.client.get("/")).count(f'data-since="{NOW.isoformat()}"') == len(DEVICES)
+
+
+def page_of(answer: httpx.Response) -> str:
+    assert answer.status_code == 200
+    return answer.text

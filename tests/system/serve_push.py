@@ -1,0 +1,116 @@
+"""The service in the middle of a push of its own: ``python serve_push.py CONFIG.json``. Run as a process by the tests beside it.
+
+Control, journal, lock, measurement and service are real. Which proposal waits is told, and the probe measures until it is stopped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.core.setup import Setup
+from service.devices.alone import alone
+from service.devices.session import DeviceUrls, Session, open_session
+from service.events import Progress
+from service.logs import configure_logs
+from service.mqtt.topics import Topics
+from service.push.operations import Verdict
+from service.scheduler import desk
+from service.scheduler.slots import Schedule
+from service.scheduler.store import ServiceStore
+from service.sequences.recipes import Diagonal
+from service.sequences.steps import CampaignPlan
+from service.serve import serve
+from service.site import Site, machine_doc, machine_from_doc
+from service.workflows.at_start import recover_at_start
+from service.workflows.base_table import read_base
+from service.workflows.measure import Manner, measure
+from service.workflows.push_approved import Approved, Order
+from service.workflows.push_word import Outcome
+from service.workflows.pushing import Pushing, Questions, Wanted
+from service.workflows.recover import recover
+from tests.scenarios.test_push import linear_tables
+
+PROPOSAL = Approved(4, 9, 0)
+
+
+def say(word: str) -> None:
+    sys.stdout.write(f"{word}\n")
+    sys.stdout.flush()
+
+
+async def probing(session: Session, store: ServiceStore, site: Site, order: Order, last: str) -> Verdict:
+    """Axes on their way for as long as nobody stops them. ``last``: what the fixture is asked for when that happens."""
+    told: list[Progress] = []
+
+    def progress(now: Progress) -> None:
+        order.progress(now)
+        if now.done > 0.0 and not told:
+            told.append(now)
+            say("on its way")
+
+    plan = CampaignPlan("probe", (Diagonal("probe", "P", "holdout", "ppp", 200, "").plan(site.machine),))
+    try:
+        await measure(session, store, site, plan, progress=progress, manner=Manner(control=order.control, part=True))
+    except asyncio.CancelledError:
+        if last:
+            host, port = site.urls.fixture.removeprefix("fixture+tcp://").split(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            writer.write(last.encode() + b"\n")
+            await reader.readline()
+            writer.close()
+        raise
+    raise AssertionError("the diagonal ended before it was stopped")
+
+
+def duties_on(site: Site, last: str) -> Any:
+    def duties(store: ServiceStore) -> desk.Duties:
+        async def push(order: Order) -> Outcome:
+            with alone(site.urls.cnc):
+                async with open_session(site.urls) as session:
+                    await recover(session.controller, store, site)
+                    await order.begun()
+                    wanted = Wanted(
+                        linear_tables(site, np.full((3, 3), 1e-5)), await read_base(session.controller), 100, None, {"proposal": 4}
+                    )
+
+                    async def probe() -> Verdict:
+                        return await probing(session, store, site, order, last)
+
+                    done = await Pushing(session.controller, store, site, control=order.control).bring(
+                        wanted, Questions(list, "a test", probe, probe)
+                    )
+                    return Outcome("kept" if done.kept else "rolled back", done.why)
+
+        async def investigate(*_: object) -> None:
+            raise AssertionError
+
+        return desk.Duties(0.0, "identification", investigate, push)
+
+    return duties
+
+
+def main() -> int:
+    given = json.loads(Path(sys.argv[1]).read_text())
+    configure_logs()
+    ready = given["ready"]
+    machine = machine_from_doc(ready["machine"])
+    urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
+    site = Site("sim", machine, machine_doc("sim", machine), urls)
+    desk.next_approved = lambda store, name, entries, now_s: None if any(e.kind == "pushing" for e in entries) else PROPOSAL  # type: ignore[assignment]
+    yearly = Schedule("yearly", "0 0 1 1 *", "UTC", "quick-check")
+    return serve(
+        Setup(
+            "sim", site.doc, {"cnc": ready["cnc"]}, (yearly,), given["store"], None, Topics("plant/abbe", "sim"), "127.0.0.1", 0,
+            lambda _: None, recover=lambda store: lambda: recover_at_start(store, site), duties=duties_on(site, given["last"]),
+        )
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,97 @@
+"""Campaigns solved anew give the same numbers wherever they are computed: the same document, to the last digit."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+from service.cli import run
+from service.errors import ConfigError
+from service.storage.store import Store
+from service.workflows.executors import Dask, Executor, Here, Processes
+from service.workflows.reanalysis import Answer, solve_all, tasks_of
+from tests.conftest import Require
+from tests.many_campaigns import dask_cluster, fill
+
+SEEDS = (7, 8)
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Two campaigns that can be solved, and one that cannot."""
+    place = tmp_path_factory.mktemp("many")
+    found = f"sqlite:///{place / 'abbe.sqlite3'}"
+    with Store.open(found) as store:
+        fill(store, place, SEEDS)
+        store.add_campaign(1, "june-empty", {})
+    return found
+
+
+def answers(url: str, executor: Executor) -> list[Answer]:
+    with Store.open(url) as store:
+        return list(solve_all(tasks_of(store, url, "june-*", "rigid6"), executor))
+
+
+@pytest.fixture(scope="module")
+def here(url: str) -> list[Answer]:
+    return answers(url, Here())
+
+
+def text(found: list[Answer]) -> str:
+    return json.dumps([one.doc for one in found])
+
+
+def test_each_is_solved_as_abbe_solve_does_and_one_that_cannot_be_stops_no_other(
+    url: str, here: list[Answer], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert [one.campaign for one in here] == ["june-7", "june-8", "june-empty"]
+    assert here[2].doc is None
+    assert here[2].refused.startswith("SOL-001: no run of this campaign has the role identify")
+    assert run(["solve", "june-7", "--model", "rigid6", "--db", url, "--json"]) == 0
+    doc = json.loads(capsys.readouterr().out)
+    assert here[0].doc is not None
+    assert {key: doc[key] for key in here[0].doc} == json.loads(json.dumps(here[0].doc))
+
+
+@pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="beside Dask, which starts processes too: ABBE_TEST_LONG=1 runs it")
+def test_processes_give_the_same_numbers(url: str, here: list[Answer]) -> None:
+    assert text(answers(url, Processes(2))) == text(here)
+
+
+def test_dask_gives_the_same_numbers(url: str, here: list[Answer], require: Require) -> None:
+    try:
+        import distributed
+    except ModuleNotFoundError:
+        require("dask", False, "distributed is not installed (pip install 'abbe[fleet]')")
+        return
+    with dask_cluster(2) as address:
+        assert text(answers(url, Dask(address))) == text(here), distributed.__version__
+
+
+def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[Answer]) -> None:
+    assert run(["solve-all", "june-*", "--model", "rigid6", "--store", url]) == 1  # one was refused
+    out = capsys.readouterr().out
+    assert [word in out for word in ("june-7", "june-8", "june-empty", "refused")] == [True] * 4
+    with Store.open(url) as store:
+        before = len(store.solutions())
+    assert run(["solve-all", "june-8", "--model", "rigid6", "--store", url, "--keep", "--json"]) == 0
+    (doc,) = json.loads(capsys.readouterr().out)
+    with Store.open(url) as store:
+        assert len(store.solutions()) == before + 1
+        assert store.solution(doc["solution_id"]).doc["parameters"] == doc["parameters"]
+        assert store.audit(1)[0].action == "abbe solve-all"
+
+
+def test_bad_input_is_one_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, told in (
+        (["solve-all", "july-*", "--store", url], "error STO-001: no campaign matches 'july-*'"),
+        (["solve-all", "--workers", "2", "--dask", "tcp://127.0.0.1:1", "--store", url], "error CFG-001: --workers and --dask both say"),
+    ):
+        assert run(words) == 2
+        err = capsys.readouterr().err
+        assert err.startswith(told)
+        assert err.count("\n") == 1
+    with pytest.raises(ConfigError, match=r"Dask is not installed|no Dask scheduler answers"):
+        Dask("nonsense://")

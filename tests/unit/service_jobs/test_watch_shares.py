@@ -1,0 +1,89 @@
+"""The watcher looks at what others were told of the controller, and asks only when that is old or was heard under other terms."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from drivers.api import ControllerStatus
+from service.devices.clock_notes import noted
+from service.devices.session import Session
+from service.errors import DoorOpen
+from service.sequences.interlocks import AT_WORK, DOOR, DRIVES, REFERENCED, REMOTE, Watching
+from service.sequences.watch import NOTHING, Watch
+
+READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
+PERIOD_S = 60.0
+
+
+class Asked:
+    """A controller that counts who asks."""
+
+    def __init__(self) -> None:
+        self.times, self.bits, self.age_s = 0, READY, 0.0
+
+    async def status(self) -> ControllerStatus:
+        self.times += 1
+        now = ControllerStatus(0.0, self.times, self.bits, 0, 0, 0, 0, (0.0, 0.0, 0.0), 0, 0, 0, 0, 100, 0, 0, 0)
+        return replace(now, host_s=time.monotonic() - self.age_s)
+
+
+def place() -> tuple[Asked, Any, Watch]:
+    asked = Asked()
+    controller: Any = noted(asked)  # type: ignore[arg-type]
+    return asked, controller, Watch(Session(controller, None, None, None), Watching(period_s=PERIOD_S))
+
+
+async def one_look(watch: Watch) -> None:
+    looking = asyncio.create_task(watch.controller())
+    for _ in range(10):
+        await asyncio.sleep(0)
+    watch.end()
+    await looking
+
+
+async def test_what_somebody_was_just_told_is_not_asked_again() -> None:
+    asked, controller, watch = place()
+    await controller.status()
+    await one_look(watch)
+    assert asked.times == 1
+
+
+async def test_what_somebody_was_just_told_ends_the_test_all_the_same() -> None:
+    asked, controller, watch = place()
+    asked.bits |= 1 << DOOR
+    await controller.status()
+    with pytest.raises(DoorOpen):
+        await watch.controller()
+    assert asked.times == 1
+
+
+async def test_what_is_a_period_old_is_asked_again() -> None:
+    asked, controller, watch = place()
+    asked.age_s = PERIOD_S
+    await controller.status()
+    asked.age_s, asked.bits = 0.0, READY | 1 << DOOR
+    with pytest.raises(DoorOpen):
+        await watch.controller()
+    assert asked.times == 2
+
+
+async def test_a_door_that_was_open_while_it_might_be_is_asked_about_again() -> None:
+    asked, controller, watch = place()
+    watch.tolerated = AT_WORK
+    asked.bits |= 1 << DOOR
+    await controller.status()
+    watch.tolerated, asked.bits = NOTHING, READY
+    await one_look(watch)
+    assert asked.times == 2
+
+
+async def test_nobody_else_asks_and_nothing_is_noted() -> None:
+    asked = Asked()
+    watch = Watch(Session(asked, None, None, None), Watching(period_s=PERIOD_S))  # type: ignore[arg-type]
+    await one_look(watch)
+    assert asked.times == 1

@@ -1,0 +1,58 @@
+"""Facts that tests turn."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from service.errors import StoreError
+from service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce
+
+NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
+RUNNING = Running("weekly", "quick-check", NOON, "helix", "revolution 3 of 10", 30.0, 42.0)
+
+
+def check(number: int, verdict: str = "pass", **figures: float | None) -> Check:
+    chosen = figures or {"body_diagonal_um": 11.8, "helix_rms_um": 1.4}
+    rows = tuple(Figure(key, value, 1.1, 20.0) for key, value in chosen.items())
+    return Check(number, "weekly", "quick-check", NOON - timedelta(hours=100 - number), 61.0, verdict, f"check {number}: {verdict}", rows)
+
+
+def facts(**changes: Any) -> Facts:
+    devices = (DeviceState("laser", "answered", "", NOON), DeviceState("cnc", "fault", "refused\x07by peer", None))
+    known = Facts(
+        machine="mill-7",
+        version="0.1.0",
+        now_utc=NOON,
+        running=None,
+        next_utc=NOON + timedelta(days=1),
+        checks=(check(2, "fail"), check(1)),
+        alarms=(Alarm("DRV-002", "open: refused", NOON - timedelta(hours=98), "cnc"),),
+        devices=devices,
+        table=TableInForce(1, 0xBEEF, 4, NOON),
+    )
+    return replace(known, **changes)
+
+
+class Source:
+    """A FactsSource whose facts are set by the test; None: the database does not answer."""
+
+    def __init__(self) -> None:
+        self.now: Facts | None = facts()
+        self._questions: asyncio.Queue[None] = asyncio.Queue()
+
+    async def asked_again(self, times: int = 2) -> None:
+        """Wait until the facts were asked for so often from now on."""
+        while not self._questions.empty():
+            self._questions.get_nowait()
+        async with asyncio.timeout(30):
+            for _ in range(times):
+                await self._questions.get()
+
+    async def facts(self) -> Facts:
+        self._questions.put_nowait(None)
+        if self.now is None:
+            raise StoreError("the database is locked")
+        return self.now

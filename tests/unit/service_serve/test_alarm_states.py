@@ -1,0 +1,174 @@
+"""Alarms as a pure state machine: whatever the checks say, in whatever order, with acknowledgements and restarts between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.workflows.alarm_states import Alarm, Found, Kind, Signal, after_check, folded, is_open, next_step
+
+RECIPE = "quick-check"
+SIGNAL = Signal("helix_rms_um", "limit", 8.8, 0.2, 7.0, "helix rms 8.8 ± 0.2 µm (U, k = 2) is above its limit of 7 µm")
+BAD = Found(True, "fail", (SIGNAL,))
+GOOD = Found(True, "pass")
+UNSURE = Found(True, "cannot tell")
+NOT_MEASURED = Found(False, "cannot tell")
+
+
+@dataclass(frozen=True)
+class Line:
+    alarm: int
+    seq: int
+    kind: str
+    doc: dict[str, Any]
+    utc: str
+
+
+@dataclass
+class Book:
+    """Lines as the store keeps them, and what a check or a person adds."""
+
+    lines: list[Line] = field(default_factory=list)
+
+    @property
+    def alarms(self) -> list[Alarm]:
+        return folded(self.lines)
+
+    @property
+    def active(self) -> Alarm | None:
+        return next((a for a in reversed(self.alarms) if a.active), None)
+
+    def add(self, number: int | None, kind: Kind, **doc: Any) -> None:
+        number = number or max((line.alarm for line in self.lines), default=0) + 1
+        seq = max((line.seq for line in self.lines if line.alarm == number), default=-1) + 1
+        self.lines.append(Line(number, seq, str(kind), doc, f"2026-11-22T00:00:{len(self.lines):02d}Z"))
+
+    def check(self, found: Found) -> Kind | None:
+        now = self.active
+        kind = after_check(now, found)
+        if kind is not None:
+            doc = {"recipe": RECIPE, "schedule": "often", "verification": len(self.lines), "text": found.text}
+            self.add(None if now is None else now.number, kind, signals=[s.text for s in found.signals], **doc)
+        return kind
+
+    def acknowledge(self, name: str = "otto") -> None:
+        self.add(self.alarms[-1].number, Kind.ACKNOWLEDGED, name=name)
+
+
+def test_the_life_of_an_alarm() -> None:
+    book = Book()
+    assert [book.check(f) for f in (GOOD, UNSURE, NOT_MEASURED)] == [None, None, None]
+    assert book.check(BAD) is Kind.RAISED
+    assert book.alarms[0].word == "raised"
+    assert book.check(NOT_MEASURED) is None
+    assert book.check(UNSURE) is Kind.HELD  # too near to the limit to say that it is over
+    book.acknowledge()
+    assert book.alarms[0].word == "acknowledged"
+    assert book.check(BAD) is Kind.HELD
+    assert book.alarms[0].word == "acknowledged"
+    assert book.check(GOOD) is Kind.CLEARED
+    assert book.alarms[0].word == "closed"
+    assert not is_open(book.alarms[0])
+    assert book.check(BAD) is Kind.RAISED
+    assert [a.number for a in book.alarms] == [1, 2]
+    assert book.check(GOOD) is Kind.CLEARED
+    assert book.alarms[1].word == "cleared"  # it stays to be seen
+    assert is_open(book.alarms[1])
+    book.acknowledge("anna")
+    assert (book.alarms[1].word, book.alarms[1].acknowledged_by) == ("closed", "anna")
+    book.acknowledge("otto")
+    assert book.alarms[1].acknowledged_by == "anna"  # who was first stays
+
+
+CHECKS = st.sampled_from([BAD, GOOD, UNSURE, NOT_MEASURED])
+ACTS = st.lists(st.one_of(CHECKS, st.just("ack")), max_size=40)
+
+
+@given(ACTS)
+def test_whatever_happens(acts: list[Found | str]) -> None:
+    """Beside the machine a model of three lines: is it on, has somebody seen it, how many were there."""
+    book, on, seen, count = Book(), False, False, 0
+    for act in acts:
+        if isinstance(act, str):
+            if count:
+                book.acknowledge()
+                seen = True
+        else:
+            kind = book.check(act)
+            if act is BAD:
+                assert kind is (Kind.HELD if on else Kind.RAISED)
+                count, seen, on = (count, seen, True) if on else (count + 1, False, True)
+            elif act is NOT_MEASURED or not on:
+                assert kind is None
+            else:
+                assert kind is (Kind.CLEARED if act is GOOD else Kind.HELD)
+                on = act is not GOOD
+        alarms = book.alarms
+        assert len(alarms) == count
+        assert sum(a.active for a in alarms) == int(on)
+        assert [a.active for a in alarms[:-1]] == [False] * max(count - 1, 0)
+        if alarms:
+            word = {(True, False): "raised", (True, True): "acknowledged", (False, False): "cleared", (False, True): "closed"}[on, seen]
+            assert alarms[-1].word == word
+            assert alarms[-1].signals or act is UNSURE or not on or isinstance(act, str) or act is NOT_MEASURED
+
+
+@given(ACTS, st.integers(0, 60))
+def test_a_restart_anywhere_finds_the_same(acts: list[Found | str], cut: int) -> None:
+    """What is read at a start follows from the lines alone: a prefix of them is what stood there then."""
+    book, then = Book(), []
+    for act in acts:
+        if not isinstance(act, str):
+            book.check(act)
+        elif book.lines:
+            book.acknowledge()
+        then.append((len(book.lines), book.alarms))
+    for length, alarms in then[:cut]:
+        assert folded(book.lines[:length]) == alarms
+
+
+def test_lines_that_cannot_follow_are_left_out() -> None:
+    stray = [Line(0, 0, "pushed", {"text": "no alarm asked for it"}, "t"), Line(7, 0, "held", {}, "t"), Line(7, 1, "acknowledged", {}, "t")]
+    assert folded(stray) == []
+
+
+@pytest.fixture
+def raised() -> Book:
+    book = Book()
+    book.check(BAD)
+    return book
+
+
+def test_an_investigation_goes_on_where_its_lines_end(raised: Book) -> None:
+    def step() -> Kind | None:
+        return next_step(raised.alarms[0])
+
+    assert step() is Kind.MEASURED
+    raised.add(1, Kind.BEGUN, text="measuring")
+    assert step() is Kind.MEASURED  # interrupted: anew
+    raised.add(1, Kind.MEASURED, text="measured", campaign="c")
+    assert step() is Kind.DISCOVERED
+    raised.add(1, Kind.DISCOVERED, text="found")
+    assert step() is Kind.PROPOSED
+    raised.add(1, Kind.FAILED, text="the link is down")
+    assert step() is None  # not at once
+    raised.check(BAD)
+    assert step() is Kind.PROPOSED
+    raised.add(1, Kind.PROPOSED, text="proposal 1", proposal=1)
+    assert step() is None
+    assert raised.alarms[0].outcome == "proposal 1"
+
+
+def test_a_cleared_alarm_asks_for_nothing(raised: Book) -> None:
+    raised.check(GOOD)
+    assert next_step(raised.alarms[0]) is None
+
+
+def test_an_ended_investigation_is_not_begun_again(raised: Book) -> None:
+    raised.add(1, Kind.ENDED, text="no proposal: not enough to write")
+    raised.check(BAD)
+    assert next_step(raised.alarms[0]) is None

@@ -1,0 +1,149 @@
+"""A strange table in force is told once, shown until it is gone or accepted, and a push of our own is never one."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+
+import pytest
+
+from drivers.errors import LinkDown
+from service.core.table_watch import AGAIN_S, CODE, LOOK_S, NOBODY_PUSHED, TableWatch
+from service.push.entries import Entry
+from service.push.states import State
+from service.workflows.in_force import InForce
+from service.workflows.push_history import wanted_by
+from tests.unit.service_serve.fakes import FakeClock, FakeShelf, settle, utc
+
+OURS = InForce(0, 0xA, 0xA)
+STRANGE = InForce(1, 0xB, 0xA)
+
+
+class Bench:
+    """What the controller says next is ``seen``: a look, or a trouble."""
+
+    def __init__(self, seen: InForce | Exception) -> None:
+        self.seen = seen
+        self.clock, self.shelf = FakeClock(utc(2026, 6, 1)), FakeShelf()
+        self.attention: list[str] = ["another line"]
+        self.changes = 0
+
+    async def look(self) -> InForce:
+        if isinstance(self.seen, Exception):
+            raise self.seen
+        return self.seen
+
+    def changed(self) -> None:
+        self.changes += 1
+
+    async def then(self, seen: InForce | Exception, s: float = LOOK_S + AGAIN_S) -> None:
+        self.seen = seen
+        await self.clock.pass_time(s)
+
+
+@asynccontextmanager
+async def watched(bench: Bench) -> AsyncIterator[None]:
+    task = asyncio.create_task(TableWatch(bench.look, bench.shelf, bench.attention, bench.clock, bench.changed).run())
+    await settle()
+    try:
+        yield
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+
+async def test_a_strange_table_is_told_once_and_shown_until_it_is_gone() -> None:
+    bench = Bench(OURS)
+    async with watched(bench):
+        await bench.then(STRANGE)
+        await bench.then(STRANGE, 100.0)
+        (alarm,) = bench.shelf.alarms
+        assert alarm["code"] == CODE
+        assert "bank 1 has CRC 0000000B, expected is 0000000A" in alarm["what"]
+        assert len(bench.attention) == 2
+        assert "accept-table" in bench.attention[1]
+        await bench.then(replace(STRANGE, wanted=0xB), 2 * LOOK_S)  # a person has accepted it
+        assert bench.attention == ["another line"]
+        await bench.then(replace(STRANGE, crc=0xC, wanted=0xB))
+        assert len(bench.shelf.alarms) == 2
+
+
+async def test_it_is_seen_within_fifteen_seconds() -> None:
+    bench = Bench(OURS)
+    async with watched(bench):
+        await bench.then(STRANGE, 15.0)
+        assert len(bench.shelf.alarms) == 1
+
+
+@pytest.mark.parametrize("silence", [LinkDown("tcp://x", "look", "gone"), replace(STRANGE, settled=False)])
+async def test_no_answer_and_an_open_push_say_nothing(silence: InForce | Exception) -> None:
+    bench = Bench(OURS)
+    async with watched(bench):
+        await bench.then(silence, 100.0)
+        assert bench.shelf.alarms == []
+        await bench.then(STRANGE)
+        await bench.then(silence, 100.0)
+        assert len(bench.attention) == 2, "what was seen is not forgotten because nobody answers"
+
+
+async def test_one_look_in_the_middle_of_an_end_is_no_alarm() -> None:
+    """The journal of another process may be read a moment before its last line: the second look finds both of one mind."""
+    bench = Bench(OURS)
+    async with watched(bench):
+        await bench.then(STRANGE, LOOK_S + AGAIN_S / 2)
+        await bench.then(replace(STRANGE, wanted=0xB), 100.0)
+        assert bench.shelf.alarms == []
+
+
+async def test_without_a_push_the_first_look_is_what_counts() -> None:
+    """There is nothing that a person could accept: he looks, and begins anew with what is right."""
+    bench = Bench(InForce(0, 0xA, None))
+    async with watched(bench):
+        for strange in (0xB, 0xC):
+            await bench.then(InForce(1, strange, None), 100.0)
+            assert f"{strange:08X}, expected is 0000000A" in bench.attention[-1]
+            assert bench.attention[1:] == [f"{CODE}: {bench.shelf.alarms[-1]['what']} - {NOBODY_PUSHED}"]
+        assert [alarm["remedy"] for alarm in bench.shelf.alarms] == [NOBODY_PUSHED] * 2
+        await bench.then(InForce(0, 0xA, None), 100.0)
+        assert (len(bench.shelf.alarms), bench.attention) == (2, ["another line"])
+    bench.seen = InForce(1, 0xC, None)
+    async with watched(bench):
+        await bench.then(InForce(1, 0xC, None), 100.0)
+        assert (len(bench.shelf.alarms), bench.attention) == (2, ["another line"])
+
+
+def entries(state: State, *docs: dict[str, int], push: int = 1) -> list[Entry]:
+    states = [State.SNAPSHOT] * (len(docs) - 1) + [state]
+    return [Entry(push, k, one, doc, "", "", "") for k, (one, doc) in enumerate(zip(states, docs, strict=True))]
+
+
+KEPT = entries(State.KEEP, {"crc": 2, "base_crc": 1}, {})
+ACCEPTED = entries(State.ACCEPTED, {"crc": 4, "base_crc": 2}, {"accepted_crc": 3}, push=2)
+ON_STRANGE = {"crc": 5, "base_crc": 9}
+
+
+@pytest.mark.parametrize(
+    ("journal", "wanted"),
+    [
+        ([], (None, True)),
+        (entries(State.KEEP, {"crc": 2, "base_crc": 1}, {}), (2, True)),
+        (entries(State.ROLLED_BACK, {"crc": 2, "base_crc": 1}, {}), (1, True)),
+        (entries(State.REJECTED, {"crc": 2, "base_crc": 1}, {}), (1, True)),
+        (entries(State.ACCEPTED, {"crc": 2, "base_crc": 1}, {"accepted_crc": 3}), (3, True)),
+        (entries(State.PROBATION, {"crc": 2, "base_crc": 1}, {}), (None, False)),
+        (entries(State.OPERATOR, {"crc": 2, "base_crc": 1}, {}), (None, False)),
+        # a push that comes to nothing on a strange table does not make that one expected
+        (KEPT + entries(State.ROLLED_BACK, ON_STRANGE, {}, push=2), (2, True)),
+        (KEPT + entries(State.REJECTED, ON_STRANGE, {}, push=2) + entries(State.ABORTED, ON_STRANGE, {}, push=3), (2, True)),
+        (KEPT + ACCEPTED + entries(State.ROLLED_BACK, ON_STRANGE, {}, push=3), (3, True)),
+        (ACCEPTED + entries(State.KEEP, ON_STRANGE, {}, push=3), (5, True)),
+        (entries(State.ABORTED, {"crc": 2, "base_crc": 1}, {}) + entries(State.REJECTED, ON_STRANGE, {}, push=2), (1, True)),
+        (entries(State.ABORTED, {}, {}), (None, True)),
+        (KEPT + entries(State.PROBATION, ON_STRANGE, {}, push=2), (None, False)),
+    ],
+)
+def test_what_the_journal_left_in_force(journal: list[Entry], wanted: tuple[int | None, bool]) -> None:
+    assert wanted_by(journal) == wanted
