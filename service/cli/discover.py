@@ -72,6 +72,7 @@ def opened(campaign: str, db: str | None, machine: Path | None, without: list[st
 
 def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
     """The job and where it stands."""
+    from service.workflows.changed_since import since_of
     from service.workflows.discover import Journal, prepare
     from service.workflows.discovery_engine import catalogue
     from service.workflows.discovery_store import journal_of
@@ -80,7 +81,8 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
 
     base = None if store is None else current(store, campaign.site.name)
     table = NO_TABLE if store is None else table_then(store, campaign)
-    job = prepare(campaign, catalogue(), base, table=table)
+    since = None if store is None else since_of(store, campaign, table)
+    job = prepare(campaign, catalogue(), base, table=table, since=since)
     return job, Journal() if store is None else journal_of(store, job)
 
 

@@ -86,7 +86,7 @@ class DiscoveryPage:
 
     ``verdict``: sign ("ok", "open", "bad"), word and text; ``tests``: kind, value, statistic and p of each test of where the gap lives;
     ``states``: state and why; ``found``: what the gap after is with, empty where before and after are one; the
-    other texts are lines.
+    other texts are lines, ``changed``: what has changed since the last solution.
     """
 
     title: str
@@ -105,4 +105,5 @@ class DiscoveryPage:
     states: Sequence[tuple[str, str]]
     provenance: Mapping[str, str]
     found: str = "what was found"
+    changed: Sequence[str] = ()
     lang: str = "en"

@@ -26,6 +26,7 @@ from service.storage.records import ModelRecord
 from service.workflows.axis_test import SLOW_DRIFT
 from service.workflows.campaign_checks import check_files, check_readings, copies, refuse
 from service.workflows.campaign_folder import Campaign
+from service.workflows.changed_since import Since
 from service.workflows.discovery_doc import finding_doc
 from service.workflows.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering
 from service.workflows.known_effects import applies, readings_of, without
@@ -51,7 +52,7 @@ class Job:
     labels; ``base``: the version of the book they are from; ``flags``: what is odd about single runs, and what thinning hides;
     ``thinning``: that in figures, None where nothing was thinned; ``seen``: the version that has to be the current one when a new one is
     added - ``base``, unless that is of another geometry, or the discovery goes on with one that has added a version of the same readings
-    itself; ``table_mm``: what a table in force did, per run, where it was taken out.
+    itself; ``table_mm``: what a table in force did, per run, where it was taken out; ``since``: the solution that it is compared with.
     """
 
     campaign: Campaign
@@ -65,6 +66,7 @@ class Job:
     thinning: Thinning | None = None
     seen: int | None = None
     table_mm: dict[str, F1] = field(default_factory=dict)
+    since: Since | None = None
 
     @property
     def source(self) -> dict[str, Any]:
@@ -79,6 +81,7 @@ class Job:
         runs = sorted(whole_run_digest(r) for r in self.runs)
         files = {e.name: code_digest(e.signal) for e in self.effects}
         words = [self.source, head, runs, sorted(self.case.includes), files]
+        words += [] if self.since is None else [{"since": self.since.number}]
         return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
 
 
@@ -88,6 +91,7 @@ def prepare(
     base: ModelRecord | None = None,
     *,
     table: TableThen = NO_TABLE,
+    since: Since | None = None,
     thin: Thin = thinned,
 ) -> Job:
     """Check a campaign's runs and take out what the model book knows.
@@ -98,6 +102,8 @@ def prepare(
         Current version of the machine's model. A version of another geometry is not used, and that is flagged.
     table : TableThen
         In force while it was measured: what it did beyond smooth corrections is taken out of the readings, and flagged.
+    since : Since, optional
+        The solution from before that it is compared with: what has changed since is found beside what is missing.
     thin : function
         From runs to runs with as many readings as the search shall hold.
 
@@ -125,7 +131,7 @@ def prepare(
     known = [] if base is None else [e for e in base.doc["effects"] if applies(e, campaign.name)]
     known_mm = readings_of(known, effects, case)
     labels = tuple(e["label"] for e in known)
-    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen, table_mm)
+    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen, table_mm, since)
 
 
 def _between(measured: list[dict[str, Any]], less: list[dict[str, Any]]) -> dict[str, F1]:
@@ -214,6 +220,7 @@ def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink)
     if finding is None:
         found = search(job.case, job.effects, progress)
         finding = finding_doc(found, job.case, (*job.effects, SLOW_DRIFT), job.known_mm, job.thinning)
+        finding |= {} if job.since is None else {"changed": job.since.compare()}
     for seq, (state, doc) in enumerate(after_fit(finding), start=1):
         if seq < len(journal.states):
             continue

@@ -167,7 +167,7 @@ def next_search(store: Store, job: Job, journal: StoredJournal, name: str) -> tu
     """
     campaign = joined(job.campaign, from_store(store, name))
     base = None if journal.base is None else version(store, job.campaign.site.name, journal.base)
-    following = replace(prepare(campaign, job.effects, base, table=table_then(store, campaign)), seen=journal.leaves)
+    following = replace(prepare(campaign, job.effects, base, table=table_then(store, campaign), since=job.since), seen=journal.leaves)
     return following, journal_of(store, following, journal)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from models.arrays import F1
 from service.report.discovery_model import DiscoveryPage, EffectCard, GapRow, Place, RunGap, Trace
 from service.report.numbers import plain
+from service.workflows.changed_words import changed_lines, changed_words
 from service.workflows.discover import Job, Journal
 from service.workflows.discovery_states import closed, entering
 from service.workflows.discovery_words import (
@@ -64,9 +65,10 @@ def discovery_page(finding: dict[str, Any], runs: list[dict[str, Any]], facts: d
     return DiscoveryPage(
         title=told["title"],
         facts=facts,
-        verdict=told.get("verdict") or verdict_of(finding),
+        verdict=told.get("verdict") or _verdict(finding),
         effects=[_card(e) for e in finding["effects"]],
         located=where_lines(finding["where"]),
+        changed=changed_lines(finding),
         gaps=gap_rows(finding),
         runs=[_run(label, doc) for label, doc in finding["runs"].items()],
         traces=_traces(finding, measured),
@@ -79,6 +81,13 @@ def discovery_page(finding: dict[str, Any], runs: list[dict[str, Any]], facts: d
         provenance=told["provenance"],
         found={"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding["verdict"]],
     )
+
+
+def _verdict(finding: dict[str, Any]) -> tuple[str, str, str]:
+    """The finding's, with what has changed where an earlier solution could be compared."""
+    sign, word, text = verdict_of(finding)
+    changes = changed_words(finding)
+    return sign, word, f"{text} {changes[:1].upper()}{changes[1:]}." if changes else text
 
 
 def gap_rows(finding: dict[str, Any]) -> list[GapRow]:

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from service.report.numbers import NOT_AVAILABLE, plain, with_uncertainty
+from service.workflows.changed_words import changed_lines
 from service.workflows.discovery_states import closed, entering, judge, not_entered
 from service.workflows.model_book import REMEDIES, name_of
 from service.workflows.never_fitted import disagreeing, told_missing
@@ -104,7 +105,7 @@ def lines_of(finding: dict[str, Any]) -> list[str]:
         out += effect_lines(e)
     if finding["confounded_with"]:
         out.append("these runs cannot tell it from: " + ", ".join(finding["confounded_with"]))
-    return out + book_lines(finding) + next_of(finding)
+    return out + changed_lines(finding) + book_lines(finding) + next_of(finding)
 
 
 def book_lines(finding: dict[str, Any]) -> list[str]:

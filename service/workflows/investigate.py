@@ -31,6 +31,8 @@ from service.site import Site
 from service.storage.store import Store
 from service.workflows.alarm_states import TRIES, Alarm, Doc, Kind, next_step
 from service.workflows.campaign_folder import from_store
+from service.workflows.changed_since import since_of
+from service.workflows.changed_words import changed_words
 from service.workflows.correct import check_promise
 from service.workflows.discover import discover, prepare
 from service.workflows.discovery_engine import catalogue, search
@@ -135,14 +137,16 @@ async def _discovered(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
         raise
     _, word, told = verdict_of(finding)
     names = ", ".join(f"{name_of(e)} {size_text(e)}" for e in finding["effects"])
-    doc = {"text": f"{word}: {names}" if names else f"{word}: {told}", "discovery": number}
+    changes = changed_words(finding)
+    doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {told}", changes) if t), "discovery": number}
     return await note(Kind.DISCOVERED, doc | _against(finding, bench.store, bench.site.name))
 
 
 def _search(bench: Bench, campaign: str) -> tuple[int | None, dict[str, Any]]:
     store = bench.store
     measured = from_store(store, campaign)
-    job = prepare(measured, catalogue(), current(store, bench.site.name), table=table_then(store, measured))
+    then = table_then(store, measured)
+    job = prepare(measured, catalogue(), current(store, bench.site.name), table=then, since=since_of(store, measured, then))
     journal = journal_of(store, job)
     return journal.id, discover(job, journal, search, bench.progress)
 

@@ -86,6 +86,8 @@ def _tables(page: DiscoveryPage) -> list[TextTable]:
     runs = [(r.label, r.test, r.role, str(r.readings), plain(r.before_um), plain(r.after_um), plain(r.floor_um)) for r in page.runs]
     out = [TextTable("Runs", ("Run", "Test", "Role", "Readings", "Before, µm", "After, µm", "Noise, µm"), runs)]
     out.append(TextTable("How it was decided", ("State", "Why"), page.states))
+    if page.changed:
+        out.append(TextTable("What has changed", ("Compared with the solution from before",), [(line.strip(),) for line in page.changed]))
     if page.effects:
         cards = [(c.name, c.where or NOT_AVAILABLE, c.do) for c in page.effects]
         out.append(TextTable("What to do", ("Effect", "Where", "What to do at the machine"), cards))

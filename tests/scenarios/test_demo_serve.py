@@ -71,6 +71,10 @@ def test_the_story_is_seen_and_approved_in_the_page(demo: Process, page: Page, t
 
     # it is named, and a proposal waits
     named = demo.expect("5. the service has measured the full campaign and searched: ", PATIENCE_S).split("searched: ")[1]
+    by_search = re.search(r"changed since solution \d+: scale of X \+([\d.]+) ± ([\d.]+) µm/m(.*)", named)
+    assert by_search is not None, named
+    assert abs(float(by_search[1]) - DRIFT_UM_PER_M) < float(by_search[2])
+    assert "not proved" not in by_search[3]
     promise = demo.expect("proposal 1 waits for approval", PATIENCE_S)
     assert re.search(r"largest change: [+-][\d.]+ µm .* in the table of X over X", promise), promise
     grown = re.search(r"changed most since solution \d+: scale of X ([+-][\d.]+) ± ([\d.]+) µm/m", promise)
@@ -78,6 +82,9 @@ def test_the_story_is_seen_and_approved_in_the_page(demo: Process, page: Page, t
     assert abs(float(grown[1]) - DRIFT_UM_PER_M) < 2.0 * float(grown[2])
     page.goto(f"{base}discoveries")
     expect(page.locator("main")).to_contain_text("alarm 1")
+    page.goto(f"{base}discovery")
+    expect(page.locator("main")).to_contain_text("scale of X")
+    expect(page.locator("main")).to_contain_text("on runs that did not choose it the gap shrinks from")
     page.goto(base)
     expect(alarm).to_contain_text("scale of X", timeout=LOOKS_MS)
     page.get_by_role("link", name="Proposal 1").first.click()
@@ -90,7 +97,6 @@ def test_the_story_is_seen_and_approved_in_the_page(demo: Process, page: Page, t
     # pushed, proved, verified, and the trend is back within its limits
     assert " kept: " in demo.expect("7. ", PATIENCE_S)
     demo.expect("8. the check after it", PATIENCE_S)
-    assert named
     page.goto(base)
     expect(alarm).to_contain_text("over, not acknowledged", timeout=LOOKS_MS)
     expect(rows.nth(0).locator("td.pass")).to_have_count(1)

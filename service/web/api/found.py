@@ -15,6 +15,7 @@ from service.users.roles import Permission
 from service.web.access import needs
 from service.web.api.shapes import Trends
 from service.web.api.shapes_tables import (
+    ChangedSince,
     Discoveries,
     Discovery,
     DiscoveryDetail,
@@ -24,6 +25,7 @@ from service.web.api.shapes_tables import (
     Solutions,
 )
 from service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, read_as, storable
+from service.workflows.changed_words import proved
 from service.workflows.trend_table import as_doc, trends
 
 CHECKS = 20_000
@@ -96,4 +98,6 @@ def _add_discoveries(app: FastAPI, sources: Sources) -> None:
         states = [DiscoveryState(state=one.state, utc=one.utc, why=str(one.doc.get("why", ""))) for one in steps]
         found: Doc | None = next((one.doc["finding"] for one in steps if "finding" in one.doc), None)
         answer = None if found is None else read_as(DiscoveryFile, found.get("answer"))
-        return DiscoveryDetail(number=row["id"], states=states, answer=answer, **row)
+        told = None if found is None else found.get("changed")
+        changed = None if told is None else ChangedSince.model_validate(told | {"proved": proved(told)})
+        return DiscoveryDetail(number=row["id"], states=states, answer=answer, changed=changed, **row)

@@ -59,11 +59,45 @@ class DiscoveryState(Answer):
     why: str
 
 
+class MotionChange(Answer):
+    """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
+
+    ``u``: standard uncertainty; ``halves``: by how many of two halves of the runs it was chosen without the other.
+    """
+
+    motion: str
+    part: Literal["linear", "shape"]
+    value: float
+    u: float
+    unit: Literal["um/m", "urad", "um"]
+    evidence: float
+    halves: int
+
+
+class ChangeGap(Answer):
+    """Measured less the solution from before, rms over runs that did not choose what changed: without and with it, and noise."""
+
+    before_um: float
+    after_um: float
+    floor_um: float
+
+
+class ChangedSince(Answer):
+    """What has changed since an earlier solution. ``gap``: None: too few set-ups judge; ``seen_um_m``: U (k = 2) of each linear one."""
+
+    since: int
+    changes: list[MotionChange]
+    gap: ChangeGap | None
+    seen_um_m: dict[str, float]
+    proved: bool
+
+
 class DiscoveryDetail(Discovery):
-    """A search with its states and, once it has one, its answer."""
+    """A search with its states and, once it has one, its answer; ``changed`` where an earlier solution could be compared."""
 
     states: list[DiscoveryState]
     answer: DiscoveryFile | None
+    changed: ChangedSince | None
 
 
 class Approval(Answer):

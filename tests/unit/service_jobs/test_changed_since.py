@@ -1,0 +1,160 @@
+"""A machine that is measured again is compared with its last solution: what has changed is named, a table in between is no change."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.cnc.tables import crc32, encode
+from models.compensation.tables import NineTables
+from service.runs.exchange import import_folder
+from service.storage.store import Store
+from service.workflows.campaign_folder import from_store, keep
+from service.workflows.changed_since import since_of
+from service.workflows.changed_words import changed_lines, changed_words
+from service.workflows.discover import Journal, discover, prepare
+from service.workflows.discovery_engine import catalogue
+from service.workflows.solve import solve_runs
+from service.workflows.solve_report import solution_doc
+from service.workflows.table_out import table_then
+from service.workflows.tables import table_image
+from tests.scenarios.campaign_files import measured, write_folder
+from tests.unit.service.discovery_bench import Search
+
+Doc = dict[str, Any]
+SEED, GROWN = 1, 60e-6
+
+
+@cache
+def june() -> tuple[Doc, str, Doc]:
+    """Machine, runs of June as text, and their solution."""
+    site, runs = measured(SEED, "joint")
+    return site.doc, json.dumps(runs), solution_doc(solve_runs(site, runs))
+
+
+def moved(runs: list[Doc], per_mm: np.ndarray, seed: int) -> list[Doc]:
+    """The same runs on a machine whose axes move farther by a share, read with other noise."""
+    rng = np.random.default_rng(seed)
+    for run in runs:
+        columns, setup = run["columns"], run["setup"]
+        axes = np.column_stack([columns[f"{c}_mm"] for c in "xyz"])
+        if run["test"].startswith("laser"):
+            added = ((axes - axes[0]) * per_mm) @ np.array(setup["nominal_beam"])
+        else:
+            away = axes - np.array(setup["centre_mm"])
+            added = np.sum(away / np.linalg.norm(away, axis=1, keepdims=True) * away * per_mm, axis=1)
+        columns["deviation_mm"] = (np.array(columns["deviation_mm"]) + added + rng.normal(0.0, 5e-5, len(added))).tolist()
+    return runs
+
+
+def growing(machine: Doc, per_mm: np.ndarray) -> NineTables:
+    """A table that makes the axes move farther by a share."""
+    at = tuple(np.linspace(*machine["stroke_mm"][axis], 21) for axis in "XYZ")
+    values = [np.zeros((21, 3)) for _ in at]
+    for a in range(3):
+        values[a][:, a] = per_mm[a] * (at[a] - at[a][0])
+    none = [np.full((21, 3), np.nan) for _ in at]
+    return NineTables((at[0], at[1], at[2]), (values[0], values[1], values[2]), (none[0], none[1], none[2]))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """With the campaign of June and its solution."""
+    _, text, doc = june()
+    with Store.open(f"sqlite:///{tmp_path / 'book.sqlite3'}") as opened:
+        put(opened, tmp_path, "june", json.loads(text))
+        keep(opened, from_store(opened, "june"), doc)
+        yield opened
+
+
+def put(store: Store, place: Path, name: str, runs: list[Doc]) -> None:
+    folder = write_folder(place / name, june()[0], [run | {"campaign": name} for run in runs])
+    head = json.loads((folder / "campaign.json").read_text()) | {"campaign": name}
+    (folder / "campaign.json").write_text(json.dumps(head))
+    import_folder(store, folder)
+
+
+def compared(store: Store, name: str) -> Doc | None:
+    campaign = from_store(store, name)
+    since = since_of(store, campaign, table_then(store, campaign))
+    return None if since is None else {"changed": since.compare()}
+
+
+def test_an_axis_that_grows_is_named_and_proved_by_runs_that_did_not_choose_it(store: Store, tmp_path: Path) -> None:
+    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
+    found = compared(store, "july")
+    assert found is not None
+    (change,) = found["changed"]["changes"]
+    assert (change["motion"], change["part"], change["unit"], change["halves"]) == ("EXX", "linear", "um/m", 2)
+    assert abs(change["value"] - GROWN * 1e6) <= 2.0 * change["u"] < 6.0
+    assert changed_words(found).startswith("changed since solution 1: scale of X +")
+    assert "proved" not in changed_words(found)
+    gap = found["changed"]["gap"]
+    assert gap["after_um"] < gap["floor_um"] + 0.1 * (gap["before_um"] - gap["floor_um"])
+    assert any("on runs that did not choose it the gap shrinks from" in line for line in changed_lines(found))
+
+
+def test_without_a_change_what_could_hide_is_told(store: Store, tmp_path: Path) -> None:
+    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
+    found = compared(store, "july")
+    assert found is not None
+    assert found["changed"]["changes"] == []
+    assert changed_words(found) == "nothing has changed since solution 1 that these runs can tell"
+    assert "scale of Z" in changed_lines(found)[1]
+
+
+def test_a_table_that_was_put_in_force_is_no_change_of_the_machine(store: Store, tmp_path: Path) -> None:
+    """X and Y are corrected after June; in July Z has grown, and the corrections are in the readings."""
+    runs = moved(json.loads(june()[1]), np.array([-GROWN, 0.5 * GROWN, GROWN]), 3)
+    image = encode(table_image(growing(june()[0], np.array([-GROWN, 0.5 * GROWN, 0.0])), 100, 7))
+    put(store, tmp_path, "july", [run | {"table": {"crc": crc32(image), "acting": True}} for run in runs])
+    assert compared(store, "july") is None, "a table that nobody knows cannot be taken out"
+    store.add_table(store.campaign("july").machine_id, None, image, crc32(image), {})
+    found = compared(store, "july")
+    assert found is not None
+    assert [c["motion"] for c in found["changed"]["changes"]] == ["EZZ"]
+    assert abs(found["changed"]["changes"][0]["value"] - GROWN * 1e6) <= 2.0 * found["changed"]["changes"][0]["u"]
+
+
+def test_the_first_campaign_is_compared_with_nothing_and_none_with_a_later_one(store: Store, tmp_path: Path) -> None:
+    assert compared(store, "june") is None
+    assert changed_lines({}) == []
+    assert changed_words({}) == ""
+
+
+def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path: Path) -> None:
+    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
+    campaign = from_store(store, "july")
+    then = table_then(store, campaign)
+    job = prepare(campaign, catalogue(), None, table=then, since=since_of(store, campaign, then))
+    assert job.digest != prepare(campaign, catalogue(), None, table=then).digest
+    journal = Journal()
+    search = Search("none")
+    finding = discover(job, journal, search, lambda _: None)
+    assert finding["changed"]["since"] == 1
+    assert json.loads(json.dumps(finding["changed"])) == finding["changed"]
+    assert discover(job, journal, search, lambda _: None) is finding
+
+
+@pytest.mark.parametrize(
+    ("gap", "halves", "proof", "says"),
+    [
+        ({"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}, 2, True, "100% closed"),
+        ({"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}, 1, False, "not chosen by each half of the runs alone: scale of X"),
+        ({"before_um": 10.0, "after_um": 8.0, "floor_um": 1.0}, 2, False, "what is left is more than noise"),
+        (None, 0, False, "too few set-ups"),
+    ],
+)
+def test_a_change_that_is_not_proved_says_so(gap: Doc | None, halves: int, proof: bool, says: str) -> None:
+    change = {"motion": "EXX", "part": "linear", "value": 12.0, "u": 1.0, "unit": "um/m", "rivals": [], "halves": halves}
+    finding = {"changed": {"since": 4, "changes": [change], "gap": gap, "seen_um_m": {}}}
+    assert changed_words(finding).endswith("(not proved)") is not proof
+    assert any(says in line for line in changed_lines(finding))
+    rival = {"changed": finding["changed"] | {"changes": [change | {"rivals": [{"name": "C0Y", "less_evidence": 1.0}]}]}}
+    assert "these runs cannot tell it from squareness of X and Y" in changed_lines(rival)[1]
