@@ -39,7 +39,7 @@ class Change:
     evidence : float
         Gain in log evidence after its price, beside all others that were named.
     rivals : tuple of (name, evidence less)
-        Others that explained nearly as much where it was taken in: these runs cannot tell it from them.
+        Others that explain nearly as much in its place: these runs cannot tell it from them.
     halves : int
         By how many of the two halves of the runs it was chosen without the other: 0 to 2.
     """
@@ -57,15 +57,17 @@ class Changed:
     """All that has changed.
 
     ``before_mm``, ``after_mm``, ``floor_mm``: rms of readings less the solution from before; less the changes, too, that the OTHER half
-    of the set-ups has chosen; and of noise. None: there are too few set-ups to judge. ``seen``: change of each scale and squareness
-    that equals its U (k = 2), rad: a smaller one may be there.
+    of the set-ups has chosen; and of noise. ``judged``: log of how much more likely each half is with what the other has chosen, the
+    smaller of the two. None: there are too few set-ups to judge. ``hidden``: how large each scale and squareness that was not named may
+    have changed all the same, rad; one that these runs do not see is not in it.
     """
 
     changes: tuple[Change, ...]
     before_mm: float | None
     after_mm: float | None
     floor_mm: float
-    seen: dict[str, float]
+    judged: float | None
+    hidden: dict[str, float]
 
 
 def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
@@ -90,8 +92,8 @@ def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
     bench = Bench(known, problem, fit)
     whole = bench.choose(total(fit.parts))
     by_half = [bench.choose(total(half)) for half in _halves(fit.parts, problem)]
-    before, after = bench.judged(by_half) if by_half else (None, None)
-    return Changed(_changes(bench, whole, by_half), before, after, bench.floor_mm(), bench.seen(whole))
+    before, after, judged = bench.judged(by_half) if by_half else (None, None, None)
+    return Changed(_changes(bench, whole, by_half), before, after, bench.floor_mm(), judged, bench.hidden(whole))
 
 
 def _silent(_: str) -> None:

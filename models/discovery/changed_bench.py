@@ -93,8 +93,10 @@ class Bench:
     def choose(self, sums: Sums) -> Chosen:
         """Take in what gains most, one after another, until nothing gains enough; what has become needless goes.
 
-        A shape is so pliant that it may gain more at first than either of two linear changes which explain all together. So the linear
-        ones also get the first word, and the choice that makes the readings more likely is taken.
+        That alone would go wrong twice. A shape is so pliant that it may gain more at first than either of two linear changes which explain
+        all together. And of an equal growth of all axes each alone gains nothing, because a laser's wavelength explains it nearly as
+        well. So the linear ones also get the first word, one by one, and all together less what is needless; the choice that makes the
+        readings most likely is taken, none included.
         """
         weight = np.exp(-self.fit.components.eta)
         gram, moment = np.tensordot(weight, sums.gram, 1), weight @ sums.moment
@@ -102,8 +104,19 @@ class Bench:
         start[: self._n] = self.known.coefficients / self.problem.sizes.typical[: self._n]
         none = Chosen((), gram, moment - gram @ start)
         linear = tuple(a for a in self.candidates if not a.several)
-        both = [self._grown(none, self.candidates), self._grown(self._grown(none, linear), self.candidates)]
-        return max(both, key=lambda c: log_evidence(gram, c.moment, self._beside(c.taken)) - self._price * len(c.taken))
+        every = self._needed(replace(none, taken=tuple(Taken(a, max(LINEAR_SIZES), 0.0, ()) for a in linear)))
+        grown = [self._grown(start, self.candidates) for start in (none, self._grown(none, linear), every)]
+        best = max([none, *grown], key=lambda c: log_evidence(gram, c.moment, self._beside(c.taken)) - self._price * len(c.taken))
+        return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
+
+    def _rivals(self, chosen: Chosen, taken: Taken) -> tuple[tuple[str, float], ...]:
+        """Candidates that explain nearly as much in place of one that was chosen, beside all the others."""
+        names = {t.asked.name for t in chosen.taken}
+        left = [a for a in self.candidates if a.name not in names]
+        others = self._beside([t for t in chosen.taken if t is not taken])
+        own, *found = evidence_of(chosen.gram, chosen.moment, others, [taken.asked, *left])
+        near = [(e.name, own.gain - e.gain) for e in found if own.gain - e.gain < NEAR]
+        return tuple(sorted(near, key=lambda item: item[1]))
 
     def _grown(self, chosen: Chosen, candidates: Sequence[Asked]) -> Chosen:
         while len(chosen.taken) < MOST and (best := self._best(chosen, candidates)) is not None:
@@ -123,21 +136,20 @@ class Bench:
         gain = found[k].gain - self._price
         if gain < ENOUGH:
             return None
-        near = [(e.name, found[k].gain - e.gain) for e in found if e is not found[k] and found[k].gain - e.gain < NEAR]
-        size = found[k].size if left[k].several else max(LINEAR_SIZES)
-        return Taken(left[k], size, gain, tuple(sorted(near, key=lambda item: item[1])))
+        return Taken(left[k], found[k].size, gain, ())
 
     def _needed(self, chosen: Chosen) -> Chosen:
-        """Every one with its gain beside all the others; the least needed goes first, until all are needed."""
+        """Every one with its gain and size beside all the others; the least needed goes first, until all are needed."""
         taken = list(chosen.taken)
-        while True:
-            told = [
-                evidence_of(chosen.gram, chosen.moment, self._beside([o for o in taken if o is not t]), [t.asked])[0].gain - self._price
-                for t in taken
-            ]
-            if not taken or min(told) >= ENOUGH:
-                return replace(chosen, taken=tuple(replace(t, gain=gain) for t, gain in zip(taken, told, strict=True)))
-            del taken[int(np.argmin(told))]
+        while taken:
+            for k, one in enumerate(taken):
+                found = evidence_of(chosen.gram, chosen.moment, self._beside([o for o in taken if o is not one]), [one.asked])[0]
+                taken[k] = replace(one, gain=found.gain - self._price, size=found.size)
+            least = min(taken, key=lambda t: t.gain)
+            if least.gain >= ENOUGH:
+                break
+            taken.remove(least)
+        return replace(chosen, taken=tuple(taken))
 
     @property
     def _price(self) -> float:
@@ -151,8 +163,8 @@ class Bench:
         """The same with all scales and squareness free, too, without one candidate."""
         others = [t for t in chosen.taken if t.asked.name != but]
         names = {but, *(t.asked.name for t in others)}
-        linear = [Taken(a, max(LINEAR_SIZES), 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
-        return self._beside([*others, *linear])
+        linear = [Taken(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
+        return self._beside([t if t.asked.several else replace(t, size=max(LINEAR_SIZES)) for t in (*others, *linear)])
 
     def size(self, chosen: Chosen, asked: Asked) -> tuple[float, float]:
         """Value of a change and its standard uncertainty (`models.discovery.changed.Change`), all that is linear free beside it."""
@@ -169,7 +181,7 @@ class Bench:
     def _coefficients(self, chosen: Chosen, asked: Asked) -> tuple[F1, F2]:
         """Coefficients (P,) of one change, mm or rad, and their covariance."""
         size = next(t.size for t in chosen.taken if t.asked.name == asked.name)
-        factor = asked.directions * size
+        factor = asked.directions * (size if asked.several else max(LINEAR_SIZES))
         whole = np.column_stack([factor, self._free(chosen, asked.name)])
         inside = whole.T @ chosen.gram @ whole
         inside[np.diag_indices_from(inside)] += 1.0
@@ -190,11 +202,20 @@ class Bench:
         mine = np.array([t.motion == motion for t in self.known.terms])
         return np.asarray(term_values(self.known.terms, points, stroke) * mine)
 
-    def seen(self, chosen: Chosen) -> dict[str, float]:
-        """Change of each scale and squareness that equals its U (k = 2), the others free beside it, rad."""
-        linear = [a for a in self.candidates if not a.several]
-        found = [evidence_of(chosen.gram, chosen.moment, self._free(chosen, a.name), [a])[0] for a in linear]
-        return {e.name: 2.0 / float(np.sqrt(max(e.information, 1e-300))) for e in found}
+    def hidden(self, chosen: Chosen) -> dict[str, float]:
+        """How large each scale and squareness that was not chosen may have changed all the same, rad: estimate and U (k = 2), without sign.
+
+        All linear ones are free. What these runs do not see, up to the largest size that is tried, is left out.
+        """
+        names = {t.asked.name for t in chosen.taken}
+        out = {}
+        for asked in self.candidates:
+            if not asked.several and asked.name not in names:
+                one = Taken(asked, max(LINEAR_SIZES), 0.0, ())
+                value, u = self.size(replace(chosen, taken=(*chosen.taken, one)), asked)
+                if 2.0 * u < max(LINEAR_SIZES):
+                    out[asked.name] = abs(value) + 2.0 * u
+        return out
 
     def floor_mm(self) -> float:
         """Noise of the readings, rms."""
@@ -209,17 +230,28 @@ class Bench:
         """Readings that count."""
         return np.asarray(self.fit.weight > 0.5)
 
-    def judged(self, by_half: Sequence[Chosen]) -> tuple[float, float]:
-        """Rms of all readings less the solution from before, and less what the other half has chosen, too, mm; set-ups refitted."""
+    def judged(self, by_half: Sequence[Chosen]) -> tuple[float, float, float]:
+        """What each half says of the other's choice: rms of all readings without and with it, mm, set-ups refitted; gain in log likelihood.
+
+        The gain is the smaller one of the two halves, everything that is open without a change integrated out.
+        """
         old = self.known.coefficients
-        before, after, count = 0.0, 0.0, 0
-        for odd, chosen in enumerate(reversed(by_half)):
+        before, after, count, gains = 0.0, 0.0, 0, []
+        for odd, (mine, others) in enumerate(zip(by_half, reversed(by_half), strict=True)):
             rows = (self.problem.readings.fold % 2 == odd) & self._whole
-            new = old + sum((self._coefficients(chosen, t.asked)[0] for t in chosen.taken), start=np.zeros_like(old))
+            change = sum((self._coefficients(others, t.asked)[0] for t in others.taken), start=np.zeros_like(old))
             before += self._left(rows, old)
-            after += self._left(rows, new)
+            after += self._left(rows, old + change)
             count += int(rows.sum())
-        return float(np.sqrt(before / count)), float(np.sqrt(after / count))
+            gains.append(self._likelier(mine, change))
+        return float(np.sqrt(before / count)), float(np.sqrt(after / count)), min(gains)
+
+    def _likelier(self, mine: Chosen, change: F1) -> float:
+        """Log of how much more likely some runs are after a change of the coefficients that they did not choose."""
+        moved = self._scaled(change)[:, 0]
+        shifted = mine.moment - mine.gram @ moved
+        plain, with_it = (log_evidence(mine.gram, m, self._open) for m in (mine.moment, shifted))
+        return with_it - plain + float(moved @ mine.moment) - 0.5 * float(moved @ mine.gram @ moved)
 
     def _left(self, rows: NDArray[np.bool_], coefficients: F1) -> float:
         """Sum of squares of readings less what coefficients predict, mm²; lost motion and set-ups refitted within their priors."""

@@ -26,12 +26,11 @@ class Asked:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Gain in log evidence at the best size, that size, and what the readings tell of one unit along the first direction (1 / u²)."""
+    """Gain in log evidence at the best size, and that size."""
 
     name: str
     gain: float
     size: float
-    information: float
 
 
 def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[Asked]) -> list[Evidence]:
@@ -77,4 +76,4 @@ def _one(asked: Asked, gram: F2, moment: F1) -> Evidence:
         inside = 1.0 + size**2 * values
         found.append(0.5 * float(np.sum(size**2 * along**2 / inside) - np.sum(np.log(inside))))
     best = int(np.argmax(found))
-    return Evidence(asked.name, found[best], asked.sizes[best], float(d[:, 0] @ gram @ d[:, 0]))
+    return Evidence(asked.name, found[best], asked.sizes[best])

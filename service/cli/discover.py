@@ -81,7 +81,7 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
 
     base = None if store is None else current(store, campaign.site.name)
     table = NO_TABLE if store is None else table_then(store, campaign)
-    since = None if store is None else since_of(store, campaign, table)
+    since = None if store is None else since_of(store, campaign)
     job = prepare(campaign, catalogue(), base, table=table, since=since)
     return job, Journal() if store is None else journal_of(store, job)
 

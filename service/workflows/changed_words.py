@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.report.numbers import plain, with_uncertainty
-from service.workflows.discovery_states import CLOSED, VISIBLE, closed
+from service.report.numbers import COVERAGE, plain, with_uncertainty
+from service.workflows.discovery_states import CLOSED, NEAR, VISIBLE, closed
 from service.workflows.linear_change import NAMES
 
+LEFT = 1.5
+"""What is left after the changes is told as more than noise from this factor on: the solution is known to a part of the noise only."""
+HALVES = 2
 UNITS = {"um/m": "µm/m", "urad": "µrad", "um": "µm"}
 Doc = dict[str, Any]
 
@@ -18,6 +21,8 @@ def changed_words(finding: Doc) -> str:
     if told is None:
         return ""
     since = f"since solution {told['since']}"
+    if told.get("trouble"):
+        return f"what has changed {since} could not be told: {told['trouble']}"
     if not told["changes"]:
         return f"nothing has changed {since} that these runs can tell"
     names = ", ".join(_size(c) for c in told["changes"])
@@ -30,40 +35,66 @@ def changed_lines(finding: Doc) -> list[str]:
     if told is None:
         return []
     out = [changed_words(finding)]
+    if told.get("trouble"):
+        return out
     for c in told["changes"]:
+        name = _name(c["motion"], c["part"])
         if c["rivals"]:
-            rivals = ", ".join(_rival(r["name"]) for r in c["rivals"])
-            out.append(f"  {_name(c['motion'], c['part'])}: these runs cannot tell it from {rivals}")
-    return out + (_proof(told) if told["changes"] else [_hidden(told)])
+            out.append(f"  {name}: these runs cannot tell it from {', '.join(_rival(r['name']) for r in c['rivals'])}")
+        if not _sure(c):
+            out.append(f"  {name}: zero is within its uncertainty, so it may be another scale or squareness that has changed")
+    return out + (_proof(told) if told["changes"] else []) + _hidden(told)
 
 
 def proved(told: Doc) -> bool:
-    """Whether runs that did not choose the changes agree better with them, and each was chosen by both halves without the other."""
-    gap = told["gap"]
-    if gap is None or any(c["halves"] < 2 for c in told["changes"]):
+    """Whether runs that did not choose the changes bear them out.
+
+    Each half of the set-ups is more likely with what the other has chosen; the gap, where it shows, closes; every change was chosen by both
+    halves, has no near rival, and is larger than its own U.
+    """
+    sure = all(c["halves"] == HALVES and not c["rivals"] and _sure(c) for c in told["changes"])
+    if told["judged"] is None or told["judged"] < NEAR or not sure:
         return False
-    return (closed(gap) or 0.0) >= CLOSED
+    return not _shows(told["gap"]) or (closed(told["gap"]) or 0.0) >= CLOSED
+
+
+def _shows(gap: Doc) -> bool:
+    return bool(gap["before_um"] > VISIBLE * gap["floor_um"])
+
+
+def _sure(change: Doc) -> bool:
+    return abs(float(change["value"])) > COVERAGE * float(change["u"])
 
 
 def _proof(told: Doc) -> list[str]:
-    gap = told["gap"]
+    gap, judged = told["gap"], told["judged"]
     if gap is None:
         return ["  there are too few set-ups for one half of them to judge what the other chooses: judged by evidence alone"]
     before, after, floor = (plain(gap[k]) for k in ("before_um", "after_um", "floor_um"))
-    share = closed(gap)
-    part = "" if share is None else f" ({share:.0%} closed)"
-    out = [f"  on runs that did not choose it the gap shrinks from {before} to {after} µm rms where {floor} µm is noise{part}"]
-    alone = [_name(c["motion"], c["part"]) for c in told["changes"] if c["halves"] < 2]
+    if _shows(gap):
+        share = closed(gap)
+        part = "" if share is None else f" ({share:.0%} closed)"
+        out = [f"  on runs that did not choose it the gap shrinks from {before} to {after} µm rms where {floor} µm is noise{part}"]
+    else:
+        out = [f"  set-ups take up nearly all of it: the gap is {before} µm rms without and {after} with it where {floor} µm is noise"]
+    if judged < NEAR:
+        out.append("  runs that did not choose it are not more likely with it")
+    alone = [_name(c["motion"], c["part"]) for c in told["changes"] if c["halves"] < HALVES]
     if alone:
         out.append(f"  not chosen by each half of the runs alone: {', '.join(alone)}")
-    if gap["after_um"] > VISIBLE * gap["floor_um"]:
+    if gap["after_um"] > LEFT * gap["floor_um"]:
         out.append("  what is left is more than noise: what the solution did not know, or a change that has no name here")
     return out
 
 
-def _hidden(told: Doc) -> str:
-    seen = ", ".join(f"{NAMES[name]} {plain(value, 2)} {'µm/m' if name[0] == 'E' else 'µrad'}" for name, value in told["seen_um_m"].items())
-    return f"  what may be there all the same (U, k = 2): {seen}"
+def _hidden(told: Doc) -> list[str]:
+    """What may have changed beside what was named, where nothing was: all of it."""
+    hidden: Doc = told["hidden_um_m"]
+    named = {c["motion"] for c in told["changes"] if c["part"] == "linear"}
+    each = [f"{NAMES[n]} {plain(v, 2)} {'µm/m' if n[0] == 'E' else 'µrad'}" for n, v in hidden.items()]
+    unseen = [words for n, words in NAMES.items() if n not in hidden and n not in named]
+    out = [f"  what may have changed all the same, at most (k = 2): {', '.join(each)}"] if each else []
+    return out + ([f"  not seen by these runs: {', '.join(unseen)}"] if unseen else [])
 
 
 def _size(change: Doc) -> str:

@@ -81,7 +81,6 @@ class Job:
         runs = sorted(whole_run_digest(r) for r in self.runs)
         files = {e.name: code_digest(e.signal) for e in self.effects}
         words = [self.source, head, runs, sorted(self.case.includes), files]
-        words += [] if self.since is None else [{"since": self.since.number}]
         return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
 
 
@@ -220,7 +219,7 @@ def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink)
     if finding is None:
         found = search(job.case, job.effects, progress)
         finding = finding_doc(found, job.case, (*job.effects, SLOW_DRIFT), job.known_mm, job.thinning)
-        finding |= {} if job.since is None else {"changed": job.since.compare()}
+        finding |= {} if job.since is None else {"changed": job.since.compare(job.campaign)}
     for seq, (state, doc) in enumerate(after_fit(finding), start=1):
         if seq < len(journal.states):
             continue

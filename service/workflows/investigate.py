@@ -146,7 +146,7 @@ def _search(bench: Bench, campaign: str) -> tuple[int | None, dict[str, Any]]:
     store = bench.store
     measured = from_store(store, campaign)
     then = table_then(store, measured)
-    job = prepare(measured, catalogue(), current(store, bench.site.name), table=then, since=since_of(store, measured, then))
+    job = prepare(measured, catalogue(), current(store, bench.site.name), table=then, since=since_of(store, measured))
     journal = journal_of(store, job)
     return journal.id, discover(job, journal, search, bench.progress)
 

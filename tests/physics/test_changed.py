@@ -51,6 +51,14 @@ def two(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
     return found
 
 
+def heat(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
+    """All axes grow alike by 5 to 30 µm/m: but for its calibration a laser's wavelength would explain that."""
+    size = float(rng.choice([-1, 1]) * 10.0 ** rng.uniform(-5.3, -4.5))
+    for name in LINEAR[:3]:
+        linear(truth, name, size)
+    return dict.fromkeys(LINEAR[:3], size)
+
+
 def pitch(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
     """The pitch of X grows along its stroke by 20 to 60 µrad; rms over it: 1 / sqrt(3) of that."""
     end = float(rng.uniform(20e-6, 60e-6))
@@ -74,25 +82,29 @@ def test_where_nothing_has_changed_nothing_is_named() -> None:
     for f in found:
         assert f.before_mm is not None
         assert f.before_mm == pytest.approx(f.floor_mm, rel=0.1)
-        assert f.seen.keys() == set(LINEAR)
-        assert all(0.1e-6 < u < 2e-6 for u in f.seen.values())
+        assert f.hidden.keys() == set(LINEAR)
+        assert all(0.1e-6 < u < 4e-6 for u in f.hidden.values())
 
 
-@pytest.mark.parametrize("hide", [one, two, pitch])
+@pytest.mark.parametrize("hide", [one, two, heat, pitch])
 def test_what_has_changed_is_named_with_a_size_that_its_uncertainty_holds(hide: Hide) -> None:
-    inside, names, gaps = [], [], []
+    inside, names, proved, gaps = [], [], [], []
     for seed in SEEDS:
         hidden, found = changed(seed, hide)
         told = {c.name: c for c in found.changes}
-        names.append(told.keys() == hidden.keys() and all(c.halves == 2 for c in told.values()))
+        names.append(told.keys() == hidden.keys() and all(c.halves == 2 and not c.rivals for c in told.values()))
+        proved.append((found.judged or 0.0) > 3.0)
         inside += [abs(told[n].value - size) <= 2.0 * told[n].u for n, size in hidden.items() if n in told]
         assert found.before_mm is not None
         assert found.after_mm is not None
         gaps.append((found.after_mm - found.floor_mm) / (found.before_mm - found.floor_mm))
-    print(f"{hide.__name__}: {sum(names)} of {len(names)} named, {sum(inside)} of {len(inside)} within U, gap left {np.median(gaps):.3f}")  # noqa: T201 - the figures of the test
+    counts = f"{sum(names)} of {len(names)} named, {sum(proved)} proved, {sum(inside)} of {len(inside)} within U"
+    print(f"{hide.__name__}: {counts}, gap left {np.median(gaps):.3f}")  # noqa: T201 - the figures of the test
     assert np.mean(names) >= 0.95
+    assert np.mean(proved) >= 0.95
     assert np.mean(inside) >= 0.9
-    assert np.median(gaps) < 0.05, "of the gap, on runs that did not choose"
+    if hide is not heat:  # a wavelength, refitted, takes most of that
+        assert np.median(gaps) < 0.05, "of the gap, on runs that did not choose"
 
 
 def test_a_motion_that_another_explains_as_well_is_told_as_its_rival() -> None:

@@ -59,10 +59,18 @@ class DiscoveryState(Answer):
     why: str
 
 
+class ChangeRival(Answer):
+    """Another change that explains nearly as much: natural logarithm of how much less likely it is."""
+
+    name: str
+    less_evidence: float
+
+
 class MotionChange(Answer):
     """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
 
-    ``u``: standard uncertainty; ``halves``: by how many of two halves of the runs it was chosen without the other.
+    ``u``: standard uncertainty; ``rivals``: what these runs cannot tell it from; ``halves``: by how many of two halves of the runs it was
+    chosen without the other.
     """
 
     motion: str
@@ -71,6 +79,7 @@ class MotionChange(Answer):
     u: float
     unit: Literal["um/m", "urad", "um"]
     evidence: float
+    rivals: list[ChangeRival]
     halves: int
 
 
@@ -83,13 +92,19 @@ class ChangeGap(Answer):
 
 
 class ChangedSince(Answer):
-    """What has changed since an earlier solution. ``gap``: None: too few set-ups judge; ``seen_um_m``: U (k = 2) of each linear one."""
+    """What has changed since an earlier solution.
+
+    ``gap``, ``judged``: None where too few set-ups judge; ``judged``: log of how much more likely runs are with what they did not choose;
+    ``hidden_um_m``: how much each scale and squareness may have changed all the same; ``trouble``: why nothing could be told.
+    """
 
     since: int
     changes: list[MotionChange]
     gap: ChangeGap | None
-    seen_um_m: dict[str, float]
+    judged: float | None
+    hidden_um_m: dict[str, float]
     proved: bool
+    trouble: str = ""
 
 
 class DiscoveryDetail(Discovery):

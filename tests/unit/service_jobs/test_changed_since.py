@@ -22,7 +22,6 @@ from service.workflows.discover import Journal, discover, prepare
 from service.workflows.discovery_engine import catalogue
 from service.workflows.solve import solve_runs
 from service.workflows.solve_report import solution_doc
-from service.workflows.table_out import table_then
 from service.workflows.tables import table_image
 from tests.scenarios.campaign_files import measured, write_folder
 from tests.unit.service.discovery_bench import Search
@@ -82,8 +81,8 @@ def put(store: Store, place: Path, name: str, runs: list[Doc]) -> None:
 
 def compared(store: Store, name: str) -> Doc | None:
     campaign = from_store(store, name)
-    since = since_of(store, campaign, table_then(store, campaign))
-    return None if since is None else {"changed": since.compare()}
+    since = since_of(store, campaign)
+    return None if since is None else {"changed": since.compare(campaign)}
 
 
 def test_an_axis_that_grows_is_named_and_proved_by_runs_that_did_not_choose_it(store: Store, tmp_path: Path) -> None:
@@ -122,6 +121,37 @@ def test_a_table_that_was_put_in_force_is_no_change_of_the_machine(store: Store,
     assert abs(found["changed"]["changes"][0]["value"] - GROWN * 1e6) <= 2.0 * found["changed"]["changes"][0]["u"]
 
 
+@pytest.mark.parametrize("acting", [None, False])
+def test_a_table_that_nobody_knows_is_compared_only_where_it_did_nothing(store: Store, tmp_path: Path, acting: bool | None) -> None:
+    told = {"crc": 12345} | ({} if acting is None else {"acting": acting})
+    put(store, tmp_path, "july", [run | {"table": told} for run in moved(json.loads(june()[1]), np.zeros(3), 4)])
+    found = compared(store, "july")
+    assert (found is None) is (acting is None)
+    assert found is None or found["changed"]["changes"] == []
+
+
+def test_with_the_same_table_both_times_it_need_not_be_known(tmp_path: Path) -> None:
+    _, text, doc = june()
+    told = {"crc": 12345, "acting": True}
+    with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as store:
+        put(store, tmp_path, "june", [run | {"table": told} for run in json.loads(text)])
+        keep(store, from_store(store, "june"), doc | {"inputs": doc["inputs"] | {"tables": [told]}})
+        put(store, tmp_path, "july", [run | {"table": told} for run in moved(json.loads(text), np.array([0.0, GROWN, 0.0]), 5)])
+        found = compared(store, "july")
+    assert found is not None
+    assert [c["motion"] for c in found["changed"]["changes"]] == ["EYY"]
+
+
+def test_a_solution_of_another_model_book_is_not_compared_and_says_so(store: Store, tmp_path: Path) -> None:
+    doc = june()[2] | {"machine_model": {"version": 1, "taken_out": ["backlash:X"], "not_for_tables": []}}
+    keep(store, from_store(store, "june"), doc)
+    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
+    found = compared(store, "july")
+    assert found is not None
+    assert found["changed"]["since"] == 2
+    assert "other effects then than now (backlash:X)" in changed_words(found)
+
+
 def test_the_first_campaign_is_compared_with_nothing_and_none_with_a_later_one(store: Store, tmp_path: Path) -> None:
     assert compared(store, "june") is None
     assert changed_lines({}) == []
@@ -131,9 +161,8 @@ def test_the_first_campaign_is_compared_with_nothing_and_none_with_a_later_one(s
 def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path: Path) -> None:
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
     campaign = from_store(store, "july")
-    then = table_then(store, campaign)
-    job = prepare(campaign, catalogue(), None, table=then, since=since_of(store, campaign, then))
-    assert job.digest != prepare(campaign, catalogue(), None, table=then).digest
+    job = prepare(campaign, catalogue(), None, since=since_of(store, campaign))
+    assert job.digest == prepare(campaign, catalogue(), None).digest, "a solution that comes later makes no other search of it"
     journal = Journal()
     search = Search("none")
     finding = discover(job, journal, search, lambda _: None)
@@ -142,19 +171,35 @@ def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path
     assert discover(job, journal, search, lambda _: None) is finding
 
 
+def test_what_cannot_be_compared_is_a_line_and_costs_no_finding(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
+    monkeypatch.setattr("service.workflows.changed_since.changed_since", lambda *_: np.linalg.cholesky(-np.eye(2)))
+    found = compared(store, "july")
+    assert found is not None
+    assert changed_lines(found) == [changed_words(found)]
+    assert changed_words(found).startswith("what has changed since solution 1 could not be told: ")
+
+
+GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
+
+
 @pytest.mark.parametrize(
-    ("gap", "halves", "proof", "says"),
+    ("told", "change", "proof", "says"),
     [
-        ({"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}, 2, True, "100% closed"),
-        ({"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}, 1, False, "not chosen by each half of the runs alone: scale of X"),
-        ({"before_um": 10.0, "after_um": 8.0, "floor_um": 1.0}, 2, False, "what is left is more than noise"),
-        (None, 0, False, "too few set-ups"),
+        ({}, {}, True, "100% closed"),
+        ({}, {"halves": 1}, False, "not chosen by each half of the runs alone: scale of X"),
+        ({"gap": GAP | {"after_um": 8.0}}, {}, False, "what is left is more than noise"),
+        ({"gap": GAP | {"before_um": 1.02}}, {}, True, "set-ups take up nearly all of it"),
+        ({"gap": GAP | {"before_um": 1.02}, "judged": -1.0}, {}, False, "runs that did not choose it are not more likely with it"),
+        ({"gap": None, "judged": None}, {"halves": 0}, False, "too few set-ups"),
+        ({}, {"rivals": [{"name": "C0Y", "less_evidence": 1.0}]}, False, "cannot tell it from squareness of X and Y"),
+        ({}, {"u": 7.0}, False, "zero is within its uncertainty"),
+        ({"hidden_um_m": {"EYY": 3.2}}, {}, True, "at most (k = 2): scale of Y 3.2 µm/m"),
+        ({}, {}, True, "not seen by these runs: scale of Y, scale of Z"),
     ],
 )
-def test_a_change_that_is_not_proved_says_so(gap: Doc | None, halves: int, proof: bool, says: str) -> None:
-    change = {"motion": "EXX", "part": "linear", "value": 12.0, "u": 1.0, "unit": "um/m", "rivals": [], "halves": halves}
-    finding = {"changed": {"since": 4, "changes": [change], "gap": gap, "seen_um_m": {}}}
+def test_a_change_that_is_not_proved_says_so(told: Doc, change: Doc, proof: bool, says: str) -> None:
+    one = {"motion": "EXX", "part": "linear", "value": 12.0, "u": 1.0, "unit": "um/m", "rivals": [], "halves": 2} | change
+    finding = {"changed": {"since": 4, "changes": [one], "gap": GAP, "judged": 50.0, "hidden_um_m": {}} | told}
     assert changed_words(finding).endswith("(not proved)") is not proof
-    assert any(says in line for line in changed_lines(finding))
-    rival = {"changed": finding["changed"] | {"changes": [change | {"rivals": [{"name": "C0Y", "less_evidence": 1.0}]}]}}
-    assert "these runs cannot tell it from squareness of X and Y" in changed_lines(rival)[1]
+    assert any(says in line for line in changed_lines(finding)), changed_lines(finding)
