@@ -6,15 +6,12 @@ table did is put in its place, so that both are of the same machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from models.compensation.smooth import smooth_of
-from models.compensation.tables import NineTables
 from models.discovery.changed import Change, Changed, changed_since
 from models.solvers.in_force import InForce
 from models.uncertainty.known_field import KnownField
@@ -23,43 +20,50 @@ from service.runs.observations import run_data
 from service.storage.records import SolutionRecord
 from service.storage.store import Store
 from service.workflows.campaign_folder import Campaign
-from service.workflows.measured_with import KIND_AT, NO_CORRECTION, distinct, images_of, stored_tables
+from service.workflows.known_effects import LASTING, applies
+from service.workflows.measured_with import KIND_AT, NO_CORRECTION, images_of, tables_of
+from service.workflows.model_book import name_of, version
 from service.workflows.provenance import machine_digest
 from service.workflows.solution_field import stored_field
-from service.workflows.table_out import NOTHING, Taken, less, table_then
+from service.workflows.table_out import NOTHING, Taken, as_left, less, table_then
 from service.workflows.tables import tables_from_image
-from service.workflows.taken_out import taken_out
+from service.workflows.taken_out import less_effects
 
 Doc = dict[str, Any]
+LOST_MOTION = "backlash"
 
 
 @dataclass(frozen=True)
 class Since:
     """The solution that a campaign is compared with, and how; comparing takes a second or two.
 
-    ``compare``: of the campaign, or of one that it was joined with; what cannot be told is its ``trouble``.
+    ``compare``: of the campaign, or of one that it was joined with, and what a search has just found in it (entries of a finding); what
+    cannot be told is its ``trouble``.
     """
 
     number: int
-    compare: Callable[[Campaign], Doc]
+    compare: Callable[[Campaign, Sequence[Doc]], Doc]
 
 
 @dataclass(frozen=True)
 class _Before:
-    """A solution, what it knows, and which of the model book's effects had been taken out of its readings."""
+    """A solution and what it knows; the table that acted when it was measured, by its CRC; what had been taken out of its readings.
+
+    ``taken``: labels of the model book's ``version``, None: nothing of a book.
+    """
 
     number: int
     known: KnownField
-    crcs: frozenset[int]
-    table: NineTables | None
+    crc: int | None
+    version: int | None
     taken: frozenset[str]
 
 
 def since_of(store: Store, campaign: Campaign) -> Since | None:
-    """The last solution of the same machine from before a campaign, if there is one that can be compared.
+    """The last solution of the same machine from a campaign stored before, if there is one that can be compared.
 
-    It has to be of the same geometry and to hold its covariance. Both tables, that which was in force when it was measured and the present
-    one, have to be known, or to be the same.
+    It has to be of the same geometry and to hold its covariance. The tables that acted when both were measured have to be known, or to be
+    the same.
     """
     for record in _earlier(store, campaign):
         try:
@@ -75,9 +79,9 @@ def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
     """Solutions of all 21 motions of this machine's earlier campaigns, the newest first."""
     numbers = {m.id for m in store.machines() if m.name == campaign.site.name}
     mine = [c for c in store.campaigns() if c.machine_id in numbers]
-    at = next((c.id for c in mine if c.name == campaign.name), None)
+    at = next((c.id for c in mine if c.name == campaign.name), 0)
     digest = machine_digest(campaign.site.machine)
-    for one in reversed([c for c in mine if at is None or c.id < at]):
+    for one in reversed([c for c in mine if c.id < at]):
         for record in reversed(store.solutions(one.id)):
             doc = record.doc
             if str(doc.get("model", "")).startswith("rigid21") and (doc.get("inputs") or {}).get("machine") == digest:
@@ -85,25 +89,32 @@ def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
 
 
 def _before_of(store: Store, record: SolutionRecord) -> _Before:
-    tables = stored_tables(store, record.id)
-    taken = frozenset((record.doc.get("machine_model") or {}).get("taken_out", []))
-    crcs = frozenset(one["crc"] for one in tables)
-    return _Before(record.id, stored_field(store, record).known, crcs, _acting(store, tables), taken)
+    book = record.doc.get("machine_model") or {}
+    taken = frozenset(book.get("taken_out", []))
+    version_ = int(book["version"]) if taken else None
+    return _Before(record.id, stored_field(store, record).known, _acting(_tables_of(store, record)), version_, taken)
 
 
-def _acting(store: Store, tables: list[Doc]) -> NineTables | None:
-    """The table that did something to runs; None: none did, or nobody knows which.
+def _tables_of(store: Store, record: SolutionRecord) -> list[Doc]:
+    """What each run of a solution says of its table; what the solution says, where its runs say nothing."""
+    used = set(record.run_ids)
+    starts = [r.start_doc for r in store.runs(record.campaign_id) if r.id in used]
+    told = [start.get("imported", start).get("table") or {} for start in starts]
+    return told if any(told) else tables_of(record.doc)
+
+
+def _acting(told: Sequence[Doc]) -> int | None:
+    """CRC of the table that may have acted in all of some runs; None: in none of them.
 
     Raises
     ------
     TableMismatch
-        It is of a kind that cannot be read.
+        Not in all of them, or another one.
     """
-    told = [one for one in tables if one.get("acting") is not False]
-    image = images_of(store)(told[0]["crc"]) if len(told) == 1 else None
-    if image is None or int.from_bytes(image[KIND_AT], "big") == NO_CORRECTION:
-        return None
-    return tables_from_image(image)
+    found = {None if one.get("crc") is None or one.get("acting") is False else int(one["crc"]) for one in told}
+    if len(found) > 1:
+        raise TableMismatch("these runs were not all measured with one table")
+    return next(iter(found), None)
 
 
 def _tables_between(store: Store, campaign: Campaign, before: _Before) -> Taken | None:
@@ -114,49 +125,45 @@ def _tables_between(store: Store, campaign: Campaign, before: _Before) -> Taken 
     TableMismatch
         One of two different tables is not known, or there was more than one at a time.
     """
-    used = [r.get("table") or {} for r in campaign.runs if r["role"] == "identify"]
-    tables = distinct([one for one in used if "crc" in one])
-    now = frozenset(one["crc"] for one in tables)
-    if now == before.crcs and len(now) <= 1:
-        return None
-    images = images_of(store)
-    acting = [one["crc"] for one in tables if one.get("acting") is not False]
-    if len(acting) > 1 or any(images(crc) is None for crc in (*acting, *before.crcs)) or len(before.crcs) > 1:
-        raise TableMismatch("the tables of both campaigns have to be known")
-    new = _acting(store, tables)
-    return None if _same(new, before.table) else Taken(_force(new), _force(before.table))
+    now = _acting([r.get("table") or {} for r in campaign.runs if r["role"] == "identify"])
+    return None if now == before.crc else Taken(_force(store, now), _force(store, before.crc))
 
 
-def _compare(store: Store, before: _Before, campaign: Campaign) -> Doc:
+def _force(store: Store, crc: int | None) -> InForce:
+    """What axes that follow do by a table."""
+    if crc is None:
+        return NOTHING
+    image = images_of(store)(crc)
+    if image is None:
+        raise TableMismatch(f"table {crc:08X} is not known")
+    if int.from_bytes(image[KIND_AT], "big") == NO_CORRECTION:
+        return NOTHING
+    table = tables_from_image(image)
+    return NOTHING if table is None else InForce(smooth_of(table) or table.correction_at)
+
+
+def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[Doc]) -> Doc:
     try:
-        return {"since": before.number} | _compared(store, campaign, before)
+        return {"since": before.number} | _compared(store, before, campaign, found)
     except StoreError:
         raise
     except (AbbeError, ValueError, ArithmeticError, LookupError) as trouble:  # what is missing is worth telling all the same
         return {"since": before.number, "changes": [], "gap": None, "judged": None, "hidden_um_m": {}, "trouble": str(trouble)}
 
 
-def _compared(store: Store, campaign: Campaign, before: _Before) -> Doc:
-    left = taken_out(store, campaign, table_then(store, campaign))
-    if frozenset(left.labels) != before.taken:
-        other = ", ".join(sorted(before.taken.symmetric_difference(left.labels)))
-        raise Unusable(f"the model book knew other effects then than now ({other})", "solve the earlier campaign again")
-    used = [r for r in left.campaign.runs if r["role"] == "identify"]
-    out = _tables_between(store, campaign, before)
-    found = changed_since(before.known, tuple(run_data(r) for r in (used if out is None else less(used, out))))
-    return changed_doc(found)
-
-
-def _same(a: NineTables | None, b: NineTables | None) -> bool:
-    if a is None or b is None:
-        return a is b
-    pairs = [*zip(a.position_mm, b.position_mm, strict=True), *zip(a.correction_mm, b.correction_mm, strict=True)]
-    return all(np.array_equal(x, y, equal_nan=True) for x, y in pairs)
-
-
-def _force(table: NineTables | None) -> InForce:
-    """What an axis that follows does by a table."""
-    return NOTHING if table is None else InForce(smooth_of(table) or table.correction_at)
+def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence[Doc]) -> Doc:
+    """The campaign less what the solution's readings were without, too, and less what heat and instruments did in it alone."""
+    left = as_left(campaign, table_then(store, campaign).table)
+    if before.version is not None:
+        book = version(store, campaign.site.name, before.version).doc["effects"]
+        same = [e for e in book if e["label"] in before.taken and applies(e, campaign.name)]
+        left = less_effects(left, same, f"model version {before.version}")
+    left = less_effects(left, [e for e in found if e["family"] not in LASTING], "found in these runs")
+    used, out = [r for r in left.runs if r["role"] == "identify"], _tables_between(store, campaign, before)
+    doc = changed_doc(changed_since(before.known, tuple(run_data(r) for r in (used if out is None else less(used, out)))))
+    # A drive's lost motion is free in the comparison; what else lasts may have been there before, swallowed by the motions.
+    beside = [name_of(e) for e in found if e["family"] in LASTING and e["name"] != LOST_MOTION]
+    return doc | {"beside": beside}
 
 
 def changed_doc(found: Changed) -> Doc:

@@ -43,6 +43,8 @@ def changed_lines(finding: Doc) -> list[str]:
             out.append(f"  {name}: these runs cannot tell it from {', '.join(_rival(r['name']) for r in c['rivals'])}")
         if not _sure(c):
             out.append(f"  {name}: zero is within its uncertainty, so it may be another scale or squareness that has changed")
+    if told["changes"] and told.get("beside"):
+        out.append(f"  {', '.join(told['beside'])} was found in the same runs: a change may be the same thing, seen by other motions")
     return out + (_proof(told) if told["changes"] else []) + _hidden(told)
 
 
@@ -50,10 +52,10 @@ def proved(told: Doc) -> bool:
     """Whether runs that did not choose the changes bear them out.
 
     Each half of the set-ups is more likely with what the other has chosen; the gap, where it shows, closes; every change was chosen by both
-    halves, has no near rival, and is larger than its own U.
+    halves, has no near rival, and is larger than its own U; and nothing was found in the same runs that could be the same thing.
     """
     sure = all(c["halves"] == HALVES and not c["rivals"] and _sure(c) for c in told["changes"])
-    if told["judged"] is None or told["judged"] < NEAR or not sure:
+    if not told["changes"] or not sure or told.get("beside") or told["judged"] is None or told["judged"] < NEAR:
         return False
     return not _shows(told["gap"]) or (closed(told["gap"]) or 0.0) >= CLOSED
 
@@ -72,9 +74,9 @@ def _proof(told: Doc) -> list[str]:
         return ["  there are too few set-ups for one half of them to judge what the other chooses: judged by evidence alone"]
     before, after, floor = (plain(gap[k]) for k in ("before_um", "after_um", "floor_um"))
     if _shows(gap):
-        share = closed(gap)
-        part = "" if share is None else f" ({share:.0%} closed)"
-        out = [f"  on runs that did not choose it the gap shrinks from {before} to {after} µm rms where {floor} µm is noise{part}"]
+        share = closed(gap) or 0.0
+        goes, part = ("shrinks", f" ({share:.0%} closed)") if share > 0.0 else ("goes", "")
+        out = [f"  on runs that did not choose it the gap {goes} from {before} to {after} µm rms where {floor} µm is noise{part}"]
     else:
         out = [f"  set-ups take up nearly all of it: the gap is {before} µm rms without and {after} with it where {floor} µm is noise"]
     if judged < NEAR:

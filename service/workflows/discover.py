@@ -219,7 +219,7 @@ def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink)
     if finding is None:
         found = search(job.case, job.effects, progress)
         finding = finding_doc(found, job.case, (*job.effects, SLOW_DRIFT), job.known_mm, job.thinning)
-        finding |= {} if job.since is None else {"changed": job.since.compare(job.campaign)}
+        finding |= {} if job.since is None else {"changed": job.since.compare(job.campaign, entering(finding))}
     for seq, (state, doc) in enumerate(after_fit(finding), start=1):
         if seq < len(journal.states):
             continue

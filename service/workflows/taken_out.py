@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -73,11 +74,24 @@ def _less_known(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | 
     lines = tuple(no_table_lines(record))
     if not chosen:
         return TakenOut(campaign, (), lines, record.version)
+    left = less_effects(campaign, chosen, f"model version {record.version}", effects)
+    return TakenOut(left, tuple(e["label"] for e in chosen), lines, record.version)
+
+
+def less_effects(campaign: Campaign, entries: Sequence[dict[str, Any]], whose: str, effects: tuple[Effect, ...] | None = None) -> Campaign:
+    """A campaign without what named effects do to its readings; ``whose``: in words, where they are from.
+
+    Raises
+    ------
+    ModelUnknown
+        The catalogue does not know one of them.
+    """
+    if not entries:
+        return campaign
     case = case_of(campaign.doc, campaign.site.machine, campaign.runs)
-    known_mm = readings_of(chosen, effects or catalogue(), case)
-    words = f"model version {record.version}: {', '.join(e['label'] for e in chosen)}"
-    runs = [_less(run, known_mm[run["run_id"]], words) for run in campaign.runs]
-    return TakenOut(replace(campaign, runs=runs), tuple(e["label"] for e in chosen), lines, record.version)
+    known_mm = readings_of(entries, effects or catalogue(), case)
+    words = f"{whose}: {', '.join(e['label'] for e in entries)}"
+    return replace(campaign, runs=[_less(run, known_mm[run["run_id"]], words) for run in campaign.runs])
 
 
 def _less(run: dict[str, Any], known_mm: np.ndarray[Any, np.dtype[np.float64]], words: str) -> dict[str, Any]:

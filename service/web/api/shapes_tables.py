@@ -95,7 +95,8 @@ class ChangedSince(Answer):
     """What has changed since an earlier solution.
 
     ``gap``, ``judged``: None where too few set-ups judge; ``judged``: log of how much more likely runs are with what they did not choose;
-    ``hidden_um_m``: how much each scale and squareness may have changed all the same; ``trouble``: why nothing could be told.
+    ``hidden_um_m``: how much each scale and squareness may have changed all the same; ``beside``: effects that were found in the same runs
+    and may be the same thing; ``trouble``: why nothing could be told.
     """
 
     since: int
@@ -104,6 +105,7 @@ class ChangedSince(Answer):
     judged: float | None
     hidden_um_m: dict[str, float]
     proved: bool
+    beside: tuple[str, ...] = ()
     trouble: str = ""
 
 

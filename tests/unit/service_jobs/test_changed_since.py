@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import pytest
 from drivers.cnc.tables import crc32, encode
 from models.compensation.tables import NineTables
 from service.runs.exchange import import_folder
+from service.storage.records import NewVersion
 from service.storage.store import Store
 from service.workflows.campaign_folder import from_store, keep
 from service.workflows.changed_since import since_of
@@ -79,10 +80,10 @@ def put(store: Store, place: Path, name: str, runs: list[Doc]) -> None:
     import_folder(store, folder)
 
 
-def compared(store: Store, name: str) -> Doc | None:
+def compared(store: Store, name: str, found: Sequence[Doc] = ()) -> Doc | None:
     campaign = from_store(store, name)
     since = since_of(store, campaign)
-    return None if since is None else {"changed": since.compare(campaign)}
+    return None if since is None else {"changed": since.compare(campaign, found)}
 
 
 def test_an_axis_that_grows_is_named_and_proved_by_runs_that_did_not_choose_it(store: Store, tmp_path: Path) -> None:
@@ -121,13 +122,38 @@ def test_a_table_that_was_put_in_force_is_no_change_of_the_machine(store: Store,
     assert abs(found["changed"]["changes"][0]["value"] - GROWN * 1e6) <= 2.0 * found["changed"]["changes"][0]["u"]
 
 
-@pytest.mark.parametrize("acting", [None, False])
-def test_a_table_that_nobody_knows_is_compared_only_where_it_did_nothing(store: Store, tmp_path: Path, acting: bool | None) -> None:
-    told = {"crc": 12345} | ({} if acting is None else {"acting": acting})
-    put(store, tmp_path, "july", [run | {"table": told} for run in moved(json.loads(june()[1]), np.zeros(3), 4)])
-    found = compared(store, "july")
-    assert (found is None) is (acting is None)
-    assert found is None or found["changed"]["changes"] == []
+@pytest.mark.parametrize(
+    ("tables", "is_compared"),
+    [
+        ([{"crc": 12345}], False),  # of an older version, which did not say whether it acts
+        ([{"crc": 12345, "acting": True}], False),
+        ([{"crc": 12345, "acting": False}], True),
+        ([{"crc": 12345, "acting": False}, {}], True),
+        ([{"crc": 12345, "acting": True}, {"crc": 12345, "acting": False}], False),
+        ([{"crc": 12345, "acting": True}, {}], False),
+    ],
+)
+def test_a_table_that_nobody_knows_is_compared_only_where_it_did_nothing(
+    store: Store, tmp_path: Path, tables: list[Doc], is_compared: bool
+) -> None:
+    runs = moved(json.loads(june()[1]), np.zeros(3), 4)
+    put(store, tmp_path, "july", [run | {"table": tables[k % len(tables)]} for k, run in enumerate(runs)])
+    assert (since_of(store, from_store(store, "july")) is not None) is is_compared
+
+
+def test_a_table_that_was_switched_on_in_between_is_another_table(tmp_path: Path) -> None:
+    _, text, doc = june()
+    image = encode(table_image(growing(june()[0], np.array([GROWN, 0.0, 0.0])), 100, 7))
+    crc = crc32(image)
+    with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as store:
+        put(store, tmp_path, "june", [run | {"table": {"crc": crc, "acting": False}} for run in json.loads(text)])
+        keep(store, from_store(store, "june"), doc)
+        store.add_table(store.campaign("june").machine_id, None, image, crc, {})
+        runs = moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 6)
+        put(store, tmp_path, "july", [run | {"table": {"crc": crc, "acting": True}} for run in runs])
+        found = compared(store, "july")
+    assert found is not None
+    assert found["changed"]["changes"] == []
 
 
 def test_with_the_same_table_both_times_it_need_not_be_known(tmp_path: Path) -> None:
@@ -142,14 +168,48 @@ def test_with_the_same_table_both_times_it_need_not_be_known(tmp_path: Path) -> 
     assert [c["motion"] for c in found["changed"]["changes"]] == ["EYY"]
 
 
-def test_a_solution_of_another_model_book_is_not_compared_and_says_so(store: Store, tmp_path: Path) -> None:
-    doc = june()[2] | {"machine_model": {"version": 1, "taken_out": ["backlash:X"], "not_for_tables": []}}
-    keep(store, from_store(store, "june"), doc)
-    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
+def entry(name: str, key: str, family: str, coefficient: float) -> Doc:
+    """An effect as a finding and a model book have it."""
+    told = {"label": f"{name}:{key}", "name": name, "key": key, "title": name, "family": family, "kind": "mean", "remedy": "parameter"}
+    return told | {"parameters": {}, "forms": [], "coefficients": [coefficient], "from": {"campaign": "june", "discovery": 1}}
+
+
+def test_what_was_taken_out_of_the_readings_then_is_taken_out_now(store: Store, tmp_path: Path) -> None:
+    """Lost motion of X by the model book of June: in July it is taken out by that same version, whatever the book says today."""
+    machine, text, doc = june()
+    book = {"machine_digest": doc["inputs"]["machine"], "effects": [entry("backlash", "X", "drive", 4.0)]}
+    store.add_model(NewVersion(machine["name"], None, book))
+    keep(store, from_store(store, "june"), doc | {"machine_model": {"version": 1, "taken_out": ["backlash:X"], "not_for_tables": []}})
+    put(store, tmp_path, "july", moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 1))
     found = compared(store, "july")
     assert found is not None
     assert found["changed"]["since"] == 2
-    assert "other effects then than now (backlash:X)" in changed_words(found)
+    assert [c["motion"] for c in found["changed"]["changes"]] == ["EXX"]
+    store.add_model(NewVersion(machine["name"], 1, book | {"effects": []}))
+    again = compared(store, "july")
+    assert again is not None
+    assert again["changed"] == found["changed"]
+
+
+def test_a_lasting_effect_that_was_found_beside_leaves_a_change_unproved(store: Store, tmp_path: Path) -> None:
+    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
+    own = compared(store, "july", [entry("backlash", "X", "drive", 0.0)])
+    assert own is not None
+    assert (own["changed"]["beside"], "not proved" in changed_words(own)) == ([], False)
+    other = compared(store, "july", [entry("lateral_play", "EYX", "structure", 0.0)])
+    assert other is not None
+    assert changed_words(other).endswith("(not proved)")
+    assert "lateral_play EYX was found in the same runs" in changed_lines(other)[1]
+
+
+def test_what_heat_did_in_these_runs_is_taken_out_first(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
+    taken: list[str] = []
+    monkeypatch.setattr(
+        "service.workflows.changed_since.less_effects", lambda c, entries, whose: taken.extend(e["label"] for e in entries) or c
+    )
+    compared(store, "july", [entry("spindle_growth", "Z", "thermal", 1.0), entry("backlash", "X", "drive", 1.0)])
+    assert taken == ["spindle_growth:Z"]
 
 
 def test_the_first_campaign_is_compared_with_nothing_and_none_with_a_later_one(store: Store, tmp_path: Path) -> None:
@@ -196,6 +256,7 @@ GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
         ({}, {"u": 7.0}, False, "zero is within its uncertainty"),
         ({"hidden_um_m": {"EYY": 3.2}}, {}, True, "at most (k = 2): scale of Y 3.2 µm/m"),
         ({}, {}, True, "not seen by these runs: scale of Y, scale of Z"),
+        ({"gap": GAP | {"after_um": 12.0}}, {}, False, "the gap goes from 10.0 to 12.0 µm rms where 1.00 µm is noise"),
     ],
 )
 def test_a_change_that_is_not_proved_says_so(told: Doc, change: Doc, proof: bool, says: str) -> None:
