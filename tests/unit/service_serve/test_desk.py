@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -264,14 +264,16 @@ with alone(sys.argv[1]):
 
 
 @pytest.fixture
-def other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> subprocess.Popen[str]:
+def other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subprocess.Popen[str]]:
     """A real process that has the machine, until it is given a line."""
     (tmp_path / "locks").mkdir()
     monkeypatch.setenv(ENVIRONMENT, str(tmp_path / "locks"))
     process = subprocess.Popen([sys.executable, "-c", HOLDER, URL], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    assert process.stdout.readline() == "has it\n"
-    return process
+    with process:
+        assert process.stdout.readline() == "has it\n"
+        yield process
+        process.kill()
 
 
 async def test_a_machine_in_use_is_waited_for_and_no_try_is_counted(running: Bench, other: subprocess.Popen[str]) -> None:
@@ -283,7 +285,7 @@ async def test_a_machine_in_use_is_waited_for_and_no_try_is_counted(running: Ben
 
     running.investigate = real
     await running.until(lambda: len(running.jobs("waits")) >= 3)
-    assert f"in use by process {other.pid}" in running.jobs()[0].text
+    assert f"in use by process {other.pid}" in running.jobs("waits")[0].text
     assert running.alarm().work == ()
 
     running.investigate = free
