@@ -43,7 +43,7 @@ def main() -> None:
     logs, codes = Path(sys.argv[1]), [int(word) for word in sys.argv[2:]]
     if why := refusal(logs, codes):
         sys.exit(f"not asked once more: {why}")
-    sys.stdout.write("\n".join(test for names in failed(logs).values() for test in names))
+    sys.stdout.writelines(f"{test}\n" for names in failed(logs).values() for test in names)
 
 
 if __name__ == "__main__":

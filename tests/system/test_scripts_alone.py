@@ -54,7 +54,7 @@ def test_a_silent_screen_comes_back_as_itself_and_ages_stand_still() -> None:
         assert page.inner_text("h1") == "Silent"
         page.wait_for_selector("html[data-ready=yes]")
         page.clock.run_for(2000)
-        page.wait_for_function("document.querySelector('h1').textContent === 'Schedule'")
+        page.wait_for_function("() => document.querySelector('h1').textContent === 'Schedule'")
         page.wait_for_selector("html[data-ready=yes]")
         for _ in range(2):  # when it asks once more, it has done with the answer before
             with page.expect_response("**/api/v1/status"):

@@ -258,7 +258,9 @@ def test_keyboard_language_and_first_paint(chromium, running) -> None:
         assert page.evaluate("document.activeElement.className") == "skip"
         page.keyboard.press("Enter")
         assert page.evaluate("document.activeElement.id") == "content"
-        page.wait_for_function("performance.getEntriesByName('first-contentful-paint').length")  # a busy machine paints later than it loads
+        page.wait_for_function(
+            "() => performance.getEntriesByName('first-contentful-paint').length"
+        )  # a busy machine paints later than it loads
         assert page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime") < 5000.0
         page.click(".languages a[hreflang=ko]")
         page.wait_for_selector("html[lang=ko][data-ready=yes]")
@@ -279,6 +281,7 @@ def test_a_screen_says_when_the_service_is_gone(chromium, filled) -> None:
         assert page.evaluate("document.body.classList.contains('stale')")
 
 
+# Always a function: a bare expression is evaluated anew at each look, and the page's policy forbids that from the second one on.
 MAP_READY = "() => document.documentElement.dataset.plotted"
 
 
@@ -320,7 +323,7 @@ def test_the_map_of_the_volume_is_turned_zoomed_and_asked(chromium, running, axe
         assert views[-1] == views[0]
         ask_nodes(page)
         page.select_option("[name=cut]", "XZ")
-        page.wait_for_function("document.querySelector('[name=level-text]').textContent.startsWith('Y ')")
+        page.wait_for_function("() => document.querySelector('[name=level-text]').textContent.startsWith('Y ')")
         assert watch.errors == []
         assert watch.foreign == []
 

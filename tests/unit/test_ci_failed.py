@@ -31,7 +31,7 @@ def test_nothing_failed_and_nothing_is_asked(tmp_path: Path) -> None:
 
 def test_up_to_three_failed_tests_are_named_one_a_line(tmp_path: Path) -> None:
     streams = {"wires": ["tests/a.py::test_a[x y]"], "parts": ["tests/b.py::test_b", "tests/b.py::test_c"], "faults": []}
-    assert asked(tmp_path, streams, [2, 2, 0]) == (0, "tests/b.py::test_b\ntests/b.py::test_c\ntests/a.py::test_a[x y]")
+    assert asked(tmp_path, streams, [2, 2, 0]) == (0, "tests/b.py::test_b\ntests/b.py::test_c\ntests/a.py::test_a[x y]\n")
 
 
 @pytest.mark.parametrize(
