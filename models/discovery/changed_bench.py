@@ -169,11 +169,11 @@ class Bench:
     def size(self, chosen: Chosen, asked: Asked) -> tuple[float, float]:
         """Value of a change and its standard uncertainty (`models.discovery.changed.Change`), all that is linear free beside it."""
         coefficients, covariance = self._coefficients(chosen, asked)
-        rows = self._values(asked.name.split()[0])
         if not asked.several:
             direction = self.known.linear({asked.name: 1.0})
             k = int(np.argmax(np.abs(direction)))
             return float(coefficients[k] / direction[k]), float(np.sqrt(covariance[k, k]) / abs(direction[k]))
+        rows = self._values(asked.name.split()[0])
         value = float(np.sqrt(np.mean((rows @ coefficients) ** 2)))
         slope = rows.T @ (rows @ coefficients) / (len(rows) * max(value, 1e-300))
         return value, float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
@@ -219,7 +219,7 @@ class Bench:
 
     def floor_mm(self) -> float:
         """Noise of the readings, rms."""
-        return float(np.sqrt(np.mean((self._noise_mm * self._whole)[self._whole] ** 2)))
+        return float(np.sqrt(np.mean(self._noise_mm[self._whole] ** 2)))
 
     @property
     def _noise_mm(self) -> F1:

@@ -91,8 +91,8 @@ def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
 def _before_of(store: Store, record: SolutionRecord) -> _Before:
     book = record.doc.get("machine_model") or {}
     taken = frozenset(book.get("taken_out", []))
-    version_ = int(book["version"]) if taken else None
-    return _Before(record.id, stored_field(store, record).known, _acting(_tables_of(store, record)), version_, taken)
+    number = int(book["version"]) if taken else None
+    return _Before(record.id, stored_field(store, record).known, _acting(_tables_of(store, record)), number, taken)
 
 
 def _tables_of(store: Store, record: SolutionRecord) -> list[Doc]:
@@ -187,6 +187,6 @@ def _change(change: Change) -> Doc:
         "u": change.u * size,
         "unit": unit,
         "evidence": change.evidence,
-        "rivals": [{"name": name, "less_evidence": less_} for name, less_ in change.rivals],
+        "rivals": [{"name": name, "less_evidence": by} for name, by in change.rivals],
         "halves": change.halves,
     }

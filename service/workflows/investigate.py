@@ -145,8 +145,8 @@ async def _discovered(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
 def _search(bench: Bench, campaign: str) -> tuple[int | None, dict[str, Any]]:
     store = bench.store
     measured = from_store(store, campaign)
-    then = table_then(store, measured)
-    job = prepare(measured, catalogue(), current(store, bench.site.name), table=then, since=since_of(store, measured))
+    book, since = current(store, bench.site.name), since_of(store, measured)
+    job = prepare(measured, catalogue(), book, table=table_then(store, measured), since=since)
     journal = journal_of(store, job)
     return journal.id, discover(job, journal, search, bench.progress)
 
