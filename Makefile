@@ -13,17 +13,24 @@ BENCH_READY := $(BENCH_VENV)/.ready
 COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint fmt bench lock clean
+.PHONY: help demo test test-long lint fmt bench lock clean
+# Most of a test's time is waiting for ports and processes, so there are more workers than cores; each may take a gigabyte.
+CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+WORKERS ?= $(shell n=$$(( $(CORES) * 2 )); echo $$(( n < 8 ? n : 8 )))
 
 help: ## list what can be made
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "Options go into ARGS: make demo ARGS=--help, make test ARGS='tests/unit -k table'. Another Python: make test PYTHON=python3.12"
 
 demo: $(RUN_READY) ## measure, correct and verify a simulated machine; writes a report
 	@$(BIN)/abbe demo $(ARGS)
 
-test: $(DEV_READY) ## all tests
-	@OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
+test: $(DEV_READY) ## all tests, side by side, about 20 minutes on two cores; ARGS=FILE: only these, one after the other
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(or $(ARGS),-p tests.progress -n $(WORKERS) --dist loadfile --no-loadscope-reorder --timeout 400)
+
+test-long: $(DEV_READY) ## hours: what is too long for every run, at full size; Ctrl-C stops it, and it goes on where it was
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.long $(ARGS)
+	$(if $(ARGS),,@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.campaigns.mutants)
 
 lint: $(DEV_READY) ## style, formatting, types, import walls
 	$(BIN)/ruff check --output-format concise

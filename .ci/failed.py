@@ -1,7 +1,7 @@
-"""Print the tests that failed in the streams of .ci/run and may be asked once more, alone; exit 1 where a failure is not of that kind.
+"""Print the tests that failed in .ci/run and may be asked once more, alone; exit 1 where a failure is not of that kind.
 
-Of that kind are at most three failed tests, in streams that ended by themselves: no time-out, no interruption, no error of pytest, no
-module that could not be read.
+Of that kind are at most three failed tests, none of them a test of safety, in a run that ended by itself: no time-out, no interruption, no
+error of pytest, no module that could not be read.
 """
 
 from __future__ import annotations
@@ -12,38 +12,42 @@ import sys
 from pathlib import Path
 
 MOST = 3
-STREAM_FAILED = 2  # what make says when its command failed; a time-out says 124
+RUN_FAILED = 2  # what make says when its command failed; a time-out says 124
 TESTS_FAILED = re.compile(r"^make(\[\d+\])?: \*\*\* .*\] Error 1$", re.MULTILINE)  # what pytest told make
+SAFETY = re.compile(
+    r"^tests/(push|faults|linuxcnc)/|/test_[a-z0-9_]*"
+    r"(banks|commission|correct|desk|devices_first|door|interlock|kill|order|pending|proposal|push|recover|rollback|stop|table|unverified"
+    r"|verified|watch|worse)"
+)
+"""Tests of pushes, tables, recovery, interlocks and faults, by folder or by a word of the file's name: one failure is a failure."""
 
 
-def failed(logs: Path) -> dict[str, list[str]]:
-    """Return the failed tests by stream, as pytest's own caches name them."""
-    caches = {path.name: path / "v/cache/lastfailed" for path in sorted((logs / "failed").iterdir())}
-    return {name: sorted(json.loads(cache.read_text())) if cache.exists() else [] for name, cache in caches.items()}
+def failed(logs: Path) -> list[str]:
+    """Return the failed tests, as pytest's own cache names them."""
+    cache = logs / "cache/v/cache/lastfailed"
+    return sorted(json.loads(cache.read_text())) if cache.exists() else []
 
 
-def refusal(logs: Path, codes: list[int]) -> str | None:
+def refusal(logs: Path, code: int) -> str | None:
     """Return why the failures count as they are, or None where they may be asked once more."""
     tests = failed(logs)
-    broken = [name for name, names in tests.items() if names]
-    number = sum(len(names) for names in tests.values())
-    if sum(code != 0 for code in codes) != len(broken) or {*codes} - {0, STREAM_FAILED}:
-        return "a stream did not end by itself, or failed without a failed test"
-    if not all(TESTS_FAILED.search((logs / name).read_text(errors="replace")) for name in broken):
-        return "a stream ended by something else than failed tests"
-    if not all("::" in test for names in tests.values() for test in names):
+    if code != RUN_FAILED or not tests or not TESTS_FAILED.search((logs / "log").read_text(errors="replace")):
+        return "the run did not end by itself, or failed without a failed test"
+    if not all("::" in test for test in tests):
         return "a module could not be read"
-    if number > MOST:
-        return f"{number} tests failed, and no more than {MOST} are asked once more"
+    if safety := [test for test in tests if SAFETY.search(test)]:
+        return f"a test of safety failed: {', '.join(safety)}"
+    if len(tests) > MOST:
+        return f"{len(tests)} tests failed, and no more than {MOST} are asked once more"
     return None
 
 
 def main() -> None:
-    """Judge the logs of the folder named first by the streams' exit codes."""
-    logs, codes = Path(sys.argv[1]), [int(word) for word in sys.argv[2:]]
-    if why := refusal(logs, codes):
+    """Judge the log and cache in the folder named first by make's exit code."""
+    logs, code = Path(sys.argv[1]), int(sys.argv[2])
+    if why := refusal(logs, code):
         sys.exit(f"not asked once more: {why}")
-    sys.stdout.writelines(f"{test}\n" for names in failed(logs).values() for test in names)
+    sys.stdout.writelines(f"{test}\n" for test in failed(logs))
 
 
 if __name__ == "__main__":

@@ -167,7 +167,8 @@ def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[s
     if first["type"] == "missing":
         return ConfigError(f"{source}: key {key!r} is missing{tail}", f"add {location[-1]} = ...")
     wanted = expected(first).replace("expected an object", "expected a table of keys")
-    return ConfigError(mask_secrets(f"{source}: {key}: {wanted}{tail}"), "correct it; `abbe schema` describes every key")
+    at = f"{source}: {key}" if key else source  # the file as a whole has no key
+    return ConfigError(mask_secrets(f"{at}: {wanted}{tail}"), "correct it; `abbe schema` describes every key")
 
 
 def _holds(values: Any, location: tuple[int | str, ...]) -> bool:

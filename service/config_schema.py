@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from drivers.errors import DriverError
 from drivers.links import urls
+from service.channel.messages import PAGE_MEMORY_MB
 from service.config_timetable import AlarmSection, ScheduleEntry, Section, WindowEntry
 from service.errors import AbbeError
 from service.mqtt.broker import parse as parse_broker
@@ -17,6 +18,32 @@ from service.runs.machine_object import Chain, Interval, Point
 from service.storage.engine import parse_url as parse_database
 
 Positive = Annotated[float, Field(gt=0.0)]
+
+SHORTEST_MM, LONGEST_MM = 50.0, 50_000.0
+"""Strokes of machines that there are. The shortest is also what a machine of a metre or two is in inches."""
+COLDEST_C, WARMEST_C = -20.0, 50.0
+"""Where machines are measured; 68 to 72 is Fahrenheit."""
+CERTIFICATES = (date(2000, 1, 1), date(2199, 12, 31))
+"""Between these a date can be the last day of a certificate; the demonstration's are of 2099."""
+
+
+def _celsius(window: tuple[float, float]) -> tuple[float, float]:
+    low, high = window
+    if low < COLDEST_C or high > WARMEST_C:
+        hint = "; is this Fahrenheit?" if low > WARMEST_C else ""
+        raise ValueError(f"expected degrees C from {COLDEST_C:g} to {WARMEST_C:g}, got [{low:g}, {high:g}]{hint}")
+    return window
+
+
+def _certificate(day: date | None) -> date | None:
+    first, last = CERTIFICATES
+    if day is not None and not first <= day <= last:
+        raise ValueError(f"expected the last day of a certificate, from {first} to {last}, got {day}")
+    return day
+
+
+Window = Annotated[Interval, AfterValidator(_celsius)]
+Certificate = Annotated[date | None, AfterValidator(_certificate)]
 
 
 class AxisIntervals(Section):
@@ -118,8 +145,8 @@ class Limits(Section):
         description="a proposed table is only pushed when somebody else than its proposer has approved it (`abbe comp approve`)",
     )
     feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
-    temperature_c: Interval = Field(default=(18.0, 24.0), description="air temperature in which a measurement is allowed")
-    run_temperature_c: Interval | None = Field(
+    temperature_c: Window = Field(default=(18.0, 24.0), description="air temperature in which a measurement is allowed")
+    run_temperature_c: Window | None = Field(
         default=None, description="air temperature (of the laser) beyond which a running measurement stops; absent: it is not watched"
     )
     continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
@@ -134,8 +161,8 @@ class Limits(Section):
 class Calibration(Section):
     """Last days of the instruments' certificates. No table is written from an instrument without one, or after it."""
 
-    ballbar: date | None = Field(default=None, description="of the ball-bar, e.g. 2027-05-31")
-    laser: date | None = Field(default=None, description="of the laser")
+    ballbar: Certificate = Field(default=None, description="of the ball-bar, e.g. 2027-05-31")
+    laser: Certificate = Field(default=None, description="of the laser")
 
 
 class Nc(Section):
@@ -210,6 +237,9 @@ class Web(Section):
         default=False,
         description="a reverse proxy on this computer takes off the TLS, keeps Host and appends to X-Forwarded-For, its name is in names",
     )
+    memory_mb: int = Field(
+        default=PAGE_MEMORY_MB, ge=512, le=65536, description="most that the page's process gets, MiB; beyond it the core starts it again"
+    )
 
     @model_validator(mode="after")
     def _both(self) -> Self:
@@ -267,6 +297,9 @@ class MachineFile(Section):
     chain: Chain = Field(description="carriages from workpiece w over bed b to tool t, e.g. w-X-Y-b-Z-t")
     vertical_axis: str = Field(default="Z", pattern="^[XYZ]$")
     stroke_mm: AxisIntervals
+    short_strokes: bool = Field(
+        default=False, description="strokes under 50 mm are meant: without this they are refused, since they may be inches"
+    )
     pivots_mm: AxisPoints = AxisPoints()
     tool_mm: Point = Field(default=(0.0, 0.0, 0.0), description="from the spindle reference point to the functional point")
     devices: Devices = Devices()
@@ -291,6 +324,17 @@ class MachineFile(Section):
         if twice:
             raise ValueError(f"two schedules are named {twice[0]!r}, expected different names")
         return entries
+
+    @model_validator(mode="after")
+    def _of_a_machine(self) -> Self:
+        for axis, (low, high) in self.stroke_mm.model_dump().items():
+            found = f"stroke_mm.{axis} = [{low:g}, {high:g}]"
+            if max(abs(low), abs(high), high - low) > LONGEST_MM:
+                raise ValueError(f"{found}: expected mm, no axis is longer than {LONGEST_MM:g} mm")
+            if high - low < SHORTEST_MM and not self.short_strokes:
+                meant = f"if it really is shorter than {SHORTEST_MM:g} mm, write short_strokes = true"
+                raise ValueError(f"{found}: expected mm, {high - low:g} looks like inches; {meant}")
+        return self
 
     @model_validator(mode="after")
     def _can_be_met(self) -> Self:

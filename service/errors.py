@@ -202,6 +202,12 @@ class MachineInUse(UnsafeToMove):
     code = "SEQ-010"
 
 
+class DevicesNotReady(AbbeError):
+    """Several devices that a measurement needs are missing, silent or not what they should be. Nothing has moved."""
+
+    code = "SEQ-011"
+
+
 class NotObservable(AbbeError):
     """The data cannot carry the claim that was asked for."""
 

@@ -35,7 +35,7 @@ from service.core.rights import may, may_measure
 from service.core.setup import Setup
 from service.core.systemd import notify
 from service.core.table_watch import TableWatch
-from service.core.watch import BoardWatch, StateTeller
+from service.core.watch import BoardWatch, StateTeller, VerifiedWatch
 from service.core.web_process import WebProcess
 from service.errors import ConfigError
 from service.mqtt.outbox import StoreOutbox
@@ -57,6 +57,7 @@ from service.web.view import View
 from service.workflows.at_start import push_is_open
 from service.workflows.push_word import open_push
 from service.workflows.shipped import parted
+from service.workflows.verified_by import verified_by
 
 if TYPE_CHECKING:
     from service.plant.opcua.server import OpcUaServer
@@ -84,7 +85,7 @@ class Service:
         self._listening = listening
         self.board = Board(setup.devices, clock)
         self._publisher = self._make_publisher()
-        self._station = Station(setup.machine, version("abbe"), store, lambda: self._scheduler.next_due(), clock)
+        self._station = Station(setup.machine, version("abbe"), store, lambda: self._scheduler.next_due(), clock, self.board.attention)
         watchers: list[JobWatcher] = [BoardWatch(self.board, self._changed), self._station]
         if self._publisher is not None:
             watchers.append(StateTeller(self._publisher, clock))
@@ -129,6 +130,8 @@ class Service:
             RulesTold(**asdict(setup.rules)),
             setup.told,
             self._jobs.full.names,
+            setup.page_memory_mb,
+            setup.control,
         )
 
     def _changed(self) -> None:
@@ -148,8 +151,8 @@ class Service:
         from service.plant.opcua.server import OpcUaServer  # an extra, and slow to import
 
         broker = "" if setup.broker is None else str(setup.broker)
-        view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock)
-        return OpcUaServer(setup.opcua, Gatherer(view.status, self._store), self._clock, setup.machine, version("abbe"))
+        view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock, setup.control)
+        return OpcUaServer(setup.opcua, Gatherer(view.status, self._store, setup.control), self._clock, setup.machine, version("abbe"))
 
     def _make_desk(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmDesk | None:
         setup = self._setup
@@ -160,7 +163,7 @@ class Service:
 
     def _make_orders(self, book: AuditBook, watchers: list[JobWatcher]) -> Orders:
         setup, store = self._setup, self._store
-        ground = Ground(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, watchers)
+        ground = Ground(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, watchers, setup.control)
         return Orders(store, self._clock, self._jobs, ground, Hands() if setup.hands is None else setup.hands(store))
 
     def _posted(self) -> None:
@@ -215,17 +218,20 @@ class Service:
         async with asyncio.TaskGroup() as tasks:
             if self._setup.recover is not None:
                 recover, told = self._setup.recover(self._store), self.board.attention
-                is_open = partial(push_is_open, self._store, self._setup.machine)
+                is_open = partial(push_is_open, self._store, self._setup.machine, self._setup.control)
                 ends = OpenEnds(recover, is_open, self._scheduler, self._shelf, told, self._clock, self._attention_changed)
                 tasks.create_task(ends.run(), name="recovery")
             if self._setup.table is not None:
                 look, told = self._setup.table(self._store), self.board.attention
                 tasks.create_task(TableWatch(look, self._shelf, told, self._clock, self._attention_changed).run(), name="table")
+            known = partial(verified_by, self._store, self._setup.machine, control=self._setup.control)
+            tasks.create_task(VerifiedWatch(known, self._publisher, self._clock, self._changed).run(), name="verified")
             await self._scheduler.run()
         return True
 
     def _attention_changed(self) -> None:
         self.board.changed()
+        self._station.noted()
         self._changed()
 
     async def _once(self) -> bool:
@@ -299,8 +305,10 @@ async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer
         try:
             host, port = listening.getsockname()[:2]
             scheme = "https" if setup.certificate else "http"
+            for line in setup.doubts:
+                log.warning("machine file", text=line)
             log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
-            last_words.append(partial(open_push, store, setup.machine))
+            last_words.append(partial(open_push, store, setup.machine, setup.control))
             return await Service(setup, store, listening, clock).run(stop, once=once)
         finally:
             await asyncio.to_thread(store.close)

@@ -11,7 +11,7 @@ import numpy as np
 from models.machine import AXES, Machine
 from service.capture.settings import MIB, CaptureSettings
 from service.config_schema import Limits, MachineFile
-from service.devices.urls import DeviceUrls
+from service.devices.urls import DeviceUrls, control_of
 from service.push.limits import PushLimits
 from service.sequences.interlocks import Suspending, Watching
 from service.sequences.nc.settings import NcSettings
@@ -37,6 +37,11 @@ class Site:
     nc: NcSettings = field(default_factory=NcSettings)
     calibrated_until: dict[str, date] = field(default_factory=dict)
     two_people: bool = False
+
+    @property
+    def control(self) -> str:
+        """Identity of the control (`control_of`); empty where there is none."""
+        return control_of(self.urls.cnc)
 
 
 def machine_from_doc(doc: dict[str, Any]) -> Machine:

@@ -189,11 +189,19 @@ def _proposals(
     return out
 
 
+class _Earlier(SystemClock):
+    """The clock of before the first check, which is thereby of the table in force."""
+
+    def utc(self) -> datetime:
+        return super().utc() - timedelta(weeks=30)
+
+
 async def _pushes(store: ServiceStore, machine: str, evil: str) -> None:
     """A rollback that did not hold, and a push that was kept: that one can be taken back."""
+    clock = _Earlier()
     back = {"kind": "rollback", "reason": f"worse on the gauge block{evil}", "by": f"user:anna{evil}"}
-    await as_if_pushed(store, SystemClock(), machine, back, (b"the table of May", b"the table of April"), TAKEN_BACK)
-    await as_if_pushed(store, SystemClock(), machine, {"proposal": 99}, (b"the table of May", b"the table of June"), KEPT)
+    await as_if_pushed(store, clock, machine, back, (b"the table of May", b"the table of April"), TAKEN_BACK)
+    await as_if_pushed(store, clock, machine, {"proposal": 99}, (b"the table of May", b"the table of June"), KEPT)
 
 
 def _discovery(store: ServiceStore, folder: Path, evil: str) -> int:
@@ -259,7 +267,7 @@ def screens(filled: Filled) -> list[str]:
     proposals = [f"/proposal?id={n}" for n in filled.proposals[::2]]
     found = [f"/result?id={filled.solution}", f"/discovery?id={filled.discovery}"]
     found += [f"/volume?id={filled.solution}", f"/volume?id={filled.solution}&motion=EYY&plane=XZ", f"/budget?id={filled.solution}"]
-    found += [f"/whatif?id={filled.solution}&take=mean.C0Y&take=EYY", "/compare", "/compare?run=1&run=2"]
+    found += [f"/whatif?id={filled.solution}&take=mean.C0Y&take=EYY", "/compare", "/compare?run=2&run=3"]
     plant = ["/fleet", "/devices", "/settings"]
     first = ["/", "/new", "/runs", *runs, "/results", "/discoveries", *found]
     return [*first, "/proposals", *proposals, "/table", "/trends", "/schedule", "/audit", *plant]

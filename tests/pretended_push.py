@@ -16,14 +16,23 @@ TAKEN_BACK = (*UP_TO_ACTIVE, S.ROLLBACK, S.ACTIVATING_BACK, S.ROLLED_BACK)
 
 
 async def as_if_pushed(
-    store: Store, clock: Clock, machine: str, doc: dict[str, Any], images: tuple[bytes, bytes], states: tuple[State, ...]
+    store: Store,
+    clock: Clock,
+    machine: str,
+    doc: dict[str, Any],
+    images: tuple[bytes, bytes],
+    states: tuple[State, ...],
+    control: str = "",
 ) -> None:
-    """Write the entries. ``images``: of the table that goes and of the one that comes; ``doc``: what is kept with the latter."""
+    """Write the entries. ``images``: of the table that goes and of the one that comes; ``doc``: what is kept with the latter; ``control``:
+    identity of the control, empty as older versions wrote.
+    """
     base, image = images
     table = store.add_table(store.add_machine(machine, {"name": machine}), None, image, crc32(image), doc)
     known = {"table": table, "base_image": base.hex(), "base_crc": crc32(base), "base_bank": 0, "image": image.hex()}
-    known |= {"crc": crc32(image), "target": 1, "base_meaning": "b", "meaning": "m"}
+    known |= {"crc": crc32(image), "target": 1, "base_meaning": "b", "meaning": "m", "owner": 0x00770000}
+    known |= {"machine": machine} | ({"control": control} if control else {})
     more = {S.SNAPSHOT: known, S.APPROVED: {"approved_by": "ann"}, S.VERIFIED: {"verify": "better"}, S.ROLLBACK: {"why": "worse"}}
-    book = await StoreBook.new(store, machine, clock)
+    book = await StoreBook.new(store, machine, clock, control)
     for state in states:
         await book.append(await book.entries(), state, more.get(state, {}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drivers.ballbar import frames
 from drivers.ballbar.conversation import Conversation
 from drivers.ballbar.sequence import OtherPace, OtherSettings, Reads, SegmentEnd
-from drivers.errors import DeviceFault, DriverError, Rebooted, SettingsChanged, WrongDevice
+from drivers.errors import DeviceFault, DriverError, Rebooted, Refused, SettingsChanged, WrongDevice
 
 _TELLS_SETTINGS = 0x0101  # firmware
 _RESTORE = "somebody changed the box: set it back (restore_settings), then measure this test again"
@@ -29,6 +29,7 @@ class Box:
         self.settings: frames.Settings | None = None
         self._name, self._talk, self._serial_no = name, talk, serial_no
         self._first: frames.Settings | None = None
+        self._max_rate_hz = 0
 
     @property
     def reads(self) -> Reads | None:
@@ -52,7 +53,7 @@ class Box:
         if info.firmware >= _TELLS_SETTINGS:
             self.settings = await self._talk.settings()
             self._first = self._first or self.settings
-        self.boot_id, self._serial_no = info.boot_id, info.serial_no
+        self.boot_id, self._serial_no, self._max_rate_hz = info.boot_id, info.serial_no, info.max_rate_hz
         return info
 
     async def peek(self) -> int:
@@ -77,6 +78,15 @@ class Box:
             raise SettingsChanged(self._name, "start stream", detail, _RESTORE)
         if now.unit != frames.NANOMETRE:
             raise SettingsChanged(self._name, "start stream", "the box shows inches", "switch it to millimetres, then open it anew")
+
+    def check_can(self, rate_hz: int, range_mm: float) -> None:
+        """Raise ``Refused`` when it cannot send so fast, or clamps readings that are wanted; what it does not tell is not judged."""
+        if 0 < self._max_rate_hz < rate_hz:
+            detail = f"{rate_hz} Hz are wanted, the box sends at most {self._max_rate_hz}"
+            raise Refused(self._name, "check", detail, "choose a lower rate")
+        if self.settings is not None and self.settings.range_nm < range_mm * 1e6:
+            detail = f"its range is set to +-{self.settings.range_nm * 1e-6:g} mm, needed are {range_mm:g}"
+            raise Refused(self._name, "check", detail, "set a larger range at the box")
 
     async def restore(self) -> None:
         """Set unit, range and zero as they were at first; errors as for `accept`, and ``Refused``."""

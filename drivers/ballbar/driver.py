@@ -162,6 +162,27 @@ class SerialBallBar:
         self.incidents.accepted()
         return info
 
+    async def check(self, rate_hz: int, *, range_mm: float) -> None:
+        """Ask whether a stream of this rate, read over this stroke, could begin now; nothing is started.
+
+        Parameters
+        ----------
+        rate_hz : int
+            Samples per second; 0: whatever the box does.
+        range_mm : float
+            Stroke to either side that is needed; of firmware 1.0, which does not tell its own, nothing is asked.
+
+        Raises
+        ------
+        Refused
+            The box cannot send so fast, or reads over less.
+        SettingsChanged, Rebooted, LinkDown, ReplyTimeout, BadFrame, WrongDevice
+            As for ``stream``.
+        """
+        await self._box.check_boot()
+        self._box.check_settings()
+        self._box.check_can(rate_hz, range_mm)
+
     async def restore_settings(self) -> None:
         """Give the box the unit, range and zero back that it had when this driver first met it.
 

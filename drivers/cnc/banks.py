@@ -117,6 +117,8 @@ class Banks:
             else:
                 detail = "another program's command took its number: it was not executed"
                 raise DeviceFault(self._name, operation, detail, "let one program at a time push; read the status again, then decide")
+        if command == reg.RELEASE and result == _LEASED and counts["LEASE_OWNER"] == 0:
+            return  # some controls refuse to release what is free: nobody has it, which is what was asked for
         if result:
             raise Refused(self._name, operation, reg.COMP_RESULT.get(result, f"result {result}"), "read the status again, then decide")
 
@@ -175,7 +177,7 @@ def _passed_over(command: int, result: int, counts: dict[str, int], fields: dict
     """Whether an acknowledge is that of another program's command: what it says does not go with who has the lease."""
     owner, holder = fields["owner"], counts["LEASE_OWNER"]
     if result == _LEASED:
-        return holder == owner or (command in (reg.LEASE, reg.RELEASE) and holder == 0)
+        return holder == owner or (command == reg.LEASE and holder == 0)
     if result:
         return False
     if command == reg.SEAL:

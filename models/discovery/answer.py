@@ -24,7 +24,8 @@ class Significance:
 
 @dataclass(frozen=True)
 class Where:
-    """Where a gap or an effect lives. None or empty: not located in that respect. Fields as in run-format.md 5 ``where``."""
+    """Where a gap or an effect lives. None or empty: not located in that respect. Fields as in run-format.md 5 ``where``;
+    ``shape``: what it looks like there, for people."""
 
     tests: tuple[str, ...] = ()
     axes: tuple[str, ...] = ()
@@ -37,6 +38,7 @@ class Where:
     period_mm: float | None = None
     angular_lobes: int | None = None
     depends_on: tuple[str, ...] = ()
+    shape: str = ""
     table: tuple[Significance, ...] = ()
 
 
@@ -101,6 +103,17 @@ class Gap:
 
 
 @dataclass(frozen=True)
+class Fitted:
+    """A value of the present simulation that these runs show: ``name`` and ``key``, value and standard uncertainty in ``unit``."""
+
+    name: str
+    key: str
+    value: float
+    u: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class Unseen:
     """What a campaign cannot show: ``what`` it is, ``because`` of what, the addition of run-format.md 5 that would show it."""
 
@@ -148,11 +161,12 @@ class Discovery:
     where : where the gap of the present model lives (for "unknown": where the missing thing lives).
     gaps : by role ("identify", "holdout").
     residual_before_mm, residual_after_mm, predicted_mm, predicted_before_mm : by run label; predictions also of sealed runs.
-    noise_mm : one reading of each run's instrument, by "bar", "laser".
+    noise_mm : one reading of each run's instrument, by "bar", "laser"; of repeats where they say less than what the fit left.
     p_value : of the whole finding (how often noise alone gives as much).
     theta, theta_names, theta_covariance : the refitted model without the effects.
     agreement : of runs that only judge, where nothing was found; the worst first. unjudged : those of them that cannot be judged.
     unseen : where nothing was found: what these runs could not have shown.
+    fitted : what the present simulation took up that people want to know (the scale of a single axis): not missing, and yet there.
     """
 
     verdict: Verdict
@@ -175,3 +189,4 @@ class Discovery:
     agreement: tuple[Agreement, ...] = ()
     unjudged: tuple[Unjudged, ...] = ()
     unseen: tuple[Unseen, ...] = ()
+    fitted: tuple[Fitted, ...] = ()

@@ -10,8 +10,9 @@ import numpy as np
 
 from models.arrays import F1
 from models.discovery.agreement import agreements
-from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict
+from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict, Where
 from models.discovery.generic import is_unnamed
+from models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
 from models.discovery.next_test import Suspect, propose
 from models.discovery.next_unnamed import propose_unnamed
 from models.discovery.prediction import Solved, left_over, predictions
@@ -20,7 +21,7 @@ from models.discovery.rivals import EXCLUDED, Rival
 from models.discovery.scene import Scene
 from models.discovery.selection import Found
 from models.discovery.strength import as_plain, shape_of, strength_of, true_to_form
-from models.discovery.unnamed import Structure, structures, told_of
+from models.discovery.unnamed import Structure, lacking, structures, told_of
 from models.discovery.unseen import unseen
 from models.discovery.variance import VarianceFinding
 from models.discovery.where import locate
@@ -62,30 +63,33 @@ def finding(
     judged = [r for r in case.runs if r.deviation_mm is not None]
     residuals = [{r.path.label: left_over(r, p[r.path.label], seen) for r in judged} for p in predicted]
     agreement, unjudged = agreements(scene, solved, predicted[0]) if told.verdict == "none" else ((), ())
-    where = locate(plain.paths, tuple(plain.by_run(plain.space.residual)))
-    if told.verdict == "unknown":
+    where, verdict, floor = locate(plain.paths, tuple(plain.by_run(plain.space.residual))), told.verdict, floors(scene)
+    lack = lack_of_fit(scene, residuals[0], floor, agreement) if verdict == "none" else None
+    if lack is not None:
+        verdict, unnamed, where = "unknown", (lacking(lack),), lack
+    elif verdict == "unknown":
         where = replace(unnamed[0].where, table=where.table)
     return Discovery(
-        verdict=told.verdict,
+        verdict=verdict,
         effects=told.effects if is_named else (),
         where=where,
         next_test=_next_test(scene, told.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
-        gaps=_gaps(scene, residuals[0], residuals[1]),
+        gaps=gaps_of(scene, residuals[0], residuals[1], floor),
         residual_before_mm=residuals[0],
         residual_after_mm=residuals[1],
         predicted_mm=predicted[1],
         predicted_before_mm=predicted[0],
-        noise_mm={k: c.sd_mm for k, c in scene.colours.items()},
-        p_value=_p_value(found, loud),
+        noise_mm={k: f.sd_mm for k, f in floor.items()},
+        p_value=_p_value(found, loud, lack),
         theta_names=scene.base.names,
         theta=solved.theta,
         theta_covariance=solved.theta_covariance,
-        rejected=told.rejected,
+        rejected=(*told.rejected, *((u.label, u.title) for u in unnamed if lack is not None)),
         confounded_with=_confounded(told.effects) if is_named else (),
         beside=tuple((u.label, u.evidence) for u in unnamed) if is_named else (),
         agreement=agreement,
         unjudged=unjudged,
-        unseen=unseen(case) if told.verdict == "none" else (),
+        unseen=unseen(case) if verdict == "none" else (),
     )
 
 
@@ -141,8 +145,13 @@ def _verdict(named: float, unnamed: float) -> Verdict:
     return "unknown" if unnamed > named else "named"
 
 
-def _p_value(found: Sequence[Found], loud: Sequence[VarianceFinding]) -> float:
-    """Bound on how often noise alone would give the strongest finding: chi-square of its parameters times how many starts were compared."""
+def _p_value(found: Sequence[Found], loud: Sequence[VarianceFinding], lack: Where | None) -> float:
+    """Of a lack of fit, the smallest of its table.
+
+    Else a bound on how often noise alone would give the strongest finding: chi-square of its parameters times the starts compared.
+    """
+    if lack is not None:
+        return min((s.p for s in lack.table), default=CHANCE)
     bounds: list[float] = [STARTS * float(chi2_above(f.gain, 2 + len(f.pick.effect.shape) + len(f.pick.forms))) for f in found]
     bounds += [float(np.exp(-f.evidence)) for f in loud]
     return min(1.0, *bounds) if bounds else 1.0
@@ -194,14 +203,14 @@ def _next_test(scene: Scene, kept: Sequence[int], solved: Solved, rivals: Sequen
     return None
 
 
-def _gaps(scene: Scene, before: Mapping[str, F1], after: Mapping[str, F1]) -> dict[str, Gap]:
+def gaps_of(scene: Scene, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:
     """Of every role with at least one reading that counts."""
     out = {}
     for role in ("identify", "holdout"):
         runs = [r for r in scene.case.runs if r.role == role and r.path.label in before]
         if any(np.isfinite(before[r.path.label]).any() for r in runs):
             rms = [float(np.sqrt(np.nanmean(np.concatenate([res[r.path.label] for r in runs]) ** 2))) for res in (before, after)]
-            noise = [(r.path.n, scene.colours[r.path.kind].sd_mm) for r in runs if r.path.kind in scene.colours]
+            noise = [(r.path.n, floor_of[r.path.kind].sd_mm) for r in runs if r.path.kind in floor_of]
             floor = float(np.sqrt(sum(n * s * s for n, s in noise) / max(sum(n for n, _ in noise), 1)))
             out[role] = Gap(rms[0], rms[1], floor)
     return out

@@ -5,7 +5,7 @@ Without them four of five effects outside of the catalogue get a wrong name (dis
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -157,7 +157,9 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
         out.append(_effect("settling", "one axis wanders off", (key,), (_par("t0_s", clock, starts["settling"][key]), tau)))
     out.append(_effect("slip", "work holding gave way", ("",), (_par("t0_s", clock, starts["slip"][""]),)))
     for key in (*AXES, *sorted(kinds)):
-        out.append(_effect("surge", "wave on the clock", (key,), (_par("period_s", PERIODS_S, starts["surge"][key]),)))
+        shortest = max(PERIODS_S[0], _resolved_s([p for p in paths if key in (*AXES, p.kind)]))
+        seen = tuple(v for v in starts["surge"][key] if v >= shortest)
+        out.append(_effect("surge", "wave on the clock", (key,), (_par("period_s", (min(shortest, PERIODS_S[1]), PERIODS_S[1]), seen),)))
     for key in CROSS:
         out.append(_effect("wave", "wave along one axis across it", (key,), (_par("pitch_mm", PITCHES_MM, starts["wave"][key]),)))
     width = Parameter("width_mm", "mm", 8.0, 45.0, 20.0, SOURCE, WIDTHS_MM)
@@ -170,6 +172,12 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
     )
     out.append(_effect("burst", "short disturbance of the reading", ("",), burst))
     return [e for e in out if all(p.starts for p in e.shape)]
+
+
+def _resolved_s(paths: Sequence[Path]) -> float:
+    """Shortest period that the readings of the quickest run tell from a longer one: two intervals."""
+    steps = [float(np.median(np.diff(p.at.t_s))) for p in paths if p.n > 1]
+    return 2.0 * min(steps, default=np.inf)
 
 
 def _par(name: str, bounds: tuple[float, float], starts: tuple[float, ...]) -> Parameter:

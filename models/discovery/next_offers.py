@@ -27,6 +27,8 @@ ARM_MM = 100.0
 LATE_S = 3.0 * 3600.0
 GAP_S = 900.0
 FEED_MM_MIN = 1500.0
+SHORTEST_BAR_MM = 10.0
+"""No ball-bar is shorter."""
 OTHER_FEED = 1.3
 """Feeds that differ by a smaller factor are one feed: what grows with the feed then changes too little to be told from geometry."""
 
@@ -59,7 +61,7 @@ def offers(case: Case) -> tuple[Offer, ...]:
     if bars:
         out += _bar_variants(bars, start)
     else:
-        out.append(_ballbar(runs[0], start))
+        out += _ballbar(runs[0], start)
     if not any(p.test == "laser_diagonal" for p in lasers):
         out.append(_diagonals(runs[0], start))
     if not any(p.test == "laser_linear" for p in lasers):
@@ -169,7 +171,7 @@ def _circles(like: Path, start: float, feed: float) -> tuple[CaseRun, ...]:
     radius = like.radius_mm if like.kind == "bar" else min(150.0, float(np.floor(0.45 * like.machine.length_mm.min())))
     angle = np.linspace(0.0, 2.0 * np.pi, READINGS)
     for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 0))):
-        if radius > 0.48 * min(like.machine.length_mm[a], like.machine.length_mm[b]):
+        if radius < SHORTEST_BAR_MM or radius > 0.48 * min(like.machine.length_mm[a], like.machine.length_mm[b]):
             continue
         q = np.tile(centre, (len(angle), 1))
         q[:, a] += radius * np.cos(angle)
@@ -182,12 +184,13 @@ def _circles(like: Path, start: float, feed: float) -> tuple[CaseRun, ...]:
     return tuple(out)
 
 
-def _ballbar(like: Path, start: float) -> Offer:
+def _ballbar(like: Path, start: float) -> list[Offer]:
+    """None where the strokes have no room for a bar."""
     runs = _circles(like, start, 2.0 * FEED_MM_MIN) + tuple(
         replace(r, path=replace(r.path, label=f"{r.path.label}_slow", setup=f"{r.path.setup}_slow"))
         for r in _circles(like, start + 1500.0, FEED_MM_MIN)
     )
-    return Offer("ballbar", runs, BAR_MIN + _minutes(runs), "a ball-bar in three planes at two feeds, both ways")
+    return [Offer("ballbar", runs, BAR_MIN + _minutes(runs), "a ball-bar in three planes at two feeds, both ways")] if runs else []
 
 
 def _laser(like: Path, q_mm: F2, beam: F1, start: float, label: str, test: str) -> CaseRun:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from models.discovery.answer import Where
 from models.discovery.case import Case
-from models.discovery.generic import is_unnamed, where_of
+from models.discovery.generic import PREFIX, is_unnamed, where_of
 from models.discovery.selection import Found
 from models.discovery.variance import VarianceFinding
 
@@ -34,6 +34,14 @@ def structures(case: Case, found: Sequence[Found], loud: Sequence[VarianceFindin
     ]
     out += [Structure(f.label, TITLES[f.name], f.evidence, f.where) for f in loud if is_unnamed(f.name)]
     return tuple(sorted(out, key=lambda s: (-s.evidence, s.label)))
+
+
+def lacking(where: Where) -> Structure:
+    """What a lack of fit is called: a shape along an axis, or that something is left at a place."""
+    axis = f":{where.axes[0]}" if len(where.axes) == 1 else ""
+    if where.shape:
+        return Structure(f"{PREFIX}smooth{axis}", where.shape, 0.0, where)
+    return Structure(f"{PREFIX}place{axis}", "more is left than noise", 0.0, where)
 
 
 def told_of(structure: Structure, *, beside: bool) -> str:

@@ -16,7 +16,7 @@ def _waves(path: Path, period_s: float) -> F2:
 
 
 def breathing(path: Path, key: str, values: Values) -> F2:
-    """0.93e-6 times the displacement times sine and cosine of the hall's cycle, 1 K: warmer air reads long."""
+    """-0.93e-6 times the displacement times sine and cosine of the hall's cycle, 1 K: warmer air reads short."""
     return _waves(path, values["period_s"])
 
 
@@ -53,10 +53,10 @@ EFFECT = Effect(
         Form("sensor", _sensed),
     ),
     needs="laser runs far apart in time, or an air sensor",
-    signature="the scale of the diagonals changes from set-up to set-up",
+    signature="the scale of the diagonals changes from set-up to set-up: short in warm air, 1 um per metre and kelvin",
     remedy="warm up or sensor",
     remedy_text="measure air temperature and pressure at the beam and let the laser's software correct the wavelength",
-    source="effects.md 4; Edlen: -0.93 ppm/K, +0.27 ppm/hPa",
+    source="effects.md 4; Edlen: the reading changes by -0.93 ppm/K, +0.27 ppm/hPa",
     blind=("ballbar_helix", "ballbar_circle"),
     separated_by={
         "axis_thermal_growth": ("ballbar", "longer_session"),

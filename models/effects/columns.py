@@ -20,8 +20,10 @@ LATERAL_KEYS = ("EYX", "EZX", "EXY", "EZY", "EXZ", "EYZ")
 NO_KEY = ("",)
 STEEL_PER_K = 11.5e-6
 """Thermal growth of steel, 1/K (effects.md 3)."""
-AIR_PER_K = 0.93e-6
-"""The laser reads this much too long per kelvin of warmer air and per millimetre of path (Edlen; effects.md 4)."""
+AIR_PER_K = -0.93e-6
+"""What a laser reads too much per kelvin of warmer air and per millimetre of path: it counts n D over the wavelength that was assumed, and
+warm air is thin, so it reads short. dn/dT at 20 C, 101325 Pa and a constant vapour pressure, as when a hall warms up; at a constant
+relative humidity -0.96e-6 (Edlen as of Birch and Downs, Metrologia 30 (1993) 155; effects.md 4)."""
 CAMPAIGN_S = (600.0, 12000.0)
 """Time constants that a campaign of hours can tell from a constant and from a straight line."""
 
@@ -122,10 +124,13 @@ def order_of(names: Iterable[str]) -> dict[str, int]:
 
 
 def commanded_turns(at: Places, axis: int) -> tuple[F1, F1]:
-    """Direction of the last motion and travel since the last turn, shape (n,) each, where an axis turns at a commanded position."""
-    if len(at.t_s) < 2:
+    """Direction of the last motion and travel since the last turn, shape (n,) each, where an axis turns at a commanded position.
+
+    A machine that dwells turns where `Places` says: it may have gone beyond a place and come back.
+    """
+    if len(at.t_s) < 2 or not at.v_mm_s.any():
         return at.sign[:, axis], at.since_mm[:, axis]
-    came_mm = run_in(at.q_mm) if at.v_mm_s.any() and len(at.t_s) > 2 else at.q_mm
+    came_mm = run_in(at.q_mm) if len(at.t_s) > 2 else at.q_mm
     sign = travel_sign(came_mm)
     since = since_reversal(came_mm, sign)
     return sign[-len(at.t_s) :, axis], since[-len(at.t_s) :, axis]

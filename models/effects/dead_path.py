@@ -15,7 +15,7 @@ def _hours(path: Path) -> F2:
 
 
 def zero_drift(path: Path, key: str, values: Values) -> F2:
-    """0.93e-6 times the dead path times the hours since the first record, 1 K/h."""
+    """-0.93e-6 times the dead path times the hours since the first record, 1 K/h: air that warms up (above 0) reads short."""
     return np.asarray(AIR_PER_K * path.dead_path_mm * _hours(path))
 
 
@@ -37,7 +37,7 @@ EFFECT = Effect(
     strength=first,
     forms=(Form("bent", of_kind("laser", _bent, 1)),),
     needs="a diagonal there and back, so that time is not position",
-    signature="the reading drifts with time inside a run, whatever the position: forth and back make a loop",
+    signature="the reading drifts in a run whatever the position, down while the air warms up (above 0 K/h): forth and back make a loop",
     remedy="set-up",
     remedy_text="bring the interferometer near the start of the travel, shield the beam, set the zero when the air has settled",
     source="effects.md 4",

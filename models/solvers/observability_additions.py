@@ -23,6 +23,8 @@ ASIDE_MM = (100.0, 50.0)
 """Virtual tools: that much longer; that far off the spindle's axis (math.md 4.6)."""
 READINGS, RUNS = 130, 10
 """Readings of a virtual run, and runs repeated with another tool, at most: they cost time, and a rank needs few."""
+SHORTEST_BAR_MM = 10.0
+"""No ball-bar is shorter."""
 MARGIN = 0.1
 """Share of the stroke that virtual runs keep off its ends."""
 
@@ -127,8 +129,9 @@ def _bar_additions(machine: Machine, runs: tuple[RunData, ...], there: Present) 
     lined = " with tools that end on one line" if one else short
     count = "at one place" if there.cups == 1 else f"at {there.cups} places"
     cups = f"the ball-bar stood {count} only" if there.cups else "no ball-bar was used"
+    helices = _helices(machine, runs)
     return [
-        Addition("centres", cups, "ball-bar helices about five centres", _helices(machine, runs)),
+        *([Addition("centres", cups, "ball-bar helices about five centres", helices)] if helices else []),
         Addition("tool", length, "a second tool length" if one else "another tool length", _with(runs, longer, "long"), (), short),
         Addition("aside", beside, "a tool whose end stands off to the side", _with(runs, aside, "aside"), (), lined),
     ]
@@ -157,9 +160,11 @@ def _inner(machine: Machine) -> F2:
 
 
 def _helices(machine: Machine, runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
-    """About the middle and four places around it, with the campaign's own bar where it has one."""
+    """About the middle and four places around it, with the campaign's own bar where it has one; none where no bar has room."""
     own = next((r for r in runs if r.radius_mm is not None), None)
     radius = 0.2 * float(machine.length_mm.min()) if own is None or own.radius_mm is None else own.radius_mm
+    if own is None and radius < SHORTEST_BAR_MM:
+        return ()
     pole = int(np.argmax(np.abs(machine.tool_mm))) if machine.tool_mm.any() else 2
     across = [a for a in range(3) if a != pole]
     aside = np.clip(0.25 * machine.length_mm, 0.0, np.maximum(0.5 * machine.length_mm - radius, 0.0))  # beyond the stroke nothing is stated

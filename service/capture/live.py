@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.api import BarBatch, Point
+from service.runs.helix_axis import about_axis, helix_axis
 
 F1 = NDArray[np.float64]
 Values = NDArray[np.float32]
@@ -29,7 +30,6 @@ ANGLES = 512
 """Places of a path at which its angle is told; in between the browser interpolates."""
 SYNC, INVALID_BITS = 0b1000, 0b10101
 UM_PER_NM = 1e-3
-PLANES = {"X": "YZ", "Y": "ZX", "Z": "XY"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +123,17 @@ def _cut(path: int, numbers: list[int], values: Values, host_s: float) -> list[S
 def angles_along(points_mm: Sequence[Point], setup: Mapping[str, Any]) -> tuple[F1, float]:
     """Angle about a ball-bar test's axis at `ANGLES` even parts of its path, degrees, not wrapped; and the path's length in mm.
 
-    Angles count from the first axis of the plane to its second, as in a recipe.
+    Angles count from the first axis of the plane to its second, as in a recipe. None where neither set-up nor path tells the axis: there
+    is no round picture of it.
     """
     points = np.asarray(points_mm, dtype=np.float64) - np.asarray(setup["centre_mm"], dtype=np.float64)
-    plane = str(setup.get("plane") or PLANES[str(setup.get("axis", "Z"))])
-    across, up = (points[:, "XYZ".index(letter)] for letter in plane)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    angle = np.rad2deg(np.unwrap(np.arctan2(up, across)))
+    if setup.get("plane"):
+        across, up = (points[:, "XYZ".index(letter)] for letter in str(setup["plane"]))
+        about = np.arctan2(up, across)
+    elif (axis := helix_axis(setup, points)) is not None:
+        about = about_axis(points, axis)
+    else:
+        return np.zeros(0), float(arc[-1])
+    angle = np.rad2deg(np.unwrap(about))
     return np.interp(np.linspace(0.0, arc[-1], ANGLES), arc, angle), float(arc[-1])

@@ -23,6 +23,8 @@ PROTOCOL = 1
 LARGEST_B = 256 * 1024
 """The longest message, bytes."""
 MOST_JOBS = 50
+PAGE_MEMORY_MB = 1024
+"""What the page's process gets, where nobody has said otherwise, MiB."""
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -171,6 +173,8 @@ class Begin:
     rules: RulesTold
     plan: MachineTold | None
     campaigns: Annotated[tuple[Word, ...], Field(max_length=200)]
+    memory_mb: Annotated[int, Field(ge=1)]
+    control: Text
 
 
 @dataclass(frozen=True, slots=True)

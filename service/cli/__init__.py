@@ -49,10 +49,12 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
     from drivers.errors import DriverError
     from service.cli.app import app
+    from service.cli.plain_text import degrade
     from service.errors import AbbeError
 
     if sys.stdout is None:
         sys.stdout = _Closed()
+    degrade()
     if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:  # as every program has it
         arguments = ["version"]
     try:

@@ -5,8 +5,12 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+from typing import TYPE_CHECKING
 
 from service.errors import ConfigError
+
+if TYPE_CHECKING:
+    from service.devices.session import Ask
 
 
 async def console_ask(text: str) -> None:
@@ -28,6 +32,13 @@ async def console_ask(text: str) -> None:
     sys.stderr.flush()
     if await _entered(line) == b"":
         raise ConfigError("standard input was closed", "start again from a terminal")
+
+
+def whoever_is_there() -> Ask:
+    """Who is asked at this console: the person at the terminal, or, known before anything moves, nobody."""
+    from service.devices.session import no_console
+
+    return console_ask if sys.stdin is not None and sys.stdin.isatty() else no_console
 
 
 async def _entered(line: int) -> bytes:

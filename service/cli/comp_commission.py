@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import JsonOption, print_json, print_table
-from service.cli.measure import MachineArgument, ready_session
+from service.cli.measure import AcceptTable, MachineArgument, ready_session
 
 if TYPE_CHECKING:
     from service.storage.store import Store
@@ -26,6 +26,7 @@ def commission(
     wait_s: Annotated[
         float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
     ] = 600.0,
+    accept_table: AcceptTable = False,
     as_json: JsonOption = False,
 ) -> None:
     """Try what the controller must refuse; then write a small known step for each axis, measure it with the ball-bar.
@@ -46,7 +47,7 @@ def commission(
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> tuple[Levels, Proved | None]:
-        async with ready_session(store, site) as session:
+        async with ready_session(store, site, accept_table=accept_table) as session:
             levels = await commission_levels(session.controller, store, site)
             if not as_json:
                 _show_levels(levels)

@@ -154,6 +154,7 @@ def approve(
     from service.workflows.proposal_doc import load
     from service.workflows.proposal_states import check_waiting
     from service.workflows.proposals import login
+    from service.workflows.push_word import open_pushes
 
     with open_store(database_url(db, machine)) as store:
         proposed = load(store, proposal)
@@ -163,7 +164,19 @@ def approve(
         except TableRefused as error:
             typer.echo(f"not approved: {error}")
             raise typer.Exit(1) from None
+        left_open = open_pushes(store, proposed.candidate.machine, _control(machine, proposed.candidate.machine))
     typer.echo(f"proposal {proposal} is approved by {done.name} until {done.expiry}")
+    for line in left_open:
+        typer.echo(f"warning: {line}", err=True)
+
+
+def _control(machine: Path | None, name: str) -> str:
+    """Identity of a machine's control; empty where its machine file was not given."""
+    from service.config import load_machine
+    from service.devices.urls import control_of
+
+    found = None if machine is None else load_machine(machine).machine
+    return control_of(found.devices.cnc) if found is not None and found.name == name else ""
 
 
 def reject(

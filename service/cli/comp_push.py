@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.cli.comp_proposals import ProposalArgument
-from service.cli.measure import MachineArgument, ready_session, verification_before
+from service.cli.measure import AcceptTable, MachineArgument, ready_session, verification_before
 
 if TYPE_CHECKING:
     from service.storage.store import Store
@@ -24,6 +24,7 @@ def push(
     wait_s: Annotated[
         float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
     ] = 600.0,
+    accept_table: AcceptTable = False,
 ) -> None:
     """Push a proposal, prove it, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
     from service.cli.progress import display
@@ -44,7 +45,7 @@ def push(
 
     async def work(store: Store) -> Correction | list[str]:
         with display() as sink:
-            async with ready_session(store, site) as session:
+            async with ready_session(store, site, accept_table=accept_table) as session:
                 await check_commissioned(session.controller, store, site)
                 said.append(await check_level(session.controller, store, site))
                 against = await reasons_now(session, store, site, proposal)
@@ -77,25 +78,30 @@ def rollback(
             "--to", metavar="PUSH", help="To what was in force when this push had ended; 0: before the first.", show_default=False
         ),
     ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask: the machine is unverified afterwards, and I want that.")] = False,
 ) -> None:
-    """Make the table active again that was in force before the last kept push: by a person's order, without measuring."""
+    """Make the table active again that was in force before the last kept push: by a person's order, without measuring. Asks first."""
     from dataclasses import replace
 
     from service.cli.running import run_job
     from service.config import load_machine
     from service.devices.session import DeviceUrls
+    from service.errors import ConfigError
     from service.push.book import read_entries
     from service.push.states import TERMINAL
     from service.site import site_of
     from service.storage.store import Store
     from service.workflows.rollback import rollback as work_rollback
+    from service.workflows.verified_by import measure_now
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> Back | str | None:
-        last = read_entries(store, site.name)[-1:]
+        last = read_entries(store, site.name, site.control)[-1:]
         finished = bool(last) and last[0].state not in TERMINAL
+        if not (finished and to is None) and not yes and not await _asked(to):
+            raise ConfigError("nothing was taken back", "say yes, or add --yes where nobody is at the console")
         async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
             if finished and to is None:
                 return f"push {last[0].push} was open and is finished; to go further back, say so again"
@@ -109,3 +115,12 @@ def rollback(
         typer.echo(found)
     else:
         typer.echo(f"in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}")
+        typer.echo(f"the machine is unverified now: {measure_now(str(machine))}")
+
+
+async def _asked(to: int | None) -> bool:
+    """Whether the person at the console wants the table of before; nobody there: no."""
+    from service.cli.ask import console_confirm
+
+    which = {None: "from before the last kept push", 0: "from before the first push"}.get(to, f"that was in force after push {to}")
+    return await console_confirm(f"The table {which} comes back without a measurement, and the machine is unverified then. Really?")

@@ -15,19 +15,29 @@ def check_config(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Machine file (TOML).", show_default=False)],
     as_json: JsonOption = False,
 ) -> None:
-    """Check a machine file and print its effective values and where each comes from."""
+    """Check a machine file and print its effective values and where each comes from; exit code 2 where something cannot work."""
+    from service.clock import SystemClock
     from service.config import load_machine
-    from service.secrets import mask_secrets
+    from service.errors import ConfigError
+    from service.secrets import mask_secrets, visible
+    from service.workflows.plausible import doubts
 
     loaded = load_machine(file)
+    found = doubts(loaded.machine, loaded.path.resolve().parent, SystemClock().utc().date())
     database = mask_secrets(loaded.database_url)
     if as_json:
         values = {key: {"value": value, "origin": origin} for key, value, origin in loaded.values()}
-        print_json({"file": str(file), "database": database, "values": values})
-        return
+        said = {"good": found.good, "errors": found.errors, "warnings": found.warnings}
+        print_json({"file": str(file), "database": database, "values": values} | said)
+        raise typer.Exit(2 if found.errors else 0)
     rows = [(key, "-" if value is None else json.dumps(value, ensure_ascii=False), origin) for key, value, origin in loaded.values()]
-    print_table(("key", "value", "from"), rows, title=f"{file} is good")
+    print_table(("key", "value", "from"), rows, title=f"{file} is good" if found.good else str(file))
     typer.echo(f"database: {database}")
+    for line in found.warnings:
+        typer.echo(f"warning: {visible(line)}", err=True)
+    for line in found.errors:
+        typer.echo(f"error {ConfigError.code}: {visible(line)}", err=True)
+    raise typer.Exit(2 if found.errors else 0)
 
 
 def schema(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")] = Path("docs/schemas")) -> None:

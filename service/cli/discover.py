@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import DbOption, MachineOption, database_url, open_store
+from service.cli.measure import AcceptTable
 from service.cli.solve import stored_campaign
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from service.workflows.discover_live import Added
 
 
-def discover(
+def discover(  # noqa: PLR0913 - one argument for each option
     campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
     json_file: Annotated[
         Path | None,
@@ -33,6 +34,7 @@ def discover(
     machine: MachineOption = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
     live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine of --machine, and go on.")] = False,
+    accept_table: AcceptTable = False,
 ) -> None:
     """Find where measurement and simulation disagree, and name the missing effect: size, what to do, what else it could be, what next.
 
@@ -45,7 +47,7 @@ def discover(
         job, journal = _started(found, store)
         finding = _searched(job, journal)
         if live and store is not None and machine is not None:
-            job, journal, finding = _gone_on(store, machine, (job, journal, finding))
+            job, journal, finding = _gone_on(store, machine, (job, journal, finding), accept_table=accept_table)
         _written(job, journal, finding, json_file, report)
     if json_file is not None and str(json_file) == "-":
         return
@@ -97,7 +99,9 @@ def _live_needs(campaign: str, machine: Path | None) -> None:
         raise ConfigError("--live goes on with a campaign of the store, not with a folder", "measure it with `abbe measure`")
 
 
-def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]]) -> tuple[Job, Journal, dict[str, Any]]:
+def _gone_on(
+    store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]], *, accept_table: bool = False
+) -> tuple[Job, Journal, dict[str, Any]]:
     """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is done twice."""
     from datetime import timedelta
 
@@ -123,7 +127,8 @@ def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]
             typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe runs on this machine by itself")
             break
         what = added(store, job.campaign, wanted.plan, wanted.after_s)
-        wait_s = _measured(store, site, job.campaign, what)
+        wait_s = _measured(store, site, job.campaign, what, accept_table=accept_table)
+        accept_table = accept_table and what.left is None  # the person has looked at the table of now, not at one that comes later
         if wait_s > 0.0:
             start = SystemClock().utc() + timedelta(seconds=wait_s + 1.0)
             what_for = ", ".join(test["adds"])
@@ -134,7 +139,7 @@ def _gone_on(store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]
     return job, journal, finding
 
 
-def _measured(store: Store, site: Site, campaign: Campaign, what: Added) -> float:
+def _measured(store: Store, site: Site, campaign: Campaign, what: Added, *, accept_table: bool) -> float:
     """What is left of an added measurement, run on the machine; stopped, it says what is kept. Gives the seconds to wait, or 0."""
     from service.cli.measure import ready_session
     from service.cli.progress import display
@@ -149,7 +154,7 @@ def _measured(store: Store, site: Site, campaign: Campaign, what: Added) -> floa
 
     async def work() -> float:
         with display() as sink:
-            async with ready_session(store, site) as session:
+            async with ready_session(store, site, accept_table=accept_table) as session:
                 return await measure_added(session, store, site, campaign, what, sink)
 
     try:

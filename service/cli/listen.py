@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.measure import MachineArgument, ready_session
+from service.cli.measure import AcceptTable, MachineArgument, ready_session
 
 if TYPE_CHECKING:
     from service.storage.store import Store
@@ -18,6 +18,7 @@ def listen(
     machine: MachineArgument,
     recipe: Annotated[Path, typer.Option(metavar="FILE.toml", help="The recipe that the NC program was written from; laser tests.")],
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
+    accept_table: AcceptTable = False,
 ) -> None:
     """Listen to the laser while the operator runs the NC program of a recipe; its standstills become the readings."""
     from service.cli.running import run_job
@@ -37,7 +38,7 @@ def listen(
     plan = replace(paced(plan, site.max_feed_mm_min), name=name or f"{title} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
 
     async def work(store: Store) -> None:
-        async with ready_session(store, site) as session:
+        async with ready_session(store, site, accept_table=accept_table) as session:
             await listen_campaign.listen(session, store, site, plan, lambda text: typer.echo(text))
 
     with Store.open(loaded.database_url) as store:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import asynccontextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from models.machine import Machine
+    from service.config import Loaded
+    from service.config_schema import MachineFile
     from service.devices.session import Session
     from service.events import ProgressSink
     from service.sequences.control import Control
@@ -21,6 +24,10 @@ if TYPE_CHECKING:
     from service.storage.store import Store
 
 MachineArgument = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")]
+AcceptTable = Annotated[
+    bool,
+    typer.Option("--accept-table", help="I have looked: the table in force, which this database did not push, is right."),
+]
 RECIPES = "identification, verification, quick-check"
 
 
@@ -39,6 +46,7 @@ def measure(  # noqa: PLR0913 - one argument for each option
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where --nc writes.")] = None,
     resume: Annotated[str, typer.Option(help="Go on with this campaign, which was broken off; its recipe is known.")] = "",
     untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: nobody has touched what is mounted.")] = False,
+    accept_table: AcceptTable = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
     from service.cli.rehearse import Rehearsal
@@ -65,16 +73,74 @@ def measure(  # noqa: PLR0913 - one argument for each option
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     if instead:
         rehearsal.run(site, plan, runs)
+    if not nc:
+        _said_before(loaded, site, plan, dry=bool(instead))
+    if instead:
+        warn_of_open_push(loaded.database_url, site)
         return
-    control = Control()
+    control, by_hand = Control(), ByHand(resume=bool(resume), untouched=untouched, accept_table=accept_table)
+    begun_s = SystemClock().monotonic_s()
     with Store.open(loaded.database_url) as store:
-        run_job(_measured(store, site, plan, control, source, resume=bool(resume), untouched=untouched), control)
-    typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
+        run_job(_measured(store, site, plan, control, source, by_hand), control)
+        typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
+        if source["recipe"] in CHECKS and not source["helix"]:
+            typer.echo(_check(store, loaded.machine, plan.name, str(source["recipe"]), begun_s))
 
 
-async def _measured(
-    store: Store, site: Site, plan: CampaignPlan, control: Control, source: dict[str, Any], *, resume: bool, untouched: bool
-) -> None:
+CHECKS = ("quick-check", "verification")
+"""Shipped recipes that end with a verdict, as those of a schedule do."""
+
+
+def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_s: float) -> str:
+    """Judge what was measured and store it as a check of the machine, which began with its campaign: a word for the table came before."""
+    from datetime import datetime
+
+    from service.clock import SystemClock
+    from service.errors import MeasurementFault
+    from service.runs.columns import load_run
+    from service.scheduler.record import Occasion, found
+    from service.scheduler.slots import Schedule
+    from service.workflows.check import judged
+
+    record = store.campaign(campaign)
+    started = datetime.fromisoformat(record.created_utc)
+    runs = [load_run(store, run.id) for run in store.runs(record.id) if run.visible_status == "complete"]
+    try:
+        result = judged(config, runs, campaign, started, SystemClock().monotonic_s() - begun_s)
+    except MeasurementFault as fault:
+        return f"not judged: {fault.detail}"
+    doc = found(Occasion(config.name, Schedule("by hand", "", "UTC", recipe), started), result)
+    number = store.add_verification(record.machine_id, record.id, str(doc["verdict"]), doc)
+    return f"check {number}: {result.verdict}: {result.text}"
+
+
+def _said_before(loaded: Loaded, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
+    """What the machine file lacks for this plan is refused; an expired certificate and a timetable that cannot be kept are told.
+
+    With a controller `measure` refuses it, after what an interrupted push left there is taken back.
+    """
+    from service.clock import SystemClock
+    from service.sequences.needed import check_configured, needed_by
+    from service.workflows.plausible import certificates, unattended
+
+    needed = needed_by(plan, air=site.watching.air_c is not None)
+    if dry or site.urls.cnc is None:
+        check_configured(needed, site.urls.named())
+    today = SystemClock().utc().date()
+    for line in (*certificates(site, today, needed.first), *unattended(loaded.machine, site, loaded.path.resolve().parent)):
+        typer.echo(f"warning: {line}", err=True)
+
+
+@dataclass(frozen=True, slots=True)
+class ByHand:
+    """What the person at the console has said: go on with a campaign, nothing was touched, the strange table in force is right."""
+
+    resume: bool
+    untouched: bool
+    accept_table: bool
+
+
+async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: dict[str, Any], said: ByHand) -> None:
     """The measurement itself, from the beginning or from where it was broken off."""
     from service.cli.ask import console_confirm
     from service.cli.progress import display
@@ -88,9 +154,9 @@ async def _measured(
     async def ask(text: str) -> bool:
         return await control.unless_stopped(console_confirm(text))  # the first Ctrl-C ends the question, too
 
-    confirm = yes if untouched else ask
-    async with ready_session(store, site) as session:
-        found = await find(session, store, site, plan, plan.name, confirm) if resume else None
+    confirm = yes if said.untouched else ask
+    async with ready_session(store, site, accept_table=said.accept_table) as session:
+        found = await find(session, store, site, plan, plan.name, confirm) if said.resume else None
         for line in found.said if found is not None else ():
             typer.echo(line, err=True)
         with display() as sink:
@@ -119,6 +185,7 @@ def correct(
     wait_s: Annotated[
         float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
     ] = 600.0,
+    accept_table: AcceptTable = False,
 ) -> None:
     """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
     from service.cli.running import run_job
@@ -144,7 +211,7 @@ def correct(
 
         store.campaign(campaign)
         with display() as sink:
-            async with ready_session(store, site) as session:
+            async with ready_session(store, site, accept_table=accept_table) as session:
                 await check_commissioned(session.controller, store, site)
                 said.append(await check_level(session.controller, store, site))
                 runs = await verification_before(session, store, site, before, sink)
@@ -182,25 +249,48 @@ async def verification_before(session: Session, store: Store, site: Site, campai
 
 
 @asynccontextmanager
-async def ready_session(store: Store, site: Site) -> AsyncIterator[Session]:
-    """The machine's devices, after what an interrupted push may have left active was taken back: nothing is measured with it."""
-    from service.cli.ask import console_ask
+async def ready_session(store: Store, site: Site, *, accept_table: bool = False) -> AsyncIterator[Session]:
+    """The machine's devices, after what an interrupted push may have left active was taken back: nothing is measured with it.
+
+    ``accept_table``: the person at the console vouches for a table in force that this database did not push.
+    """
+    from service.cli.ask import whoever_is_there
     from service.devices.alone import alone
-    from service.devices.session import open_session
-    from service.workflows.recover import recover
+    from service.workflows.proposals import by_whom
+    from service.workflows.recovered import recovered_session
+
+    def told(text: str) -> None:
+        typer.echo(text, err=True)
 
     with alone(site.urls.cnc):
-        async with open_session(site.urls, console_ask) as session:
-            said = await recover(session.controller, store, site)
-            if said is not None:
-                typer.echo(said, err=True)
+        accept_by = by_whom() if accept_table else ""
+        async with recovered_session(store, site, ask=whoever_is_there(), accept_by=accept_by, told=told) as session:
             yield session
+
+
+def warn_of_open_push(url: str, site: Site) -> None:
+    """Without a connection: say on standard error what the journals know of a push that has not come to its end, into this control, or into
+    another one that may be this one under another address (`open_pushes`).
+    """
+    from service.cli.common import open_store
+    from service.errors import StoreError
+    from service.workflows.push_word import open_pushes
+
+    try:
+        store = open_store(url)
+    except StoreError:  # no database yet: there is no journal
+        return
+    with store:
+        said = open_pushes(store, site.name, site.control)
+    for line in said:
+        typer.echo(f"warning: {line}", err=True)
 
 
 def _plan(machine: Machine, source: dict[str, Any]) -> CampaignPlan:
     """The campaign, named after its recipe."""
     from service.errors import ConfigError
     from service.sequences.campaigns import identification, quick_check, verification
+    from service.sequences.recipe_file import parse_recipe, recipe_text
     from service.sequences.recipes import Helix
     from service.sequences.steps import CampaignPlan
 
@@ -209,14 +299,16 @@ def _plan(machine: Machine, source: dict[str, Any]) -> CampaignPlan:
         raise ConfigError(f"rate {rate_hz} Hz does not divide 1000", "use 1000, 500, 250, 200, 125, 100, 50 ...")
     if helix:
         try:
-            x, y, z, radius = (float(v) for v in helix.split(","))
+            x, y, z, radius = numbers = tuple(float(v) for v in helix.split(","))
+            if not all(map(math.isfinite, numbers)):
+                raise ValueError(helix)
         except ValueError:
             raise ConfigError(f"--helix {helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
-        return CampaignPlan("helix", (Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz).plan(machine),))
+        wanted = Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz)
+        recipe_text("helix", (wanted,))  # what no recipe file may say is refused here, too
+        return CampaignPlan("helix", (wanted.plan(machine),))
     plans = {"identification": identification, "verification": verification, "quick-check": quick_check}
     if source.get("text") is not None:
-        from service.sequences.recipe_file import parse_recipe
-
         name, recipes = parse_recipe(str(source["text"]), recipe)
         return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
     if recipe not in plans:

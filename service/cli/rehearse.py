@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +14,10 @@ if TYPE_CHECKING:
     from service.sequences.check import DryRun
     from service.sequences.steps import CampaignPlan
     from service.site import Site
+
+
+HAIR = 1e-6
+"""mm; a position that is whole but for the arithmetic is whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,15 +82,37 @@ def print_path(plan: CampaignPlan) -> None:
             typer.echo(f"{test.label},{x:.5f},{y:.5f},{z:.5f}")
 
 
+HEADINGS = ("test", "kind", "s", "mm", "X", "Y", "Z", "mm/min", "points")
+NAMES = 2
+"""So many columns hold names, which fold; the others hold numbers, which stay whole however narrow the terminal is."""
+NARROWEST = 8
+
+
 def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
     """One line a test: time, path, extent, largest speed, readings."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=f"{name}: {sum(r.duration_s for r in runs) / 60:.1f} min of machine time, mounting not counted")
-    for column in ("test", "kind", "s", "path mm", "X", "Y", "Z", "mm/min", "readings"):
-        table.add_column(column, justify="left" if column in ("test", "kind") else "right")
-    for r in runs:
-        extent = [f"{r.lowest_mm[a]:.0f}..{r.highest_mm[a]:.0f}" for a in range(3)]
-        table.add_row(r.label, r.test, f"{r.duration_s:.0f}", f"{r.path_mm:.0f}", *extent, f"{r.fastest_mm_min:.0f}", str(r.readings))
-    Console().print(table)
+    rows = [
+        (r.label, r.test, f"{r.duration_s:.0f}", f"{r.path_mm:.0f}", *_extent(r), f"{r.fastest_mm_min:.0f}", str(r.readings)) for r in runs
+    ]
+    widths = [max(map(len, column)) for column in zip(HEADINGS, *rows, strict=True)]
+    gap = 2
+    least = sum(widths[NAMES:]) + NAMES * NARROWEST + gap * len(HEADINGS)
+    wide = Console().width if sys.stdout.isatty() else sum(widths) + gap * len(HEADINGS)
+    table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False)
+    for k, (heading, width) in enumerate(zip(HEADINGS, widths, strict=True)):
+        if k < NAMES:
+            table.add_column(heading, overflow="fold", min_width=min(NARROWEST, width))
+        else:
+            table.add_column(heading, justify="right", no_wrap=True, min_width=width)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    typer.echo(f"{name}: {sum(r.duration_s for r in runs) / 60:.1f} min of machine time, mounting not counted; X, Y, Z in mm")
+    Console(highlight=False, width=max(wide, least)).print(table)
+
+
+def _extent(run: DryRun) -> tuple[str, ...]:
+    """Lowest and highest position of each axis, rounded outwards to whole mm."""
+    return tuple(f"{math.floor(lo + HAIR)}..{math.ceil(hi - HAIR)}" for lo, hi in zip(run.lowest_mm, run.highest_mm, strict=True))

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from service.plant.opcua.setup import OpcUaSetup
     from service.scheduler.desk import Duties
     from service.scheduler.ports import Check, CheckResult
-    from service.scheduler.slots import Schedule
     from service.scheduler.store import ServiceStore
     from service.sequences.control import Control
     from service.sequences.steps import CampaignPlan
@@ -71,9 +70,11 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     Raises
     ------
     AbbeError
-        A schedule names no recipe, or its paths leave the machine's strokes: better now than at the first slot, at night.
+        A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: better now than at
+        the first slot, at night.
     """
     from service.capture.live import LiveFeed
+    from service.clock import SystemClock
     from service.core.setup import Setup
     from service.mqtt.topics import Topics
     from service.scheduler.ready import Ready, look_at
@@ -85,10 +86,12 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     from service.workflows.check import run_check
     from service.workflows.in_force import look_at_table
     from service.workflows.investigate import campaign_plan
+    from service.workflows.plausible import check_unattended, doubts
     from service.workflows.report import rules_of
     from service.workflows.shipped import RECIPES
 
     config = loaded.machine
+    check_unattended(config, loaded.path.resolve().parent)
     site, live = site_of(config), LiveFeed()
 
     def check_on(store: ServiceStore) -> Check:
@@ -105,7 +108,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         machine=config.name,
         doc=site.doc,
         devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
-        schedules=_measurable(schedules_of(config), site),
+        schedules=schedules_of(config),
         store_url=loaded.database_url,
         broker=_broker(loaded),
         topics=Topics(config.mqtt.topic_prefix, config.name),
@@ -121,6 +124,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         recipes=tuple(name for name in sorted(RECIPES) if _fits(name, site)),
         recover=lambda store: lambda: recover_at_start(store, site),
         behind_tls=config.web.behind_tls,
+        page_memory_mb=config.web.memory_mb,
         rules=rules_of(config),
         duties=duties_on(config.alarm, site, plan, live=live),
         table=(lambda store: look_at_table(site, store)) if config.alarm.watch_table else None,
@@ -129,6 +133,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         hands=None if site.urls.cnc is None else hands_on(config.alarm, site),
         campaigns=_campaigns(config.alarm.campaign, site, folder),
         campaign=None if site.urls.cnc is None else campaign_on(site, folder, live),
+        doubts=doubts(config, folder, SystemClock().utc().date()).warnings,
     )
 
 
@@ -254,21 +259,11 @@ def _beside(machine_file: Path, name: str) -> str:
 
 def _fits(recipe: str, site: Site) -> bool:
     """Whether a recipe can be offered on this machine at all: its paths lie inside the strokes."""
-    try:
-        _dry_run(recipe, site)
-    except AbbeError:
-        return False
-    return True
-
-
-def _dry_run(recipe: str, site: Site) -> None:
     from service.sequences.check import dry_run_campaign
     from service.workflows.shipped import recipe_plan
 
-    dry_run_campaign(site.machine, recipe_plan(recipe, site.machine), site.max_feed_mm_min)
-
-
-def _measurable(schedules: tuple[Schedule, ...], site: Site) -> tuple[Schedule, ...]:
-    for schedule in schedules:
-        _dry_run(schedule.recipe, site)
-    return schedules
+    try:
+        dry_run_campaign(site.machine, recipe_plan(recipe, site.machine), site.max_feed_mm_min)
+    except AbbeError:
+        return False
+    return True

@@ -40,6 +40,7 @@ def show(
     """Show one run: state, setup and what its columns hold (--json: as an exchange file). Or a campaign: runs and incidents."""
     from service.cli.show_campaign import show_campaign
     from service.runs.columns import run_document, whole_document
+    from service.runs.coverage import not_judged, with_state
     from service.storage.records import RunRecord
 
     with open_store(database_url(db, machine)) as store:
@@ -48,12 +49,15 @@ def show(
             show_campaign(store, record, as_json=as_json)
             return
         chunks = store.chunks(record.id)
-        document = whole_document(store, record) if record.visible_status == "complete" else run_document(record, chunks)
+        document = (
+            whole_document(store, record) if record.visible_status == "complete" else with_state(run_document(record, chunks), record)
+        )
     if as_json:
         print_json(document)
         return
     pieces = (document.get("timing") or {}).get("pieces", [])
     told = {"pieces": ", ".join(f"{one['readings']} of {one['run']}" for one in pieces) + " and its own"} if pieces else {}
+    told |= {"judged": why} if (why := not_judged(document)) else {}
     setup = {f"setup.{key}": value for key, value in document["setup"].items()}
     print_table(
         ("key", "value"),

@@ -42,8 +42,14 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         str, typer.Argument(help="Campaign in the database, or a folder with campaign.json. Runs with the role identify are used.")
     ],
     model: Annotated[
-        ModelName, typer.Option("--model", help="Three scales and three squareness; 21 error motions; or what held-out runs ask for.")
-    ] = ModelName.rigid21,
+        ModelName | None,
+        typer.Option(
+            "--model",
+            help="Three scales and three squareness; 21 error motions; or what held-out runs ask for. "
+            "Default: rigid21, or rigid6 where there are too few readings for it.",
+            show_default=False,
+        ),
+    ] = None,
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -94,7 +100,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 class _Wanted:
     """What was asked for beside the solution itself."""
 
-    model: ModelName
+    model: ModelName | None
     tables: bool
     grid: Path | None
     nodes: int
@@ -132,7 +138,7 @@ def _solved(campaign: Campaign, wanted: _Wanted) -> tuple[Account, dict[str, Any
         def say(text: str) -> None:
             sink(Progress("solve", float(next(stages, STAGES - 1)), float(STAGES), None, text))
 
-        solved = solve_runs(campaign.site, campaign.runs, model=wanted.model.value, say=say)
+        solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, say=say)
         say("what these runs cannot tell, and how well the volume is known")
         told = account(solved)
         doc = {"campaign": campaign.name, "machine": campaign.site.doc} | solution_doc(told) | _more(told, wanted, say)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from types import FrameType
 from typing import Any
 
 import typer
+
+from service.children import python_words
 
 SIM_SETTINGS: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Everything after ``sim`` belongs to the simulators, ``--help`` included."""
@@ -28,7 +29,7 @@ def version() -> None:
 
 
 def sim(context: typer.Context) -> None:
-    """Run the simulated machine and its instruments; arguments go to `python -m simulators`."""
+    """Run the simulated machine and its instruments; arguments go to the module `simulators`."""
     # A group of its own: Ctrl-C reaches the child once, from here, and not a second time from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
     words = list(context.args)
@@ -36,7 +37,7 @@ def sim(context: typer.Context) -> None:
         # The child ends when this pipe closes: not even SIGKILL of this process leaves it behind.
         words.append("--watch-stdin")
         own_group["stdin"] = subprocess.PIPE
-    child = subprocess.Popen([sys.executable, "-m", "simulators", *words], **own_group)  # noqa: S603 - our own package
+    child = subprocess.Popen(python_words("simulators", *words), **own_group)  # noqa: S603 - our own package
 
     def forward(number: int, _frame: FrameType | None) -> None:
         if child.poll() is None:

@@ -13,12 +13,15 @@ def accept_table(
     machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
     yes: Annotated[bool, typer.Option("--yes", help="I have looked at the controller: its active table is right.")] = False,
 ) -> None:
-    """After an interrupted push that Abbe could not clear up: say that the active table is right, so that work can go on."""
+    """Say that the active table is right, so that work can go on: after an interrupted push that Abbe could not clear up, under whatever
+    name it was begun, or where this database did not push the table. Who and when is kept in the push journal.
+    """
     from service.config import load_machine
     from service.devices.session import DeviceUrls, open_session
     from service.errors import ConfigError
     from service.site import site_of
     from service.storage.store import Store
+    from service.workflows.proposals import by_whom
     from service.workflows.recover import accept
 
     if not yes:
@@ -28,7 +31,7 @@ def accept_table(
 
     async def work(store: Store) -> str:
         async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
-            return await accept(session.controller, store, site)
+            return await accept(session.controller, store, site, by_whom())
 
     with Store.open(loaded.database_url) as store:
         typer.echo(asyncio.run(work(store)))

@@ -27,18 +27,24 @@ def trend(
     """Trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
     from service.cli.common import open_store
     from service.config import load_machine
+    from service.devices.urls import control_of
     from service.scheduler.store import ServiceStore
-    from service.workflows.alarms import series_begins
     from service.workflows.trend_table import HEADINGS, as_doc, row, trends
+    from service.workflows.verified_by import measure_now, verified_by
 
     loaded = load_machine(machine)
     since = _moment(after)
     open_store(loaded.database_url).close()  # a missing file is one line, and none is made
     with ServiceStore.open(loaded.database_url) as store:
-        since = since or series_begins(store, loaded.machine.name)
-        found = trends(store.verifications_of(loaded.machine.name, limit=100_000), since)
+        known = verified_by(store, loaded.machine.name, control=control_of(loaded.machine.devices.cnc))
+        found = trends(store.verifications_of(loaded.machine.name, limit=100_000), since or known.since)
     if as_json:
-        print_json(as_doc(loaded.machine.name, found))
+        print_json(as_doc(loaded.machine.name, found) | {"verified": known.as_doc()})
+        return
+    if not known.holds:
+        typer.echo(f"{known.text}: {measure_now(str(machine))}" if known.state == "unverified" else known.text)
+    if not found and known.changes:
+        typer.echo(f"no check of {loaded.machine.name} has figures since the table in force came: --after shows those before it")
         return
     if not found:
         typer.echo(f"no check of {loaded.machine.name} has figures yet: abbe serve, or abbe serve --once")

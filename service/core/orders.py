@@ -77,12 +77,15 @@ class _Task:
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Where orders are carried out: the machine's name, who may (``await may(who)``), the audit, and who watches jobs."""
+    """Where orders are carried out: the machine's name, who may (``await may(who)``), the audit, who watches jobs, and the identity
+    of the machine's control.
+    """
 
     machine: str
     may: Callable[[str], Awaitable[bool]]
     audit: AuditBook
     watchers: Sequence[JobWatcher] = ()
+    control: str = ""
 
 
 class Orders(Patient):
@@ -113,7 +116,7 @@ class Orders(Patient):
         if refused is not None:
             return refused
         try:
-            now = await asyncio.to_thread(offered, self._store, self._ground.machine)
+            now = await asyncio.to_thread(offered, self._store, self._ground.machine, self._ground.control)
         except TableRefused as no:
             return _answer(asked.request, "conflict", str(no))
         if (now.push, now.crc) != (asked.push, asked.crc):

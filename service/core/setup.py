@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.capture.live import LiveFeed
-from service.channel.messages import MachineTold
+from service.channel.messages import PAGE_MEMORY_MB, MachineTold
 from service.clock import Clock
 from service.core.campaigns import MeasureCampaign
 from service.core.open_ends import Recover
 from service.core.orders import Hands
+from service.devices.urls import control_of
 from service.mqtt.broker import Broker
 from service.mqtt.topics import Topics
 from service.plant.opcua.setup import OpcUaSetup
@@ -77,6 +78,8 @@ class Setup:
         What the page calculates dry runs from.
     hands : callable, optional
         Given the open store, what a person can order of tables; None: nothing.
+    page_memory_mb : int
+        Most that the page's process gets, MiB.
     campaigns : tuple of str
         Full campaigns that a person may start, if ``campaign`` is there.
     campaign : callable, optional
@@ -108,5 +111,13 @@ class Setup:
     live: LiveFeed | None = None
     told: MachineTold | None = None
     hands: Callable[[ServiceStore], Hands] | None = None
+    page_memory_mb: int = PAGE_MEMORY_MB
     campaigns: tuple[str, ...] = ()
     campaign: Callable[[ServiceStore], MeasureCampaign] | None = None
+    doubts: tuple[str, ...] = ()
+    """What the machine file says that is possible and rarely meant: logged once the service serves."""
+
+    @property
+    def control(self) -> str:
+        """Identity of the machine's control (`control_of`); empty where there is none."""
+        return control_of(self.devices.get("cnc"))

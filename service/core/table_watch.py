@@ -1,4 +1,4 @@
-"""Somebody else changed the table in force: seen within seconds, told once, shown until a person has looked.
+"""The table in force is not one that Abbe brought and verified: seen within seconds, told once, shown until a person has looked.
 
 Modbus asks nobody for a password: whoever is in the machine's network can put any table into force. Nothing here writes to the
 controller or takes anything back: which table is right is a person's word (``abbe accept-table``).
@@ -15,16 +15,17 @@ from service.clock import Clock
 from service.errors import AbbeError
 from service.scheduler.loop import Alarms
 from service.workflows.in_force import InForce, LookAtTable
+from service.workflows.table_gate import STRANGE as STRANGE_TABLE
+from service.workflows.verified_by import STRANGE
 
 log = structlog.get_logger("abbe.table")
 
 LOOK_S = 10.0
 AGAIN_S = 1.0
 """A first difference is looked at once more after this: a push of another process may have ended between both readings."""
-CODE = "CMP-010"
-NOBODY_PUSHED = "look at the controller; if its table is right, start the service again"
-"""Without a push in the journal there is nothing to accept and nothing to go back to: the first look of a service is what counts."""
-REMEDY = "find out who wrote it; if the table is right: abbe accept-table MACHINE.toml; else: abbe comp rollback or a new push"
+CODE = STRANGE
+REMEDY = "find out who wrote it; restore the right table at the controller, or, if this one is right: abbe accept-table MACHINE.toml"
+"""Neither a rollback nor a push: both are refused while such a table is in force (`service.workflows.table_gate`)."""
 
 
 class TableWatch:
@@ -50,7 +51,7 @@ class TableWatch:
         self._look, self._alarms, self._attention = look, alarms, attention
         self._clock, self._changed = clock, changed
         self._first: int | None = None
-        """CRC that stands for the journal's while there is none: that of the first look."""
+        """CRC that stands for the journal's while there is none: that of the first look at a table with which nothing was wrong."""
         self._told: tuple[int, str] | None = None
 
     async def run(self) -> None:
@@ -70,26 +71,32 @@ class TableWatch:
             seen = await self._look()
         except (AbbeError, DriverError, OSError):  # in use, out of reach, restarting: the next look is soon
             return None
-        if seen.wanted is None and self._first is None:
+        if seen.wanted is None and self._first is None and not seen.strange and not seen.unverified:
             self._first = seen.crc
         return seen if seen.settled else None
 
-    def _strange(self, seen: InForce) -> bool:
+    def _strange(self, seen: InForce) -> str:
+        """What is wrong with the table in force; empty: nothing."""
         wanted = seen.wanted if seen.wanted is not None else self._first
-        return seen.crc != wanted
+        here = f"bank {seen.bank} has CRC {seen.crc:08X}"
+        whose = f"that of {seen.unverified}, which was never verified" if seen.unverified else ""
+        if wanted is not None and seen.crc != wanted:
+            text = f"somebody else changed the compensation in force: {here}, expected is {wanted:08X}"
+            return f"{text}; it is {whose}" if whose else text
+        if whose:
+            return f"the compensation in force is unverified: {here}, {whose}"
+        return f"{STRANGE_TABLE} is in force: {here}" if seen.strange else ""
 
     async def _judge(self, seen: InForce) -> None:
-        if not self._strange(seen):
+        text = self._strange(seen)
+        if not text:
             self._show(None)
             return
         if self._told is not None and self._told[0] == seen.crc:
             return
-        wanted = seen.wanted if seen.wanted is not None else self._first
-        text = f"somebody else changed the compensation in force: bank {seen.bank} has CRC {seen.crc:08X}, expected is {wanted:08X}"
-        log.error("the table in force is not ours", bank=seen.bank, crc=f"{seen.crc:08X}", wanted=f"{wanted:08X}")
-        remedy = REMEDY if seen.wanted is not None else NOBODY_PUSHED
-        self._show((seen.crc, f"{CODE}: {text} - {remedy}"))
-        await self._alarms.alarm({"code": CODE, "what": text, "remedy": remedy, "at_utc": self._clock.utc().isoformat()})
+        log.error("the table in force is not ours", bank=seen.bank, crc=f"{seen.crc:08X}", why=text)
+        self._show((seen.crc, f"{CODE}: {text} - {REMEDY}"))
+        await self._alarms.alarm({"code": CODE, "what": text, "remedy": REMEDY, "at_utc": self._clock.utc().isoformat()})
 
     def _show(self, told: tuple[int, str] | None) -> None:
         if told == self._told:

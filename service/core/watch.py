@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime
 
 from service.clock import Clock
+from service.errors import StoreError
 from service.events import Progress
 from service.mqtt.publisher import Publisher
 from service.scheduler.ports import Doc
 from service.scheduler.slots import Schedule
 from service.web.board import Board
+from service.workflows.verified_by import VerifiedBy
+
+LOOK_S = 5.0
 
 
 class BoardWatch:
@@ -32,6 +38,29 @@ class BoardWatch:
     def job_ended(self, doc: Doc | None) -> None:
         """The check ended."""
         self._board.job_ended(doc)
+        self._changed()
+
+
+class VerifiedWatch:
+    """Looks what measured the table in force, and tells the broker and the page when that has changed: any process may roll back."""
+
+    def __init__(self, look: Callable[[], VerifiedBy], publisher: Publisher | None, clock: Clock, changed: Callable[[], None]) -> None:
+        self._look, self._publisher, self._clock, self._changed = look, publisher, clock, changed
+        self._told: VerifiedBy | None = None
+
+    async def run(self) -> None:
+        """Look for ever. A database that does not answer is asked again."""
+        while True:
+            with suppress(StoreError):
+                self._tell(await asyncio.to_thread(self._look))
+            await self._clock.sleep(LOOK_S)
+
+    def _tell(self, known: VerifiedBy) -> None:
+        if known == self._told:
+            return
+        self._told = known
+        if self._publisher is not None:
+            self._publisher.set_verified(known.as_doc())
         self._changed()
 
 

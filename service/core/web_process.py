@@ -9,7 +9,6 @@ import asyncio
 import os
 import socket
 import subprocess
-import sys
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
 
@@ -33,8 +32,10 @@ from service.channel.messages import (
     from_web,
 )
 from service.channel.wire import Wire
+from service.children import python_words
 from service.clock import Clock
 from service.core.jobs import JobBook
+from service.core.limits import keep_within
 from service.core.live import show_live
 from service.core.orders import Orders
 from service.errors import AbbeError, ChannelBroken
@@ -151,8 +152,10 @@ class WebProcess:
         # Nothing secret on the command line; and in its environment neither the broker's password nor systemd's address.
         env = {k: v for k, v in os.environ.items() if k in PASSED_ON or not (k.startswith("ABBE_") or k in WITHHELD)}
         ends = (theirs.fileno(), self._listening.fileno())
-        words = (sys.executable, "-m", "service.web.process", *map(str, ends))
-        return await asyncio.create_subprocess_exec(*words, stdin=subprocess.DEVNULL, pass_fds=ends, env=env)
+        words = python_words("service.web.process", *ends)
+        child = await asyncio.create_subprocess_exec(*words, stdin=subprocess.DEVNULL, pass_fds=ends, env=env)
+        keep_within(child.pid, self._begin.memory_mb)
+        return child
 
     async def _end(self, child: asyncio.subprocess.Process) -> None:
         """It has read the end of the channel, and ends by itself; one that does not is killed. It holds nothing that could be lost."""

@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 
+from service.devices.urls import address_of
 from service.errors import MachineInUse, UnsafeToMove
 
 ENVIRONMENT = "ABBE_LOCK_FOLDER"
@@ -46,7 +47,7 @@ def alone(url: str | None) -> Iterator[None]:
     if url is None:
         yield
         return
-    path = lock_folder() / f"{hashlib.sha256(url.partition('?')[0].encode()).hexdigest()[:16]}.lock"
+    path = lock_folder() / f"{hashlib.sha256(address_of(url).encode()).hexdigest()[:16]}.lock"
     try:
         handle = _locked(path)
     except OSError as error:

@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 from drivers import registry
 from drivers.api import BallBar, Controller, DisplacementMeter, Fixture
+from drivers.errors import DriverError
 from service.devices.clock_notes import noted
 from service.devices.urls import DeviceUrls as DeviceUrls
-from service.errors import ConfigError
+from service.errors import AbbeError, ConfigError, DevicesNotReady
 
 Ask = Callable[[str], Awaitable[None]]
+First = Callable[[Controller], Awaitable[None]]
+D = TypeVar("D", Controller, BallBar, DisplacementMeter, Fixture)
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Open devices. A test that needs an absent one is refused by name (`need`)."""
+    """Open devices. A test that needs an absent one is refused by name (`need`).
+
+    ``attended``: somebody is there to answer a question at the console.
+    """
 
     controller: Controller
     ballbar: BallBar | None
     laser: DisplacementMeter | None
     fixture: Fixture | None
+    attended: bool = True
 
     def need_ballbar(self) -> BallBar:
         """The ball-bar, or one clear line that it is not configured."""
@@ -49,8 +57,17 @@ async def no_console(text: str) -> None:
 
 
 @asynccontextmanager
-async def open_session(urls: DeviceUrls, ask: Ask = no_console) -> AsyncIterator[Session]:
+async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First | None = None) -> AsyncIterator[Session]:
     """Open every configured device and identify it; close all of them at the end, whatever happens.
+
+    Parameters
+    ----------
+    urls : DeviceUrls
+        Where they are.
+    ask : callable
+        Asks the person at the console.
+    first : callable, optional
+        Gets the open controller before any other device is opened (`service.workflows.recovered`). What it raises ends it.
 
     Raises
     ------
@@ -58,20 +75,44 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console) -> AsyncIterator
         No controller configured.
     DriverError
         A device cannot be opened or is not what its protocol demands.
+    DevicesNotReady
+        The same of several: all are tried, and told in one line.
     """
     if urls.cnc is None:
         raise ConfigError("no controller configured", "add cnc = ... under [devices] of the machine file")
     async with AsyncExitStack() as stack:
-        controller = noted(await registry.open_controller(urls.cnc))
-        stack.push_async_callback(controller.close)
-        ballbar = laser = fixture = None
-        if urls.ballbar is not None:
-            ballbar = await registry.open_ballbar(urls.ballbar)
-            stack.push_async_callback(ballbar.close)
-        if urls.laser is not None:
-            laser = await registry.open_laser(urls.laser)
-            stack.push_async_callback(laser.close)
-        if urls.fixture is not None:
-            fixture = await registry.open_fixture(urls.fixture, ask)
-            stack.push_async_callback(fixture.close)
-        yield Session(controller, ballbar, laser, fixture)
+        troubles: list[DriverError] = []
+
+        async def opened(device: Awaitable[D]) -> D | None:
+            try:
+                found = await device
+            except DriverError as error:
+                troubles.append(error)
+                return None
+            stack.push_async_callback(found.close)
+            return found
+
+        found = await opened(registry.open_controller(urls.cnc))
+        controller = None if found is None else noted(found)
+        if controller is not None and first is not None:
+            await first(controller)
+        ballbar = None if urls.ballbar is None else await opened(registry.open_ballbar(urls.ballbar))
+        laser = None if urls.laser is None else await opened(registry.open_laser(urls.laser))
+        fixture = None if urls.fixture is None else await opened(registry.open_fixture(urls.fixture, ask))
+        raise_all(troubles)
+        assert controller is not None
+        yield Session(controller, ballbar, laser, fixture, ask is not no_console)
+
+
+def raise_all(troubles: Sequence[AbbeError | DriverError]) -> None:
+    """Raise what is wrong with devices: one error as it is, several as one line.
+
+    Raises
+    ------
+    AbbeError, DriverError
+        As above.
+    """
+    if len(troubles) == 1:
+        raise troubles[0]
+    if troubles:
+        raise DevicesNotReady("; ".join(str(error) for error in troubles), "nothing has moved")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from urllib.parse import parse_qs, urlsplit
+
+UNIT = "1"
+"""Modbus unit of a URL that names none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,3 +17,31 @@ class DeviceUrls:
     ballbar: str | None = None
     laser: str | None = None
     fixture: str | None = None
+
+    def named(self) -> tuple[str, ...]:
+        """Roles that have an address."""
+        return tuple(role for role, url in asdict(self).items() if url is not None)
+
+
+def control_of(url: str | None) -> str:
+    """Which control a URL leads to: its identity for the push journal; empty for no URL.
+
+    The register map has no serial number, and a boot id is gone with the next start, so the address stands for the control: `address_of`,
+    and the Modbus unit where it is not 1, for a gateway has several controls behind one address. A number that the control states itself
+    would take its place here. One control under two addresses (a host name and its IP) is two: docs/decisions/0030-whose-table-it-is.md.
+    """
+    address = address_of(url)
+    unit = parse_qs((url or "").partition("?")[2]).get("unit", [UNIT])[0].strip().lstrip("0") or "0"
+    return address if unit == UNIT or not address else f"{address}?unit={unit}"
+
+
+def address_of(url: str | None) -> str:
+    """Where a URL leads, for the lock of the machine: scheme, host and port (or the path of a line), host in lower case, without the query.
+
+    All units behind one address share one lock.
+    """
+    if not url:
+        return ""
+    plain = url.partition("?")[0]
+    parts = urlsplit(plain)
+    return f"{parts.scheme}://{parts.netloc.lower()}{parts.path.rstrip('/')}" if parts.scheme else plain

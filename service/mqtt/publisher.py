@@ -73,6 +73,7 @@ class Publisher:
         self._on_drop = on_drop
         self._untidy = TIDY_EVERY  # the first look is at the start: an older version kept everything
         self._state: dict[str, Any] = {"state": "online"}
+        self._verified: dict[str, Any] = {}
         self._wake = asyncio.Event()
         self._stopping = asyncio.Event()
         self._pause_s = FIRST_PAUSE_S
@@ -86,6 +87,12 @@ class Publisher:
         """Change the retained state message. Only the latest state matters: it is not queued, but sent again at every connection."""
         self._state = {"state": state, "since_utc": since_utc.isoformat(), **more}
         self._wake.set()
+
+    def set_verified(self, told: dict[str, Any]) -> None:
+        """Change what the state message says of the table in force; it goes with every state but offline."""
+        if told != self._verified:
+            self._verified = told
+            self._wake.set()
 
     def stop(self) -> None:
         """Say offline, if there is a broker to say it to, and let `run` return."""
@@ -157,12 +164,14 @@ class Publisher:
                 await client.publish(self._topics.state, self._state_payload(farewell), qos=1, retain=True, timeout=FAREWELL_S)
 
     async def _tell(self, client: aiomqtt.Client) -> None:
-        told: dict[str, Any] | None = None
+        told: tuple[dict[str, Any], dict[str, Any]] | None = None
         while not self._stopping.is_set():
             self._wake.clear()  # before looking: what is put in while we look wakes us again
-            if self._state is not told:
-                told = self._state
-                await client.publish(self._topics.state, self._state_payload(told), qos=1, retain=True)
+            now = (self._state, self._verified)
+            if told is None or any(a is not b for a, b in zip(now, told, strict=True)):
+                told = now
+                verified = {"verified": now[1]} if now[1] else {}
+                await client.publish(self._topics.state, self._state_payload(now[0] | verified), qos=1, retain=True)
                 self._connected()
             rows = await self._outbox.pending()
             for row in rows:

@@ -96,6 +96,18 @@ class TableInForce:
 
 
 @dataclass(frozen=True, slots=True)
+class Verified:
+    """Which measurement stands behind the table in force: ``verified``, ``unverified`` or ``unknown``, and in words since what.
+
+    ``holds``: whether the verdict of the last check is of the table in force.
+    """
+
+    state: str
+    text: str
+    holds: bool
+
+
+@dataclass(frozen=True, slots=True)
 class DeviceState:
     """A device, and when it was last heard of."""
 
@@ -118,6 +130,14 @@ class Facts:
     alarms: tuple[Alarm, ...]
     devices: tuple[DeviceState, ...]
     table: TableInForce | None = None
+    verified: Verified = Verified("unknown", "", True)
+
+    @property
+    def verdict(self) -> str | None:
+        """Of the last check, where it is of the table in force; else whether anything measured that table. None: no check yet."""
+        if not self.verified.holds:
+            return self.verified.state
+        return self.checks[0].verdict if self.checks else None
 
     @property
     def state(self) -> str:

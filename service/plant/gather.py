@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Protocol
 
-from service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce
+from service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce, Verified
 from service.storage.records import PushEntryRecord, SlotRecord
 
 SHOWN_ALARMS = 20
@@ -21,7 +21,7 @@ class Archive(Protocol):
         """Return the latest slots of a machine that were missed, skipped or interrupted, newest first."""
         ...
 
-    def last_push(self, machine: str, /) -> Sequence[PushEntryRecord]:
+    def last_push(self, machine: str, control: str = "", /) -> Sequence[PushEntryRecord]:
         """Return the journal of the last push of a machine; empty if there was none."""
         ...
 
@@ -37,8 +37,8 @@ class Gatherer:
         Slots and pushes. Without it there are only the alarms of failed checks, and no table.
     """
 
-    def __init__(self, status: Callable[[], Awaitable[Any]], archive: Archive | None = None) -> None:
-        self._status, self._archive = status, archive
+    def __init__(self, status: Callable[[], Awaitable[Any]], archive: Archive | None = None, control: str = "") -> None:
+        self._status, self._archive, self._control = status, archive, control
         self._revision = ""
         self._slow: tuple[tuple[Alarm, ...], TableInForce | None] = ((), None)
 
@@ -63,16 +63,16 @@ class Gatherer:
             now_utc=status.now_utc,
             running=_running(status.job),
             next_utc=min((due.due_utc for due in status.next_due), default=None),
-            checks=tuple(_check(one) for one in status.last),
+            checks=tuple(_check(one) for one in status.last if not one.push or one.verdict == "pass"),  # else of a table not in force
             alarms=tuple(alarms[:SHOWN_ALARMS]),
             devices=tuple(DeviceState(device.role, device.state, device.text, device.at_utc) for device in status.devices),
             table=self._slow[1],
+            verified=_verified(status.verified),
         )
 
-    @staticmethod
-    def _read(archive: Archive, machine: str) -> tuple[tuple[Alarm, ...], TableInForce | None]:
+    def _read(self, archive: Archive, machine: str) -> tuple[tuple[Alarm, ...], TableInForce | None]:
         slots = archive.slots_not_run(machine, SHOWN_ALARMS)
-        return tuple(_slot_alarm(slot) for slot in slots), table_in_force(archive.last_push(machine))
+        return tuple(_slot_alarm(slot) for slot in slots), table_in_force(archive.last_push(machine, self._control))
 
 
 def _running(job: Any) -> Running | None:
@@ -80,6 +80,10 @@ def _running(job: Any) -> Running | None:
         return None
     percent = 100.0 * job.done / job.total if job.total > 0 else None
     return Running(job.schedule, job.recipe, job.since_utc, job.stage, job.message, percent, job.eta_s)
+
+
+def _verified(one: Any) -> Verified:
+    return Verified(one.state, one.text, one.why in ("check", "never"))
 
 
 def _check(one: Any) -> Check:

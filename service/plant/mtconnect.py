@@ -77,13 +77,16 @@ class Agent:
         self._put("msg", now, f"{job.stage}: {job.message}" if job and job.stage else UNAVAILABLE)
         if not facts.checks:
             self._put("result", now, UNAVAILABLE)
-        for check in sorted(facts.checks, key=lambda one: one.number):
+        for check in sorted(facts.checks[1:], key=lambda one: one.number):
             if check.number > self._seen:
-                self._put("result", now, _result(check))
-                self._seen = check.number
+                self._put("result", now, _result(check, check.verdict))
+        if facts.checks:  # an earlier table's verdict is none of the table in force
+            self._put("result", now, _result(facts.checks[0], facts.verdict or ""))
+            self._seen = facts.checks[0].number
         table = facts.table
-        known = (("bank", str(table.bank)), ("crc32", f"{table.crc:08x}"), ("push", str(table.push))) if table else UNAVAILABLE
-        self._put("table", now, known)
+        known = (("bank", str(table.bank)), ("crc32", f"{table.crc:08x}"), ("push", str(table.push))) if table else ()
+        told = (("verified", facts.verified.state), ("verified_text", facts.verified.text)) if facts.verified.text else ()
+        self._put("table", now, (*known, *told) if known else UNAVAILABLE)
         self._put("system", now, *_condition(facts))
 
     def _put(self, item: str, utc: datetime, value: str | Entries, level: str = "", native: str = "") -> None:
@@ -187,9 +190,9 @@ def _write(parent: ET.Element, one: Observation) -> None:
         ET.SubElement(written, "Entry", key=_clean(key).replace(" ", "_")).text = _clean(value)
 
 
-def _result(check: Check) -> Entries:
+def _result(check: Check, verdict: str) -> Entries:
     """Figures with their unit at the end of the key; beside each its expanded uncertainty (k = 2) and its limit."""
-    head = {"number": str(check.number), "verdict": check.verdict, "schedule": check.schedule, "recipe": check.recipe}
+    head = {"number": str(check.number), "verdict": verdict, "schedule": check.schedule, "recipe": check.recipe}
     for figure in check.figures:
         three = {figure.key: figure.value, f"{figure.key}.expanded": figure.expanded, f"{figure.key}.limit": figure.limit}
         head |= {key: repr(float(value)) for key, value in three.items() if value is not None}
@@ -198,6 +201,9 @@ def _result(check: Check) -> Entries:
 
 def _condition(facts: Facts) -> tuple[str, str, str]:
     """Text, level and code of what the last check says of the machine."""
+    if not facts.verified.holds:
+        code = facts.verified.state
+        return ("", "Normal", "") if code == "verified" else (facts.verified.text, "Warning", code)
     if not facts.checks:
         return "", "Unavailable", ""
     last = facts.checks[0]

@@ -6,7 +6,7 @@ import asyncio
 
 from service.clock import Clock
 from service.errors import UnsafeToMove
-from service.push.entries import GENESIS, Doc, Entry, Journal, follow
+from service.push.entries import GENESIS, WORD, Doc, Entry, Journal, follow
 from service.push.states import TERMINAL, State
 from service.storage.base import utc_text
 from service.storage.records import PushEntryRecord
@@ -14,14 +14,14 @@ from service.storage.store import Store
 
 
 class StoreBook:
-    """Journal of the last push of one machine, or of its next one. Open it with `last` or `new`.
+    """Journal of the last push into one control, or of its next one. Open it with `last`, `new` or `word`.
 
     Parameters
     ----------
     store : Store
         The database.
     machine : str
-        Name of the machine: all its pushes share one chain.
+        Name of the journal (`Store.push_chain`): all pushes into one control share a chain, whatever the machine is called now.
     clock : Clock
         For the time of an entry.
     push : int
@@ -37,30 +37,43 @@ class StoreBook:
         self._push, self._head, self._journal = push, head, journal
 
     @classmethod
-    async def last(cls, store: Store, machine: str, clock: Clock) -> StoreBook | None:
-        """Journal of the last push of a machine; None if there was none."""
-        entries = await asyncio.to_thread(read_entries, store, machine)
+    async def last(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook | None:
+        """Journal of the last push of a machine's control, or of the word before the first (`WORD`); None if there was none."""
+        chain = await asyncio.to_thread(store.push_chain, machine, control)
+        return await cls.of_chain(store, chain, clock)
+
+    @classmethod
+    async def of_chain(cls, store: Store, chain: str, clock: Clock) -> StoreBook | None:
+        """The same of a journal by its own name."""
+        entries = await asyncio.to_thread(_entries_of, store, chain)
         if not entries:
             return None
         push = entries[-1].push
-        return cls(store, machine, clock, push, entries[-1].digest, tuple(entry for entry in entries if entry.push == push))
+        return cls(store, chain, clock, push, entries[-1].digest, tuple(entry for entry in entries if entry.push == push))
 
     @classmethod
-    async def new(cls, store: Store, machine: str, clock: Clock) -> StoreBook:
-        """An empty journal for the next push of a machine.
+    async def word(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
+        """Where a person's word about the table in force is written: with the last push, or under `WORD` where there was none."""
+        chain = await asyncio.to_thread(store.push_chain, machine, control)
+        return await cls.of_chain(store, chain, clock) or cls(store, chain, clock, WORD, GENESIS, ())
+
+    @classmethod
+    async def new(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
+        """An empty journal for the next push into a machine's control.
 
         Raises
         ------
         UnsafeToMove
             The last push has not come to an end: it is finished first.
         """
-        book = await cls.last(store, machine, clock)
+        chain = await asyncio.to_thread(store.push_chain, machine, control)
+        book = await cls.of_chain(store, chain, clock)
         if book is None:
-            return cls(store, machine, clock, 1, GENESIS, ())
+            return cls(store, chain, clock, 1, GENESIS, ())
         last = (await book.entries())[-1]
         if last.state not in TERMINAL or last.state is State.OPERATOR:
-            raise UnsafeToMove(f"push {last.push} of {machine} stands at {last.state}", "finish it first")
-        return cls(store, machine, clock, last.push + 1, last.digest, ())
+            raise UnsafeToMove(f"push {last.push} of {chain} stands at {last.state}", "finish it first")
+        return cls(store, chain, clock, last.push + 1, last.digest, ())
 
     async def entries(self) -> Journal:
         """The push so far."""
@@ -83,6 +96,14 @@ class StoreBook:
         return entry
 
 
-def read_entries(store: Store, machine: str) -> list[Entry]:
-    """All entries of a machine, of all its pushes."""
-    return [Entry(r.push, r.seq, State(r.state), r.doc, r.utc, r.prev, r.digest) for r in store.push_entries(machine)]
+def read_entries(store: Store, machine: str, control: str = "") -> list[Entry]:
+    """All entries of a machine's control, of all its pushes, whatever the machine was called; ``control`` empty: by the name alone."""
+    return [_entry(r) for r in store.push_entries(machine, control)]
+
+
+def _entries_of(store: Store, chain: str) -> list[Entry]:
+    return [_entry(r) for r in store.push_entries_of(chain)]
+
+
+def _entry(r: PushEntryRecord) -> Entry:
+    return Entry(r.push, r.seq, State(r.state), r.doc, r.utc, r.prev, r.digest)

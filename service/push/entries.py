@@ -15,6 +15,8 @@ from service.push.states import FOLLOWS, State
 
 Doc = dict[str, Any]
 GENESIS = "0" * 64
+WORD = 0
+"""Number under which a person's word about a table stands in a journal that has no push yet."""
 
 
 class JournalBroken(ValueError):  # noqa: N818 - reads as what it is
@@ -87,9 +89,13 @@ def follow(journal: Journal, push: int, state: State, doc: Doc, utc: str, head: 
         This state cannot follow.
     """
     last = journal[-1].state if journal else None
-    if state not in FOLLOWS[last]:
+    if not _may_follow(push, last, state):
         raise JournalBroken(f"push {push}: {state} cannot follow {last or 'nothing'}")
     return Entry(push, len(journal), state, doc, utc, head, digest_of(push, len(journal), state, doc, utc, head))
+
+
+def _may_follow(push: int, last: State | None, state: State) -> bool:
+    return state in FOLLOWS[last] or (push == WORD and last is None and state is State.ACCEPTED)
 
 
 def check_chain(entries: Sequence[Entry], head: str = GENESIS) -> None:
@@ -108,7 +114,7 @@ def check_chain(entries: Sequence[Entry], head: str = GENESIS) -> None:
             raise JournalBroken(f"{name}: does not follow the entry before it")
         if entry.digest != digest_of(entry.push, entry.seq, entry.state, entry.doc, entry.utc, entry.prev):
             raise JournalBroken(f"{name}: was changed after it was written")
-        if entry.seq != (before.seq + 1 if before else 0) or entry.state not in FOLLOWS[before.state if before else None]:
+        if entry.seq != (before.seq + 1 if before else 0) or not _may_follow(entry.push, before.state if before else None, entry.state):
             raise JournalBroken(f"{name}: {entry.state} cannot stand here")
         last[entry.push], head = entry, entry.digest
 

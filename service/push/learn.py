@@ -87,7 +87,7 @@ def _commanded(known: Known, op: Op, outcome: Outcome) -> Known:
         lease = known.lease if isinstance(outcome, Refused) else op.owner
         return known._replace(verdict=outcome, lease=lease, leases=known.leases + 1)
     if op.kind is Kind.RELEASE:  # refused: somebody else has it, and the old owner is shut out all the same
-        known = known._replace(releases=known.releases + 1)
+        known = known._replace(releases=known.releases + 1, stop=known.stop or op.text)
         return known if isinstance(outcome, Doubt) else known._replace(fenced=True, lease=0)
     if op.kind is Kind.SEAL:
         return known._replace(sealed=known.sealed + 1, verdict=outcome if isinstance(outcome, Refused) else None)

@@ -91,7 +91,7 @@ def _begin(known: Known, order: Order) -> Op:
 def _abandon(f: Doc, known: Known, state: State, why: str) -> Op:
     """Before activation: give the lease back, and end. The table in force was never touched."""
     if state not in (State.SNAPSHOT, State.VALIDATED) and not known.fenced and known.doubts < 2 * DOUBTS:
-        return Op(Kind.RELEASE, owner=f["owner"])
+        return Op(Kind.RELEASE, owner=f["owner"], text=why)
     return record(State.ABORTED, why=why)
 
 

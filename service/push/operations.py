@@ -175,7 +175,7 @@ class Known(NamedTuple):
     rested : bool
         This process has just written that the way back is not open: it does not try again by itself.
     stop : str
-        Why a person or the service wants the push to end; empty if nobody does.
+        Why a person or the service wants the push to end, or why it is being given up; empty if it goes on.
     """
 
     mine: bool = False

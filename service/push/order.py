@@ -31,6 +31,8 @@ class Order:
         Registers of one write, even.
     table : int
         Number of the table in the store; 0 if it is not kept there.
+    control : str
+        Identity of the control (`service.devices.urls.control_of`); empty: not known.
     process : dict
         Which process pushes (`service.storage.owner.Owner`): nobody recovers while it lives.
     """
@@ -45,6 +47,7 @@ class Order:
     attended: bool = False
     chunk_words: int = 100
     table: int = 0
+    control: str = ""
     process: Doc = field(default_factory=dict)
 
     def doc(self) -> Doc:
@@ -60,5 +63,6 @@ class Order:
             "attended": self.attended,
             "chunk_words": self.chunk_words,
             "table": self.table,
+            "control": self.control,
             "process": self.process,
         }

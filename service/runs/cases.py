@@ -9,9 +9,11 @@ import numpy as np
 
 from models.arrays import F1, F2
 from models.discovery.case import Case, CaseRun
-from models.effects.path import Path, Places, driven, standing
+from models.effects.path import Path, Places, driven, since_reversal, standing
+from models.geometry.chain import travel_sign
 from models.machine import Machine
 from service.errors import MeasurementFault
+from service.runs.approached import came_from
 from service.runs.formats import ASSUMED_MODEL
 
 RESOLUTION_MM = {"bar": 1e-4, "laser": 1e-5}
@@ -76,6 +78,10 @@ def path_of(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: 
     temp = {s: np.asarray(columns[f"temp_{s}_C"], dtype=np.float64) for s in SENSORS if f"temp_{s}_C" in columns}
     first = {s: v[:1] for s, v in temp.items()}
     at = driven(q, t_s, feed, dwelling=laser, temp_c=temp)
+    if laser:
+        path, rows = came_from(run, q)
+        sign = travel_sign(path)
+        at = replace(at, sign=sign[rows], since_mm=since_reversal(path, sign)[rows])
     t_set = float(setup.get("t_set_s", t_s[0]))
     if t_s[0] < t_set - CLOCKS_S:
         raise MeasurementFault(

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from service.errors import FileFormatError
 from service.explain import expected, shown, where
+from service.files import NotPlainError, read_plain
 from service.runs.formats import Columns, RunFile, Setup
 from service.runs.json_text import strict_json
 from service.storage.records import Doc
@@ -38,14 +39,15 @@ def read_json(path: Path) -> Doc:
     Raises
     ------
     FileFormatError
-        If it is missing, no UTF-8, or no JSON, as `service.runs.json_text.strict_json` reads it.
+        If it is missing, no plain file, too large, no UTF-8, or no JSON, as `service.runs.json_text.strict_json` reads it.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise FileFormatError(f"{path}: larger than {MAX_BYTES >> 20} MiB", "expected a run or campaign file")
-        value = strict_json(path.read_text(encoding="utf-8"), path, finite=False)  # `check` says where a NaN stands
+        text = read_plain(path, MAX_BYTES).decode("utf-8")
+        value = strict_json(text, path, finite=False)  # `check` says where a NaN stands
     except FileNotFoundError:
         raise FileFormatError(f"{path}: no such file", "give a folder with campaign.json and its run files") from None
+    except NotPlainError as err:
+        raise FileFormatError(f"{path}: {err.strerror}", "put the run or campaign file itself there") from None
     except OSError as err:
         raise FileFormatError(f"{path}: cannot be read: {err.strerror}", "check its access rights") from None
     except UnicodeDecodeError as err:

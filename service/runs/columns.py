@@ -25,6 +25,7 @@ from service.runs.bar_columns import bar_columns, begins_seen, sync_edges
 from service.runs.bar_point_columns import bar_point_columns
 from service.runs.clocks import RunClock, run_clock
 from service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
+from service.runs.coverage import with_state
 from service.runs.laser_columns import laser_columns
 from service.runs.pieces import SoFar, joined, pieces_of, read_so_far, up_to
 from service.storage.records import ChunkRecord, Doc, RunRecord
@@ -62,11 +63,14 @@ def load_run(store: Store, id_or_label: int | str) -> Doc:
 
 
 def whole_document(store: Store, record: RunRecord) -> Doc:
-    """A run with the pieces that belong to it, as an ``abbe-run/1`` document; errors as of `load_run`."""
+    """A run with the pieces that belong to it, as an ``abbe-run/1`` document; errors as of `load_run`.
+
+    One that is not complete says so under ``state`` (`service.runs.coverage`).
+    """
     document = run_document(record, store.chunks(record.id))
     pieces = pieces_of(record.start_doc)
     if not pieces:
-        return document
+        return with_state(document, record)
     broken = [(store.run(p.run), p.to_mm) for p in pieces]
     pieces_doc = [run_document(run, store.chunks(run.id)) for run, _ in broken]
     parts = [up_to(run, one["columns"], to_mm) for (run, to_mm), one in zip(broken, pieces_doc, strict=True)]
@@ -75,7 +79,7 @@ def whole_document(store: Store, record: RunRecord) -> Doc:
     troubles = [f"in {run.label}: {text}" for (run, _), one in zip(broken, pieces_doc, strict=True) if (text := _trouble(one))]
     if troubles and "trouble" not in timing:
         timing["trouble"] = troubles[0]
-    return document | {"columns": joined([*parts, document["columns"]]), "timing": timing}
+    return with_state(document | {"columns": joined([*parts, document["columns"]]), "timing": timing}, record, broken[0][0].start_doc)
 
 
 def _trouble(document: Doc) -> str:

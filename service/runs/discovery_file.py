@@ -24,13 +24,17 @@ Adds = Literal[
 
 
 class FoundEffect(FileObject):
-    """One named effect. ``parameters``: ``strength`` and ``u_strength`` in the unit of its name, and further ones with theirs."""
+    """One named effect. ``parameters``: ``strength`` and ``u_strength`` in the unit of its name, and further ones with theirs.
+
+    ``proved``: runs that were never fitted confirm it.
+    """
 
     name: str
     key: str
     parameters: dict[str, float]
     evidence: float
     alternatives: list[str]
+    proved: bool | None = None
 
 
 class FoundBeside(FileObject):
@@ -53,6 +57,7 @@ class FoundWhere(FileObject):
     period_mm: float | None = None
     angular_lobes: int | None = None
     depends_on: list[str] = Field(default_factory=list)
+    shape: str = Field(default="", description="what it looks like there, for people")
 
 
 class FoundTest(FileObject):
@@ -81,6 +86,16 @@ class FoundUnseen(FileObject):
     adds: Adds
 
 
+class FoundFitted(FileObject):
+    """A value of the present simulation that a test of one axis shows: its ``scale`` in um/m, with standard uncertainty."""
+
+    name: str
+    key: str
+    value: float
+    u: float
+    unit: str
+
+
 class FoundThinning(FileObject):
     """Long ball-bar runs were searched with fewer values than they have readings; what that hides is not known to be absent."""
 
@@ -95,18 +110,26 @@ class FoundThinning(FileObject):
 
 
 class DiscoveryFile(FileObject):
-    """What a campaign's simulation lacks, and the prediction of every sealed run, mm."""
+    """What a campaign's simulation lacks, and the prediction of every sealed run, mm.
+
+    ``effects`` holds what is stood by, ``suspects`` names that fit the fitted runs and that runs which only judge do not confirm: then the
+    verdict is "unknown". ``proved``: the judging runs confirm the effects; ``proof``: the rule, or why they cannot judge.
+    """
 
     format: Literal["abbe-discovery/1"]
     case: str
     verdict: Literal["named", "none", "unknown"]
     effects: list[FoundEffect]
+    suspects: list[FoundEffect] = Field(default_factory=list)
+    proved: bool = False
+    proof: str = ""
     confounded_with: list[str] = Field(default_factory=list)
     beside: list[FoundBeside] = Field(default_factory=list)
     where: FoundWhere
     next_test: FoundTest | None = None
     agreement: list[FoundAgreement] = Field(default_factory=list)
     unseen: list[FoundUnseen] = Field(default_factory=list)
+    fitted: list[FoundFitted] = Field(default_factory=list)
     thinning: FoundThinning | None = None
     rms_before_um: float | None = Field(None, ge=0)
     rms_after_um: float | None = Field(None, ge=0)

@@ -61,6 +61,8 @@ def read_folder(folder: Path) -> Folder:
         For the first mistake in any file.
     """
     head = folder / CAMPAIGN_FILE
+    if folder.exists() and not folder.is_dir():
+        raise FileFormatError(f"{folder} is a file, expected a folder", f"give the folder that holds {CAMPAIGN_FILE} and its run files")
     campaign = read_json(head)
     check(head, campaign, CampaignFile)
     runs = []

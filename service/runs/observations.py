@@ -10,6 +10,7 @@ from models.arrays import F1, F2
 from models.geometry.chain import travel_sign
 from models.solvers.observations import RunData, Test, block_average, reading_noise_mm
 from service.errors import MeasurementFault
+from service.runs.approached import came_from
 
 BLOCKS = 400
 """Values per ball-bar run that enter a solution: noise averages down, smooth errors stay."""
@@ -49,7 +50,7 @@ def _run_data(run: dict[str, Any], blocks: int) -> RunData:
         "setup": setup["setup_id"],
         "axes_mm": axes[valid],
         "deviation_mm": np.asarray(columns["deviation_mm"], dtype=np.float64)[valid],
-        "sign": _signs(axes)[valid],
+        "sign": _signs(run, axes)[valid],
         "t_s": np.asarray(columns["t_s"], dtype=np.float64)[valid],
         "weight_n": np.ones(int(valid.sum())),
         "tool_mm": _tool(setup),
@@ -63,11 +64,12 @@ def _run_data(run: dict[str, Any], blocks: int) -> RunData:
     return block_average(RunData(kind="bar", **common, centre_mm=centre, radius_mm=float(setup["radius_mm"])), blocks)
 
 
-def _signs(axes_mm: F2) -> F2:
+def _signs(run: dict[str, Any], axes_mm: F2) -> F2:
     """Direction in which each axis last moved, from the rows that say where the machine was; an invalid one may not."""
     there = np.isfinite(axes_mm).all(axis=1)
     out = np.full(axes_mm.shape, np.nan)
-    out[there] = travel_sign(axes_mm[there])
+    path, rows = came_from(run, axes_mm) if there.all() else (axes_mm[there], np.arange(int(there.sum())))
+    out[there] = travel_sign(path)[rows]
     return out
 
 

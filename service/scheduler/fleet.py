@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any
 
@@ -12,12 +12,22 @@ from service.scheduler.station import SILENT_AFTER
 from service.scheduler.store import ServiceStore
 from service.storage.records import StationRecord, VerificationRecord
 from service.workflows.trend_table import FigureTrend, trends
+from service.workflows.verified_by import LOOKED, VerifiedBy, of_push_taken_back, verified_by
 
 CHECKS = 400
 """So many checks of each machine are looked at for its trend, which uses no more (`models.trend.MOST_CHECKS`)."""
 NOT_RUNNING = "not running"
 NO_SERVICE = "no service"
-HEADINGS = ("machine", "state", "last check (UTC)", "verdict", "figures ± U (k = 2)", "next due (UTC)", "days until limit (95 %)")
+HEADINGS = (
+    "machine",
+    "state",
+    "last check (UTC)",
+    "verdict",
+    "table in force",
+    "figures ± U (k = 2)",
+    "next due (UTC)",
+    "days until limit (95 %)",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +53,12 @@ class Stand:
     heard_utc : str
         When its service said something last; empty without one.
     check_utc, verdict : str
-        The last check; empty without one.
+        The last check; empty without one. Where its verdict is not of the table in force: ``unverified``; ``verified`` by the push that
+        brought the table and was measured before and after; ``unknown``.
     figures : tuple of Figure
-        Those of the last check that are judged, in its order.
+        Those of the last check that are judged, in its order; none where its verdict is not of the table in force.
+    verified : VerifiedBy
+        What measured the table in force, or since what nothing has.
     next_due_utc, next_recipe : str
         What its service will do next; empty if it does not run or has no timetable.
     """
@@ -58,6 +71,7 @@ class Stand:
     figures: tuple[Figure, ...] = ()
     next_due_utc: str = ""
     next_recipe: str = ""
+    verified: VerifiedBy = field(default_factory=lambda: VerifiedBy("unknown", "never"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,19 +104,19 @@ def stands(store: ServiceStore, now: datetime) -> list[Stand]:
         With time zone.
     """
     said = store.stations()
-    return [_stand(name, said.get(name), store.verifications_of(name, limit=1), now) for name in store.machine_names()]
+    return [_stand(store, name, said.get(name), store.verifications_of(name, LOOKED), now) for name in store.machine_names()]
 
 
 def fleet(store: ServiceStore, now: datetime) -> list[MachineLine]:
     """One line for each machine of a database, by name, with the trends of its figures; parameters as for `stands`."""
     said = store.stations()
-    return [_line(name, said.get(name), store.verifications_of(name, limit=CHECKS), now) for name in store.machine_names()]
+    return [_line(store, name, said.get(name), store.verifications_of(name, limit=CHECKS), now) for name in store.machine_names()]
 
 
-def _line(name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
-    found = trends(checks)
+def _line(store: ServiceStore, name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
+    stand = _stand(store, name, said, checks, now)
+    found = trends(checks, stand.verified.since)
     soonest = min((one for one in found if not one.trend.forecast.reason), key=lambda one: one.trend.forecast.days, default=None)
-    stand = _stand(name, said, checks, now)
     return MachineLine(
         **{one.name: getattr(stand, one.name) for one in fields(stand)},
         drifting=tuple(one.figure for one in found if one.trend.state == "drifting"),
@@ -111,21 +125,24 @@ def _line(name: str, said: StationRecord | None, checks: Sequence[VerificationRe
     )
 
 
-def _stand(name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> Stand:
+def _stand(store: ServiceStore, name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> Stand:
     """``checks``: newest first."""
     state = state_of(said, now)
     due = said.doc.get("due", []) if said is not None and state not in {NOT_RUNNING, NO_SERVICE} else []
     first: dict[str, str] = min(due, key=lambda one: datetime.fromisoformat(one["due_utc"]), default={})
-    last = checks[0] if checks else None
+    last = next((one for one in checks if not of_push_taken_back(one)), None)
+    known = verified_by(store, name)
+    verdict = "" if last is None and known.holds else known.verdict("" if last is None else last.verdict)
     return Stand(
         machine=name,
         state=state,
         heard_utc=said.seen_utc if said is not None else "",
         check_utc="" if last is None else str(last.doc.get("started_utc") or last.utc),
-        verdict="" if last is None else last.verdict,
-        figures=() if last is None else figures_of(last.doc),
+        verdict=verdict,
+        figures=() if last is None or not known.holds else figures_of(last.doc),
         next_due_utc=first.get("due_utc", ""),
         next_recipe=first.get("recipe", ""),
+        verified=known,
     )
 
 
@@ -155,7 +172,7 @@ def row(line: MachineLine) -> tuple[str, ...]:
     figures = ", ".join(_words(one) for one in line.figures)
     state = line.state if line.state != NOT_RUNNING else f"{NOT_RUNNING}, last heard {_minute(line.heard_utc)}"
     due = f"{_minute(line.next_due_utc)} {line.next_recipe}" if line.next_due_utc else ""
-    return (line.machine, state, _minute(line.check_utc), line.verdict, figures, due, _limit_words(line))
+    return (line.machine, state, _minute(line.check_utc), line.verdict, line.verified.text, figures, due, _limit_words(line))
 
 
 def _words(one: Figure) -> str:
@@ -188,6 +205,7 @@ def _doc(one: MachineLine) -> dict[str, Any]:
         "heard_utc": one.heard_utc or None,
         "check_utc": one.check_utc or None,
         "verdict": one.verdict or None,
+        "verified": one.verified.as_doc(),
         "figures": [{"name": f.name, "value": f.value, "expanded_uncertainty": f.expanded, "limit": f.limit} for f in one.figures],
         "next_due_utc": one.next_due_utc or None,
         "next_recipe": one.next_recipe or None,

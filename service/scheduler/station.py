@@ -46,13 +46,21 @@ class Station:
         The timetable's next slots.
     clock : Clock
         Beats.
+    attention : sequence of str
+        What needs a person now, kept by others.
     """
 
     def __init__(
-        self, machine: str, version: str, store: Desk, next_due: Callable[[], Sequence[tuple[Schedule, datetime]]], clock: Clock
+        self,
+        machine: str,
+        version: str,
+        store: Desk,
+        next_due: Callable[[], Sequence[tuple[Schedule, datetime]]],
+        clock: Clock,
+        attention: Sequence[str] = (),
     ) -> None:
         self._machine, self._version = machine, version
-        self._store, self._next_due, self._clock = store, next_due, clock
+        self._store, self._next_due, self._clock, self._attention = store, next_due, clock, attention
         self._job: Doc | None = None
         self._began = clock.utc()
         self._news = asyncio.Event()
@@ -65,6 +73,10 @@ class Station:
     def job_progress(self, progress: Progress) -> None:
         """Progress is for the machine's own page."""
 
+    def noted(self) -> None:
+        """Hear that what needs a person has changed."""
+        self._news.set()
+
     def job_ended(self, doc: Doc | None) -> None:
         """Note that it ended."""
         self._job = None
@@ -74,7 +86,8 @@ class Station:
         """What is said now."""
         due = [{"schedule": one.name, "recipe": one.recipe, "due_utc": at.isoformat()} for one, at in self._next_due()]
         state = WAITING if self._job is None else MEASURING
-        return {"schema": 1, "state": state, "job": self._job, "due": due, "version": self._version, "began_utc": self._began.isoformat()}
+        told = {"schema": 1, "state": state, "job": self._job, "due": due, "version": self._version, "began_utc": self._began.isoformat()}
+        return told | {"attention": list(self._attention)}
 
     async def run(self) -> None:
         """Write now, at every change, and once a beat; until cancelled."""

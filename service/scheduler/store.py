@@ -8,7 +8,7 @@ from datetime import datetime
 
 from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
 
-from service.storage.records import Doc, SlotRecord, VerificationRecord
+from service.storage.records import Doc, SlotRecord
 from service.storage.store import Store
 from service.storage.store_campaigns import new_id
 from service.storage.store_slots import SLOT_COLUMNS, slot_record
@@ -61,20 +61,6 @@ class ServiceStore(Store):
         query = select(func.max(slots.c.slot_utc)).where(slots.c.schedule == schedule)
         text = self._read(lambda connection: connection.execute(query).scalar())
         return None if text is None else datetime.fromisoformat(text)
-
-    def verifications_of(self, machine: str, limit: int = 100) -> list[VerificationRecord]:
-        """Return the latest checks of a machine, newest first, whatever descriptions it has had.
-
-        Parameters
-        ----------
-        machine : str
-            Name of the machine.
-        limit : int
-            At most so many.
-        """
-        query = select(verifications).join(machines, machines.c.id == verifications.c.machine_id).where(machines.c.name == machine)
-        query = query.order_by(verifications.c.id.desc()).limit(limit)
-        return [VerificationRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def slots_not_run(self, machine: str, limit: int = 20) -> list[SlotRecord]:
         """Return the latest slots of a machine that were missed, skipped or interrupted, newest first.

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator
 
 from models.machine import AXES
 from service.sequences.bar_recipes import BarRecipe, Circle, Helix, HelixPoints
-from service.sequences.recipe_tables import Feed, Letter, Settle, TestTable
+from service.sequences.recipe_tables import Coordinate, Feed, Letter, Settle, TestTable
 
 Arc = Annotated[float, Field(ge=0.0, le=360.0)]
 Turns = Annotated[float, Field(ge=3.0, le=50.0)]
@@ -17,8 +17,8 @@ Turns = Annotated[float, Field(ge=3.0, le=50.0)]
 class CupTable(TestTable):
     """Keys of every ball-bar test."""
 
-    centre_mm: tuple[float, float, float]
-    radius_mm: Annotated[float, Field(gt=0.0, le=2000.0)]
+    centre_mm: tuple[Coordinate, Coordinate, Coordinate]
+    radius_mm: Annotated[float, Field(ge=0.1, le=2000.0)]
     axis: Letter = "Z"
     opens: Literal[1, -1] = 1
     direction: Literal[1, -1] = 1

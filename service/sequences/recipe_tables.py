@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[^\s/\\](?:[^\n\r/\\]*[^\s/\\])?$")]
 Feed = Annotated[float, Field(gt=0.0, le=100_000.0)]
+Coordinate = Annotated[float, Field(ge=-1e5, le=1e5)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Settle = Annotated[float, Field(ge=0.0, le=60.0)]
 Letter = Literal["X", "Y", "Z"]

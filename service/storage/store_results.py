@@ -12,7 +12,7 @@ from service.errors import StoreError
 from service.storage.base import StoreBase
 from service.storage.records import Doc, PushRecord, SolutionRecord, TableRecord, VerificationRecord
 from service.storage.store_campaigns import new_id
-from service.storage.tables import comp_tables, pushes, solutions, verifications
+from service.storage.tables import comp_tables, machines, pushes, solutions, verifications
 
 
 class ResultStore(StoreBase):
@@ -183,6 +183,20 @@ class ResultStore(StoreBase):
         if machine_id is not None:
             query = query.where(verifications.c.machine_id == machine_id)
         return [VerificationRecord(*row) for row in self._all(query)]
+
+    def verifications_of(self, machine: str, limit: int = 100) -> list[VerificationRecord]:
+        """Return the latest checks of a machine, newest first, whatever descriptions it has had.
+
+        Parameters
+        ----------
+        machine : str
+            Name of the machine.
+        limit : int
+            At most so many.
+        """
+        query = select(verifications).join(machines, machines.c.id == verifications.c.machine_id).where(machines.c.name == machine)
+        query = query.order_by(verifications.c.id.desc()).limit(limit)
+        return [VerificationRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def _all(self, query: Select[Any]) -> Sequence[Any]:
         return self._read(lambda connection: connection.execute(query).all())

@@ -64,12 +64,15 @@ def experiment(case: Case, key: str) -> Experiment:
 
 
 def _null_vector(case: Case, checks: Checks, problem: Problem) -> None:
-    """The names say which parameters hang together; their ratios and that they leave no trace are computed."""
+    """The names say which parameters hang together; their ratios, up to the common sign, and that they leave no trace are computed."""
     names = [t.name for t in monomials(1)]
     stored = dict(case.items())
     if not set(stored) <= set(names):
         raise FileFormatError(f"{case.label}: parameters {', '.join(stored)} are not all known", f"known: {', '.join(names)}")
+    parts = list(stored.values())
     weights, trace = hidden_combination(*problem, [names.index(k) for k in stored])
-    for w, part in zip(weights, stored.values(), strict=True):
-        value = np.round(w, DECIMALS) if trace < NO_TRACE else np.nan
+    # A null vector and its negative are one direction: the file's sign is taken for all components together.
+    sign = -1.0 if sum(w * part.number() for w, part in zip(weights, parts, strict=True)) < 0 else 1.0
+    for w, part in zip(weights, parts, strict=True):
+        value = np.round(sign * w, DECIMALS) if trace < NO_TRACE else np.nan
         checks.compare("null vectors, degree 1", value, part, unit="1", rounding="stated with four decimals, ours rounded alike")

@@ -15,6 +15,7 @@ from starlette.types import ASGIApp
 
 from service.plant.facts import FactsSource
 from service.plant.gather import Gatherer
+from service.scheduler.store import ServiceStore
 from service.users.roles import Permission
 from service.web import problems
 from service.web.access import PUBLIC, needs
@@ -30,7 +31,7 @@ from service.web.headers import SecurityHeaders
 from service.web.jobs import add_jobs
 from service.web.live import add_live
 from service.web.login import add_login
-from service.web.metrics import Counted, add_metrics
+from service.web.metrics import add_metrics
 from service.web.mtconnect import add_mtconnect
 from service.web.page import HERE, ICON, environment, render
 from service.web.pages.live import add_live_page
@@ -70,7 +71,7 @@ class Parts:
     ----------
     core : CoreLine
         The core.
-    store : Counted
+    store : ServiceStore
         What is counted.
     machine : str
         Name of the machine.
@@ -80,14 +81,17 @@ class Parts:
         What can be run dry before.
     campaigns : tuple of str
         Those of the recipes that end with a proposal.
+    control : str
+        Identity of the machine's control; empty: not known.
     """
 
     core: CoreLine
-    store: Counted
+    store: ServiceStore
     machine: str
     recipes: tuple[str, ...]
     plans: Rehearsals = field(default_factory=Rehearsals)
     campaigns: tuple[str, ...] = ()
+    control: str = ""
 
 
 def as_in_host_header(host: str) -> str:
@@ -163,7 +167,7 @@ def create_app(
         add_jobs(app, parts.core, parts.recipes, parts.campaigns)
         add_table_orders(app, parts.core)
         add_live(app, parts.core)
-        add_metrics(app, parts.store, parts.core, parts.machine)
+        add_metrics(app, parts.store, parts.core, parts.machine, parts.control)
     app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
     app.add_middleware(Framed, routes=app.router.routes, behind_tls=app.behind_tls)  # inside of the guard: it knows who asks
     app.add_middleware(Guard, routes=app.router.routes, door=door)

@@ -17,6 +17,8 @@ HEADERS_S = 10.0
 """From the connection, or from the answer before it, to the end of a request's headers."""
 BODY_S = 20.0
 """To the end of its body: forms are short."""
+LINGER_S = 2.0
+"""So long the rest of a body that was refused is thrown away as it comes: who is cut off while he sends may never read the answer."""
 READ_S = 30.0
 """So long an answer may wait for its reader, from when he stops reading."""
 MOST_CONNECTIONS = 200
@@ -61,10 +63,12 @@ class PatientProtocol(H11Protocol):
         self._watch()
 
     def on_response_complete(self) -> None:
-        """Wait for the next request."""
+        """Wait for the next request; for the rest of one that was answered before it ended, not long."""
         self.silent_since_s = self.loop.time()
         super().on_response_complete()
         self._watch()
+        if self._waits_for is h11.SEND_BODY:
+            self._wait_for(h11.SEND_BODY, LINGER_S)
 
     def pause_writing(self) -> None:
         """The reader does not read."""
@@ -106,8 +110,12 @@ class PatientProtocol(H11Protocol):
         self._stop_waiting()
         wait_s = {h11.IDLE: HEADERS_S, h11.SEND_BODY: BODY_S}.get(state)
         if wait_s is not None:
-            self._waits_for = state
-            self._wait = self.loop.call_later(wait_s, self.let_go)
+            self._wait_for(state, wait_s)
+
+    def _wait_for(self, state: Any, wait_s: float) -> None:
+        self._stop_waiting()
+        self._waits_for = state
+        self._wait = self.loop.call_later(wait_s, self.let_go)
 
     def _stop_waiting(self) -> None:
         self._waits_for = None

@@ -72,7 +72,7 @@ def _answers(operation: Doc, need: Need | None, *, changes: bool) -> None:
             answer["description"] = HTTP[422][1] if name == "422" else answer["description"]
             answer["content"] = {MEDIA_TYPE: {"schema": REF}}
     # In front of the application, and answered in words: a Host that is not ours, too much at once.
-    for name in ("400", "503", *(("413",) if changes else ())):
+    for name in ("400", "503"):
         answers[name]["content"]["text/plain"] = {"schema": {"type": "string"}}
     if need is not PUBLIC and not changes:
         answers.setdefault("303", {"description": "Nobody is logged in, and a browser asks for text/html: to the login page"})

@@ -1,4 +1,7 @@
-"""In front of every route: rate, who asks, what the route needs, where the request comes from; behind it: the record. Pure ASGI."""
+"""In front of every route: rate, who asks, how long the body is, what the route needs, where the request comes from; behind it: the record.
+
+Pure ASGI. Nothing of a body is read for somebody unknown.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from service.audit.chain import Event
 from service.errors import AbbeError
 from service.users.people import NOBODY, ONLOOKER, Principal
 from service.web.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
+from service.web.bodies import Body
 from service.web.door import Door, csrf_token
 from service.web.origin import address_of, is_ours, is_tls
 from service.web.problems import problem
@@ -69,21 +73,23 @@ class Guard:
         visit = Visit(NOBODY, address)
         scope.setdefault("state", {})["visit"] = visit
         changes = scope["type"] == "http" and scope["method"] in MUTATING
+        body = Body(scope, receive, route) if changes else None
         try:
-            refused = await self._refusal(request, need_of(route), visit, changes=changes)
+            refused = await self._refusal(request, need_of(route), visit, body)
         except AbbeError as error:  # the store does not answer: then nobody is known
             refused = problem(503, error.detail, error.code, {"Retry-After": "5"})
-        if changes and self._door is not None:
-            await self._recorded(self._door, route, visit, refused, (scope, receive, send))
+        if body is not None and self._door is not None:
+            await self._recorded(self._door, route, visit, refused, (scope, body.receive, send))
         elif refused is not None:
             await _answer(refused, scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
-    async def _refusal(self, request: HTTPConnection, need: Need | None, visit: Visit, *, changes: bool) -> Response | None:
-        """Why a request is not let through; None: it is."""
+    async def _refusal(self, request: HTTPConnection, need: Need | None, visit: Visit, body: Body | None) -> Response | None:
+        """Why a request is not let through; None: it is. ``body``: of one that changes something."""
         if need is None:
             return problem(403, "nobody has said who may do this")
+        changes = body is not None
         bearer = _bearer(request)
         tls = is_tls(request, behind_tls=self._behind_tls)
         secret = None if self._door is None else request.cookies.get(self._door.cookie(tls=tls))
@@ -91,8 +97,12 @@ class Guard:
             used = changes or in_use(request.url.path, request.headers.get(ACTIVE_HEADER))
             visit.principal = ONLOOKER if self._door is None else await self._door.who(bearer, secret, in_use=used)
         visit.secret = (secret or "") if visit.principal.by == "session" else ""
-        if need is not PUBLIC and (missing := _missing(request, need, visit.principal, changes=changes)) is not None:
-            return missing
+        if need is not PUBLIC and (unknown := _unknown(request, visit.principal, changes=changes)) is not None:
+            return unknown
+        if body is not None and (too_long := await body.refusal()) is not None:
+            return too_long
+        if need is not PUBLIC and need not in visit.principal.permissions:
+            return problem(403, f"a {visit.principal.role} may not do this: it needs {need.value!r}")
         if changes or request.scope["type"] == "websocket":
             return self._foreign(request, visit, need, changes=changes)
         return None
@@ -174,14 +184,12 @@ class _Log:
         self.written = True
 
 
-def _missing(request: HTTPConnection, need: Need, principal: Principal, *, changes: bool) -> Response | None:
+def _unknown(request: HTTPConnection, principal: Principal, *, changes: bool) -> Response | None:
     # Without users everybody may look; to change something one has to be somebody.
     if principal is NOBODY or (changes and principal.by == "nobody"):
         if "text/html" in request.headers.get("accept", "") and not changes and request.scope["type"] == "http":
             return RedirectResponse("/login", 303)
         return problem(401, "log in, or send a token", headers={"WWW-Authenticate": "Bearer"})
-    if need not in principal.permissions:
-        return problem(403, f"a {principal.role} may not do this: it needs {need.value!r}")
     return None
 
 

@@ -40,7 +40,7 @@ def add_login(app: FastAPI, env: Environment, door: Door) -> None:
     async def form() -> HTMLResponse:
         return page(200)
 
-    @app.post("/login", include_in_schema=False)
+    @app.post("/login", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(PUBLIC)
     async def login(request: Request) -> Response:
         visit: Visit = request.state.visit

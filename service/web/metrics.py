@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Iterator
-from typing import Protocol
 
 from fastapi import FastAPI
 from fastapi.responses import Response
@@ -15,37 +14,18 @@ from prometheus_client.registry import Collector
 
 from service.channel.messages import Moment
 from service.errors import CoreSilent
-from service.storage.records import VerificationRecord
+from service.scheduler.store import ServiceStore
 from service.users.roles import Permission
 from service.web.access import needs
 from service.web.core_line import CoreLine
+from service.workflows.verified_by import verified_by
 
 VERDICTS = ("pass", "fail", "cannot tell")
 
 
-class Counted(Protocol):
-    """The part of the store that is counted here."""
-
-    def verdict_counts(self, machine: str) -> dict[str, int]:
-        """Return how many checks ended with each verdict."""
-        ...
-
-    def slot_counts(self, machine: str) -> dict[str, int]:
-        """Return how many slots stand at each state."""
-        ...
-
-    def waiting_messages(self) -> int:
-        """Return how many messages wait for the broker."""
-        ...
-
-    def verifications_of(self, machine: str, limit: int = ...) -> list[VerificationRecord]:
-        """Return the latest checks, newest first."""
-        ...
-
-
 class _Figures(Collector):
-    def __init__(self, store: Counted, core: CoreLine, machine: str) -> None:
-        self._store, self._core, self._machine = store, core, machine
+    def __init__(self, store: ServiceStore, core: CoreLine, machine: str, control: str) -> None:
+        self._store, self._core, self._machine, self._control = store, core, machine, control
 
     def collect(self) -> Iterable[Metric]:
         yield from self._of_store()
@@ -69,8 +49,14 @@ class _Figures(Collector):
             slots.add_metric([why], sum(number for state, number in states.items() if state.startswith(why)))
         yield slots
         yield GaugeMetricFamily("abbe_outbox_waiting", "Messages that wait for the broker", self._store.waiting_messages())
-        last = next(iter(self._store.verifications_of(self._machine, 1)), None)
-        figures = GaugeMetricFamily("abbe_last_figure", "Figures of the last check; the unit is at the end of the name", labels=["figure"])
+        known = verified_by(self._store, self._machine, control=self._control)
+        about = "1: a check, or the push that brought it, measured the table in force; 0: nothing has since it came"
+        yield GaugeMetricFamily("abbe_table_verified", about, float(known.state == "verified"))
+        checks_now = self._store.verifications_of(self._machine, 1) if known.holds else []
+        last = next(iter(checks_now), None)
+        figures = GaugeMetricFamily(
+            "abbe_last_figure", "Figures of the last check with the table in force; the unit is at the end of the name", labels=["figure"]
+        )
         for name, value in sorted((last.doc.get("values") or {}).items()) if last is not None else ():
             if value is not None:
                 figures.add_metric([name], value)
@@ -89,10 +75,10 @@ def _of_core(moment: Moment) -> Iterator[Metric]:
     yield CounterMetricFamily("abbe_web_restarts", "How often the web process was started again", moment.web_restarts)
 
 
-def add_metrics(app: FastAPI, store: Counted, core: CoreLine, machine: str) -> None:
+def add_metrics(app: FastAPI, store: ServiceStore, core: CoreLine, machine: str, control: str = "") -> None:
     """Add the route to the application. Who may look at the page may ask for these; a program with a token of the scope ``read``."""
     registry = CollectorRegistry()
-    registry.register(_Figures(store, core, machine))
+    registry.register(_Figures(store, core, machine, control))
     ProcessCollector(namespace="abbe_web", registry=registry)
 
     @app.get("/metrics", include_in_schema=False)

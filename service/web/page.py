@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, tzinfo
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
@@ -44,14 +44,18 @@ def environment() -> Environment:
 def render(env: Environment, status: Status, past: Sequence[Verification]) -> str:
     """Return the page."""
     zone: tzinfo = ZoneInfo(status.next_due[0].timezone) if status.next_due else UTC
-    lang = current().lang
+    lang, changes = current().lang, status.verified.changes
+    # The verification of a push that was taken back is of a table that is not in force.
+    latest = next((check for check in past if not check.push or check.verdict == "pass"), None)
     return env.get_template("page.html").render(
         status=status,
         past=past,
-        latest=past[0] if past else None,
+        latest=latest,
         figures=figures(past),
-        latest_figures=_judged_first(past[0]) if past else [],
-        trends=trends(past, zone),
+        latest_figures=[] if latest is None else _judged_first(latest),
+        trends=trends(past, zone, changes),
+        verified=status.verified,
+        earlier=lambda check: bool(changes) and not check.push and check.started_utc <= changes[-1],
         marks=MARKS,
         zone=zone,
         machine=status.machine,
@@ -69,14 +73,14 @@ def figures(past: Sequence[Verification]) -> list[str]:
     return list(judged or dict.fromkeys(key for check in past for key in check.values))[:SHOWN_FIGURES]
 
 
-def trends(past: Sequence[Verification], zone: tzinfo) -> list[Markup]:
-    """Return a plot for each figure."""
+def trends(past: Sequence[Verification], zone: tzinfo, changes: Sequence[datetime] = ()) -> list[Markup]:
+    """Return a plot for each figure; ``changes``: when another table came into force."""
     plots = []
     for key in figures(past):
         name, unit = language.figure(current().lang, key)
-        points = [point for check in past if (point := _point(check, key, unit)) is not None]
+        points = [point for check in past if (point := _point(check, key, unit, changes)) is not None]
         if points:
-            plots.append(Markup(trend_svg(name, current().unit(unit), points, zone)))  # noqa: S704 - our own writer, which escapes
+            plots.append(Markup(trend_svg(name, current().unit(unit), points, zone, changes)))  # noqa: S704 - our own writer, which escapes
     return plots
 
 
@@ -90,14 +94,15 @@ def _named(lang: str, key: str) -> tuple[str, str]:
     return name, current().unit(unit)
 
 
-def _point(check: Verification, key: str, unit: str) -> Point | None:
+def _point(check: Verification, key: str, unit: str, changes: Sequence[datetime]) -> Point | None:
     """A figure of a check in the reader's unit; None: it has none."""
     value, limit, system = check.values.get(key), check.limits.get(key), current().units
     if value is None:
         return None
     u = converted(check.uncertainties.get(key) or 0.0, unit, system)
     line = None if limit is None else converted(limit, unit, system)
-    return Point(check.started_utc, converted(value, unit, system), u, line, figure_verdict(check, key))
+    earlier = bool(changes) and check.started_utc <= changes[-1]
+    return Point(check.started_utc, converted(value, unit, system), u, line, figure_verdict(check, key), earlier)
 
 
 def figure_verdict(check: Verification, key: str) -> str:

@@ -59,7 +59,9 @@ async def _abbe(_: Request, error: Exception) -> JSONResponse:
     return problem_of(error)
 
 
-async def _defect(_: Request, error: Exception) -> JSONResponse:
+async def _defect(request: Request, error: Exception) -> JSONResponse:
+    if isinstance(error, MemoryError) and (end := getattr(request.app.state, "end", None)) is not None:
+        end()  # a process that has come to its limit stays there: the core starts a new one
     # The traceback goes to the log (the server re-raises); a client has no use for our insides.
     return problem(500, f"{type(error).__name__}: a defect of this program; see the service's log", DEFECT)
 

@@ -21,8 +21,23 @@ class Cause(_Answer):
     device: str = ""
 
 
+class Verified(_Answer):
+    """Which measurement stands behind the table in force.
+
+    ``verified``: a check was measured with it, whatever its verdict, or the push that brought it was measured before and after.
+    ``unverified``: an earlier verdict says nothing of the machine now; ``text`` says since what.
+    """
+
+    state: Literal["verified", "unverified", "unknown"] = "unknown"
+    why: Literal["check", "push", "rollback", "accepted", "changed", "other", "open", "never", "journal"] = "never"
+    number: int = 0
+    utc: datetime | None = None
+    text: str = ""
+    changes: Annotated[list[datetime], Field(default_factory=list)]
+
+
 class Verification(_Answer):
-    """One check. Figures end in their unit; uncertainties are expanded, k = 2."""
+    """One check. Figures end in their unit; uncertainties are expanded, k = 2. ``push``: the one that it decided on, 0 for none."""
 
     id: int
     machine: str
@@ -39,6 +54,7 @@ class Verification(_Answer):
     runs: Annotated[list[str], Field(default_factory=list)]
     text: str
     cause: Cause | None = None
+    push: int = 0
 
 
 class Device(_Answer):
@@ -110,7 +126,7 @@ class Alarm(_Answer):
 
 class Status(_Answer):
     """Everything the page shows. ``revision`` changes when more than the progress of a running check has changed; ``attention``: what needs
-    a person now."""
+    a person now; ``verified``: whether the last verdict is of the table in force."""
 
     machine: str
     version: str
@@ -123,6 +139,7 @@ class Status(_Answer):
     alarms: Annotated[list[Alarm], Field(default_factory=list)]
     last: list[Verification]
     attention: Annotated[list[str], Field(default_factory=list)]
+    verified: Annotated[Verified, Field(default_factory=lambda: Verified(changes=[]))]
 
 
 class Verifications(_Answer):

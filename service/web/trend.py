@@ -16,13 +16,14 @@ LEFT, RIGHT, TOP, BOTTOM = 58, 40, 16, 40
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One check's figure. ``verdict`` is of the figure, not of the whole check."""
+    """One check's figure. ``verdict`` is of the figure, not of the whole check; ``earlier``: measured before the table in force came."""
 
     at: datetime
     value: float
     uncertainty: float
     limit: float | None
     verdict: str
+    earlier: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ class _Scale:
         return self.first_px + (value - self.low) / (self.high - self.low) * (self.last_px - self.first_px)
 
 
-def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo) -> str:
+def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo, changes: Sequence[datetime] = ()) -> str:
     """Return the plot as an SVG element.
 
     Parameters
@@ -49,11 +50,14 @@ def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo) -> st
         In any order; must not be empty.
     zone : tzinfo
         Of the dates on the horizontal axis.
+    changes : sequence of datetime
+        When another table came into force: a line across. Points of an earlier table are drawn in grey.
     """
     points = sorted(points, key=lambda point: point.at)
-    x, y = _time_scale(points), _value_scale(points)
+    changes = [moment for moment in changes if moment >= points[0].at]
+    x, y = _time_scale(points, changes), _value_scale(points)
     label = f"{name} [{unit}]" if unit else name
-    body = [*_grid(y), *_dates(points, x, zone), *_limit(points, x, y)]
+    body = [*_grid(y), *_dates(points, x, zone), *_limit(points, x, y), *_changes(changes, x)]
     for point in points:
         body += _mark(point, x(point.at.timestamp()), y, unit)
     body.append(f'<text class="axis" x="{LEFT}" y="11">{escape(label)}</text>')
@@ -66,8 +70,14 @@ def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo) -> st
     )
 
 
-def _time_scale(points: Sequence[Point]) -> _Scale:
-    first, last = points[0].at.timestamp(), points[-1].at.timestamp()
+def _changes(changes: Sequence[datetime], x: _Scale) -> list[str]:
+    """A line where another table came into force."""
+    lines = [f"M{x(moment.timestamp()):.1f} {TOP + 4}V{HEIGHT - BOTTOM}" for moment in changes]
+    return [f'<path class="changed" d="{line}"/>' for line in lines]
+
+
+def _time_scale(points: Sequence[Point], changes: Sequence[datetime]) -> _Scale:
+    first, last = points[0].at.timestamp(), max([points[-1].at, *changes]).timestamp()
     # A single check, or several within a minute, still get an axis with a length.
     margin = max((last - first) * 0.04, 30.0)
     return _Scale(first - margin, last + margin, LEFT, WIDTH - RIGHT)
@@ -133,11 +143,13 @@ def _mark(point: Point, px: float, y: _Scale, unit: str) -> list[str]:
     """Draw bar and mark. The verdict is a shape as well as a colour."""
     top, bottom, middle = y(point.value + point.uncertainty), y(point.value - point.uncertainty), y(point.value)
     bar = f'<path class="bar" d="M{px:.1f} {top:.1f}V{bottom:.1f}M{px - 4:.1f} {top:.1f}h8M{px - 4:.1f} {bottom:.1f}h8"/>'
-    hover = f"<title>{escape(f'{number(point.value)} ± {number(point.uncertainty)} {unit}, {point.verdict}')}</title>"
+    told = f"{number(point.value)} ± {number(point.uncertainty)} {unit}, {point.verdict}"
+    hover = f"<title>{escape(told + (', earlier table' if point.earlier else ''))}</title>"
+    earlier = " earlier" if point.earlier else ""
     if point.verdict == "pass":
-        mark = f'<circle class="pass" cx="{px:.1f}" cy="{middle:.1f}" r="4">{hover}</circle>'
+        mark = f'<circle class="pass{earlier}" cx="{px:.1f}" cy="{middle:.1f}" r="4">{hover}</circle>'
     elif point.verdict == "fail":
-        mark = f'<path class="fail" d="M{px - 5:.1f} {middle - 5:.1f}l10 10m0 -10l-10 10">{hover}</path>'
+        mark = f'<path class="fail{earlier}" d="M{px - 5:.1f} {middle - 5:.1f}l10 10m0 -10l-10 10">{hover}</path>'
     else:
-        mark = f'<path class="unclear" d="M{px:.1f} {middle - 5:.1f}l5 5l-5 5l-5 -5z">{hover}</path>'
+        mark = f'<path class="unclear{earlier}" d="M{px:.1f} {middle - 5:.1f}l5 5l-5 5l-5 -5z">{hover}</path>'
     return [bar, mark]

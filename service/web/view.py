@@ -10,31 +10,12 @@ from zoneinfo import ZoneInfo
 
 from service.clock import Clock
 from service.scheduler.slots import Schedule, cron_in_words
-from service.storage.records import AlarmEntryRecord, VerificationRecord
+from service.scheduler.store import ServiceStore
 from service.web import words
-from service.web.schemas import Alarm, Device, Due, Job, Mqtt, Status, Verification
+from service.web.schemas import Alarm, Device, Due, Job, Mqtt, Status, Verification, Verified
 from service.workflows.alarm_states import folded, is_open
 from service.workflows.alarms import alarm_doc
-
-
-class Archive(Protocol):
-    """The part of the store that is read here."""
-
-    def verifications_of(self, machine: str, limit: int = ...) -> list[VerificationRecord]:
-        """Return the latest checks, newest first."""
-        ...
-
-    def alarm_entries(self, machine: str) -> list[AlarmEntryRecord]:
-        """Return everything about a machine's alarms."""
-        ...
-
-    def newest_slot(self, schedules: Sequence[str]) -> str:
-        """Return which slot of these schedules was taken last, and how it stands."""
-        ...
-
-    def waiting_messages(self) -> int:
-        """Return how many messages wait for the broker."""
-        ...
+from service.workflows.verified_by import VerifiedBy, strange_table, verified_by
 
 
 class Standing(Protocol):
@@ -82,7 +63,7 @@ class View:
         Version of this program.
     board : Standing
         The moment.
-    archive : Archive
+    archive : ServiceStore
         The past.
     next_due : callable
         The future.
@@ -92,15 +73,16 @@ class View:
         Now.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what one page shows, from where each is known
         self,
         machine: str,
         version: str,
         board: Standing,
-        archive: Archive,
+        archive: ServiceStore,
         next_due: Callable[[], Sequence[tuple[Schedule, datetime]]],
         broker: str,
         clock: Clock,
+        control: str = "",
     ) -> None:
         self._machine = machine
         self._version = version
@@ -109,6 +91,7 @@ class View:
         self._next_due = next_due
         self._broker = broker
         self._clock = clock
+        self._control = control
 
     async def verifications(self, limit: int) -> list[Verification]:
         """Return the latest checks, newest first."""
@@ -148,21 +131,28 @@ class View:
         upcoming = self._next_due()
         # A slot that was skipped leaves no check and may leave no alarm: without it an open page would go on as if it had not been due.
         slot = await asyncio.to_thread(self._archive.newest_slot, [f"{self._machine}/{schedule.name}" for schedule, _ in upcoming])
-        job = self._board.job
+        job, attention = self._board.job, self._board.attention
+        known = await asyncio.to_thread(verified_by, self._archive, self._machine, control=self._control, strange=strange_table(attention))
         asked = 0 if job is None else job.prompt
         return Status(
             machine=self._machine,
             version=self._version,
             now_utc=now,
-            revision=f"{last[0].id if last else 0}.{self._board.changes}.{len(entries)}.{asked}.{slot}",
+            revision=f"{last[0].id if last else 0}.{self._board.changes}.{len(entries)}.{asked}.{known.why}{known.number}.{slot}",
             job=job,
             devices=self._board.devices,
             next_due=[_due(schedule, slot_utc, now) for schedule, slot_utc in upcoming],
             mqtt=mqtt,
             alarms=[Alarm.model_validate(alarm_doc(one)) for one in reversed(folded(entries)) if is_open(one)],
             last=last,
-            attention=self._board.attention,
+            attention=attention,
+            verified=_verified(known),
         )
+
+
+def _verified(known: VerifiedBy) -> Verified:
+    utc = datetime.fromisoformat(known.utc) if known.utc else None
+    return Verified(state=known.state, why=known.why, number=known.number, utc=utc, text=known.text, changes=list(known.changes))
 
 
 def _due(schedule: Schedule, slot: datetime, now: datetime) -> Due:

@@ -6,11 +6,11 @@ import asyncio
 
 from service.capture.recovery import recover_segments
 from service.devices.alone import alone
-from service.devices.session import DeviceUrls, open_session
+from service.devices.session import DeviceUrls
 from service.push.states import TERMINAL, State
 from service.site import Site
 from service.storage.store import Store
-from service.workflows.recover import recover
+from service.workflows.recovered import recovered_session
 
 
 async def recover_at_start(store: Store, site: Site) -> str | None:
@@ -28,23 +28,22 @@ async def recover_at_start(store: Store, site: Site) -> str | None:
     """
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
     told = [run.text for run in runs]
-    if await push_is_open(store, site.name):
+    if await push_is_open(store, site.name, site.control):
         with alone(site.urls.cnc):
-            async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
-                pushed = await recover(session.controller, store, site)
-        told += [pushed] if pushed else []
+            async with recovered_session(store, site, DeviceUrls(cnc=site.urls.cnc), told=told.append):
+                pass
     return "; ".join(told) or None
 
 
-async def push_is_open(store: Store, machine: str) -> bool:
-    """Whether the last push of a machine is on its way, waits for its way back, or needs a person: by its journal alone.
+async def push_is_open(store: Store, machine: str, control: str = "") -> bool:
+    """Whether the last push into a machine's control is on its way, waits for its way back, or needs a person: by its journal alone.
 
     Raises
     ------
     StoreError
         The database does not answer.
     """
-    journal = await asyncio.to_thread(store.last_push, machine)
+    journal = await asyncio.to_thread(store.last_push, machine, control)
     if not journal:
         return False
     state = State(journal[-1].state)

@@ -59,8 +59,7 @@ def drift_found(case: Case) -> Discovery | None:
 
     Fitted to the identify runs; the holdout runs are predicted from their positions' means and the drift gone on.
     """
-    fitted = sorted(case.of("identify"), key=lambda r: float(r.path.at.t_s[0]))
-    place, t, reading = (np.concatenate(v) for v in zip(*(_valid(r) for r in fitted), strict=True))
+    place, t, reading = _fitted(case)
     drift = repeat_drift(place, t, reading)
     if drift is None:
         return None
@@ -93,6 +92,20 @@ def drift_found(case: Case) -> Discovery | None:
     )
 
 
+def drift_at(case: Case) -> dict[str, F1]:
+    """The drift that `drift_found` names at every reading of every run, mm, by label; it goes on beyond the fitted runs as it went last."""
+    place, t, reading = _fitted(case)
+    drift = repeat_drift(place, t, reading)
+    return {} if drift is None else {r.path.label: _gone_on(_drift_at(drift, t), r.path.at.t_s) for r in case.runs}
+
+
+def _fitted(case: Case) -> tuple[F1, F1, F1]:
+    """Place, time and reading of the identify runs, in the order of time."""
+    runs = sorted(case.of("identify"), key=lambda r: float(r.path.at.t_s[0]))
+    place, t, reading = (np.concatenate(v) for v in zip(*(_valid(r) for r in runs), strict=True))
+    return place, t, reading
+
+
 def _named(drift: RepeatDrift, axis: str, where: Where) -> NamedEffect:
     tau = {} if drift.tau_s is None else {"tau_s": (drift.tau_s, drift.tau_s)}  # from a coarse list: known to a factor
     evidence = -0.5 * np.log(max(1.0 - drift.share, 1e-12)) * drift.drift_mm.size
@@ -109,10 +122,10 @@ def _next(axis: str) -> NextTest:
 def _valid(run: CaseRun) -> tuple[F1, F1, F1]:
     """Place, time and reading of the readings that count."""
     assert run.deviation_mm is not None
-    return _places(run)[run.valid], run.path.at.t_s[run.valid], run.deviation_mm[run.valid]
+    return places_of(run)[run.valid], run.path.at.t_s[run.valid], run.deviation_mm[run.valid]
 
 
-def _places(run: CaseRun) -> F1:
+def places_of(run: CaseRun) -> F1:
     """A number for position and side of every reading."""
     position = np.round(run.path.at.q_mm @ run.path.look[0] / NEAR_MM) * NEAR_MM
     return np.asarray(position + 1e6 * run.path.direction)
@@ -128,7 +141,7 @@ def _predicted(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) 
     """Mean of the same place in the fitted runs, with the drift where there is one; beyond them it goes on as it went last."""
     means = {p: float(level[place == p].mean()) for p in np.unique(place)}
     fallback = float(level.mean())
-    out = np.array([means.get(p, fallback) for p in _places(run)])
+    out = np.array([means.get(p, fallback) for p in places_of(run)])
     return out if drift is None else out + _gone_on(drift, run.path.at.t_s)
 
 
@@ -146,4 +159,4 @@ def _left(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1
 def _gap(role: str, judged: Sequence[CaseRun], before: dict[str, F1], after: dict[str, F1], drift: RepeatDrift) -> Gap:
     labels = [r.path.label for r in judged if r.role == role]
     rms = [float(np.sqrt(np.nanmean(np.concatenate([v[label] for label in labels]) ** 2))) for v in (before, after)]
-    return Gap(rms[0], rms[1], min(rms[1], drift.after_mm))
+    return Gap(rms[0], rms[1], drift.after_mm if drift.named else drift.before_mm)

@@ -12,6 +12,7 @@ from typing import Any
 from service.audit.book import heads_in
 from service.audit.chain import faults
 from service.errors import BackupRefused
+from service.files import is_plain, read_plain
 from service.storage.copying import rows_of
 from service.storage.store_audit import AuditRecord
 
@@ -24,6 +25,7 @@ HEADS = "audit-head"
 MACHINE = "machine.toml"
 COUNTED = ("machines", "campaigns", "runs", "chunks", "solutions", "verifications", "proposals", "audit")
 _PIECE = 1 << 20
+LONGEST_LIST = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +57,13 @@ def digest_of(path: Path) -> str:
 
 def listed(folder: Path) -> dict[str, dict[str, Any]]:
     """Every file below a folder but the list: its size and digest, by its path in the folder. Raises OSError."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / LIST)
-    return {path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": digest_of(path)} for path in files}
+    found = dict[str, dict[str, Any]]()
+    for path in sorted(folder.rglob("*")):
+        if not is_plain(path):  # a link, a pipe, a device: no backup has one, and a copy would follow it
+            found[path.relative_to(folder).as_posix()] = {}
+        elif path.is_file() and path != folder / LIST:
+            found[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": digest_of(path)}
+    return found
 
 
 def read_backup(folder: Path) -> Backup:
@@ -68,7 +75,7 @@ def read_backup(folder: Path) -> Backup:
         It is none, of a newer version, or a file is missing, too many or not as it was written: which one.
     """
     try:
-        doc = json.loads((folder / LIST).read_text(encoding="utf-8"))
+        doc = json.loads(read_plain(folder / LIST, LONGEST_LIST))
         if doc.get("format") != FORMAT:
             raise BackupRefused(f"{folder} is a backup of the format {doc.get('format')!r}", f"this version of Abbe reads {FORMAT}")
         wanted, found = doc["files"], listed(folder)

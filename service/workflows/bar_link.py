@@ -13,13 +13,12 @@ from service.errors import RunInterrupted
 from service.sequences.control import Control, State
 from service.sequences.interlocks import Suspending
 from service.sequences.journal import WAITS, Journal
+from service.sequences.needed import BEFORE_S
 from service.sequences.runner import Runner
 from service.sequences.steps import ReadBar, RecordPath, TestPlan
 
 BALLBAR = "ballbar"
 """The word in ``[limits] continue_after``."""
-BEFORE_S = 5.0
-"""So long the box is looked for before a run."""
 MOST_BREAKS = 5
 """So often a test begins again because the box was lost; then a person has to look at it."""
 BREAKS = (LinkDown, ReplyTimeout, Rebooted)

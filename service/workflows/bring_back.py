@@ -47,7 +47,7 @@ async def bring_back(site: Site, store: Store, order: BackOrder, *, clock: Clock
 async def _heard(controller: Controller, store: Store, site: Site, order: BackOrder, clock: Clock) -> Outcome:
     control = order.ordered.control
     try:
-        await asyncio.to_thread(check_unchanged, store, site.name, order)
+        await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
         back = await rollback(controller, store, site, ordered=order.ordered)
     except (TableRefused, TableMismatch) as no:
         return Outcome("refused", _told(no))
@@ -59,10 +59,11 @@ async def _heard(controller: Controller, store: Store, site: Site, order: BackOr
         return Outcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
     if back is None:
         return Outcome("refused", "the table from before is in force already; nothing was written")
-    return Outcome("kept", f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}")
+    told = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
+    return Outcome("kept", f"{told}; the machine is unverified now: run a quick check")
 
 
-def check_unchanged(store: Store, machine: str, order: BackOrder) -> None:
+def check_unchanged(store: Store, machine: str, order: BackOrder, control: str = "") -> None:
     """Refuse an order that was given in view of another table than the one in force by the journal now.
 
     Raises
@@ -70,7 +71,7 @@ def check_unchanged(store: Store, machine: str, order: BackOrder) -> None:
     TableRefused
         It was, or nothing can be taken back any more.
     """
-    now = offered(store, machine)
+    now = offered(store, machine, control)
     if (now.push, now.crc) != (order.push, order.crc):
         raise TableRefused(
             f"the table in force is {now.crc:08X} of push {now.push}, ordered back was {order.crc:08X} of push {order.push}",

@@ -16,6 +16,7 @@ from models.machine import Machine
 from models.solvers.observations import RunData
 from models.solvers.plausibility import Suspect, suspects
 from service.errors import CampaignRefused
+from service.workflows.copied_runs import copies
 from service.workflows.finding import Finding
 from service.workflows.run_geometry import geometry
 from service.workflows.run_times import times
@@ -28,8 +29,6 @@ NO_READING_MM = 1000.0
 SPIKES = 0.05
 """Larger a share of a run's readings is no matter of single outliers."""
 HALF = 0.5
-COPIED_SHARE = 0.98
-"""Runs share no more readings than this, positions included, unless one is a copy: noise differs every time."""
 FEWEST_BAR = 20
 PER_TURN = 8
 OTHER_RATIO = 8.0
@@ -174,32 +173,6 @@ def _too_few(run: Doc, count: int) -> list[Finding]:
         f"only {count} valid readings on {turns:g} turns: cup, bar length and lost motion take most of what they tell ({wanted} are needed)"
     )
     return [Finding(run["run_id"], what, "measure it again with a higher rate", False)]
-
-
-def copies(runs: Sequence[Doc]) -> list[Finding]:
-    """Runs whose readings stand in another run already, whatever they are called and whenever they are said to be measured."""
-    keys = [_row_keys(r) for r in runs]
-    out = []
-    for k, run in enumerate(runs):
-        for j in range(k):
-            short, long = sorted((keys[j], keys[k]), key=lambda v: v.size)
-            if short.size and np.isin(short, long).mean() >= COPIED_SHARE:
-                what = f"its readings are those of run {runs[j]['run_id']}: one measurement would count twice"
-                out.append(Finding(run["run_id"], what, "leave it out (--without), or export it again", True))
-                break
-    return out
-
-
-def _row_keys(run: Doc) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """One number per reading made of its position and deviation; none for a run whose deviations are all the same."""
-    columns = run["columns"]
-    y = np.asarray(columns["deviation_mm"], dtype=np.float64)
-    if y.size == 0 or not np.isfinite(y).all() or float(np.ptp(y)) == 0.0:
-        return np.zeros(0, dtype=np.int64)
-    key = np.rint(np.clip(y, -NO_READING_MM, NO_READING_MM) * 1e8).astype(np.int64) * 1_000_003
-    for c, prime in (("x_mm", 7_368_787), ("y_mm", 15_485_863), ("z_mm", 32_452_843)):
-        key = key * 31 + np.rint(np.asarray(columns[c], dtype=np.float64) * 1e5).astype(np.int64) * prime
-    return key
 
 
 def check_readings(machine: Machine, data: Sequence[RunData]) -> list[Finding]:

@@ -107,8 +107,8 @@ async def scene_of(
     site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
 ) -> Scene:
     """This machine, its controller and its table in force, now. ``attended``: a person who may approve is at the machine."""
-    last_s = await asyncio.to_thread(_last_push_s, store, site.name)
-    month_ago = {} if attended else _on_grid(await asyncio.to_thread(_month_ago, store, site.name, base, clock), grid)
+    last_s = await asyncio.to_thread(_last_push_s, store, site)
+    month_ago = {} if attended else _on_grid(await asyncio.to_thread(_month_ago, store, site, base, clock), grid)
     travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}
     return Scene(
         site.name, mark_of([base.status.boot_id]), MAP_VERSION, form.lsb_nm, form.bank_registers, travel, {}, base.crc,
@@ -116,9 +116,9 @@ async def scene_of(
     )  # fmt: skip
 
 
-def _month_ago(store: Store, machine: str, base: Base, clock: Clock) -> NineTables | None:
+def _month_ago(store: Store, site: Site, base: Base, clock: Clock) -> NineTables | None:
     """The tables that were in force `MONTH` ago, as far as pushes tell; before the first push that of its base, else the present one."""
-    entries = read_entries(store, machine)
+    entries = read_entries(store, site.name, site.control)
     then = clock.utc() - MONTH
     kept = [e for e in entries if e.state is State.KEEP]
     old = [e.push for e in kept if datetime.fromisoformat(e.utc) <= then]
@@ -139,6 +139,6 @@ def _on_grid(tables: NineTables | None, grid: NineTables) -> dict[tuple[str, str
     return found
 
 
-def _last_push_s(store: Store, machine: str) -> float:
-    kept = [e for e in store.push_entries(machine) if e.state == "KEEP"]
+def _last_push_s(store: Store, site: Site) -> float:
+    kept = [e for e in store.push_entries(site.name, site.control) if e.state == "KEEP"]
     return datetime.fromisoformat(kept[-1].utc).timestamp() if kept else float("-inf")

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 from service.capture.live import LiveFeed
 from service.clock import Clock, SystemClock
 from service.config_schema import MachineFile
 from service.devices.alone import alone
-from service.devices.session import open_session
 from service.events import ProgressSink
 from service.runs.columns import load_run
 from service.sequences.control import Control
+from service.sequences.needed import BALLBAR, LASER
 from service.sequences.steps import CampaignPlan
 from service.site import site_of
 from service.storage.store import Store
 from service.workflows.measure import Manner, measure
-from service.workflows.recover import recover
+from service.workflows.plausible import INSTRUMENTS, ended_certificates
+from service.workflows.recovered import recovered_session
 from service.workflows.shipped import recipe_plan
 from service.workflows.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
 
+MEASURED_WITH = {"body_diagonal_um": LASER, "helix_rms_um": BALLBAR}
 MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}
 
 
@@ -40,7 +43,7 @@ class CheckResult:
     duration_s: float
     text: str
     comparable: bool = True
-    """Whether the figures can be put beside those of other checks: measured in the air in which they can be judged."""
+    """Whether the figures can be put beside those of other checks: the air was within its limits, no certificate had ended."""
 
 
 async def run_check(
@@ -69,35 +72,56 @@ async def run_check(
     # With the machine: services that share a database check at the same second, and a campaign's name is there once.
     plan = CampaignPlan(f"{plan.name} {config.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
     with alone(site.urls.cnc):
-        async with open_session(site.urls) as session:
-            await recover(session.controller, store, site)
+        async with recovered_session(store, site) as session:
             run_ids = await measure(session, store, site, plan, progress=progress, clock=clock, manner=Manner(control=control, live=live))
     runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
+    return judged(config, runs, plan.name, started, clock.monotonic_s() - start_s)
+
+
+def judged(config: MachineFile, runs: list[dict[str, Any]], campaign: str, started: datetime, duration_s: float) -> CheckResult:
+    """Judge the runs of a check's recipe.
+
+    Raises
+    ------
+    MeasurementFault
+        They are none: a body diagonal is missing, a run was not measured to its end.
+    """
     rows = figure_rows(figures(runs))
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
     verdict = overall([judge(*rows[k], limits[k]) for k in limits if k in rows])
     text = f"{MARK[verdict]}: " + ", ".join(f"{_name(k)} {rows[k][0]:.1f} µm (limit {limits[k]:g})" for k in limits if k in rows)
-    outside = _outside(runs, config.limits.temperature_c)
-    if outside is not None:
+    against = [*_air(runs, config.limits.temperature_c), *_ended(config, rows, started)]
+    if against:
         verdict = "cannot tell"
-        low, high = config.limits.temperature_c
-        text = f"air temperature {outside:.1f} C is outside of {low:g}..{high:g} C, so the figures cannot be judged; {text}"
+        text = f"{' and '.join(against)}, so the figures cannot be judged; {text}"
     return CheckResult(
         verdict,
         {k: v for k, (v, _) in rows.items()},
         {k: COVERAGE * u for k, (_, u) in rows.items()},
         {k: v for k, v in limits.items() if k in rows},
         [r["run_id"] for r in runs],
-        plan.name,
+        campaign,
         started,
-        clock.monotonic_s() - start_s,
+        duration_s,
         text,
-        outside is None,
+        not against,
     )
 
 
 def _name(key: str) -> str:
     return {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}[key]
+
+
+def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list[str]:
+    """Instruments of these figures that no certificate carried when the check began: they cannot say what is within limits."""
+    roles = {MEASURED_WITH[name] for name in names if name in MEASURED_WITH}
+    ended = ended_certificates(site_of(config), started.astimezone(UTC).date(), roles)
+    return [f"the certificate of the {INSTRUMENTS[role]} ended on {day}" for role, day in ended.items()]
+
+
+def _air(runs: list[dict[str, Any]], window: tuple[float, float]) -> list[str]:
+    outside, (low, high) = _outside(runs, window), window
+    return [] if outside is None else [f"air temperature {outside:.1f} C is outside of {low:g}..{high:g} C"]
 
 
 def _outside(runs: list[dict[str, Any]], window: tuple[float, float]) -> float | None:

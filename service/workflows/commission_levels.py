@@ -105,7 +105,7 @@ def _keep(store: Store, site: Site, doc: Doc) -> int:
 
 def _earlier_boots(store: Store, site: Site) -> set[int]:
     """Boot ids that earlier pushes and commissionings of this machine have met."""
-    boots = {int(e.doc["boot"]) for e in read_entries(store, site.name) if "boot" in e.doc}
+    boots = {int(e.doc["boot"]) for e in read_entries(store, site.name, site.control) if "boot" in e.doc}
     last = last_proof(store, site)
     return boots | ({int(last["boot_id"])} if last else set())
 

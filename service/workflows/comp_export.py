@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -17,6 +18,7 @@ import numpy as np
 from models.arrays import F1
 from models.machine import AXES, Machine
 from service.errors import FileFormatError, FormatRefused, TableFileError
+from service.files import NotPlainError, read_plain
 from service.formats.choice import Choice, best_of, choices, rounded
 from service.formats.controls import CONTROLS, Control
 from service.formats.identified import Identified
@@ -28,7 +30,7 @@ from service.report.page_file import write_page
 from service.site import machine_from_doc
 from service.workflows.stored_prediction import stored_prediction
 
-LARGEST_FILE = 20_000_000
+LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
 ONLY_FRESH = "the tables hold for a machine that was measured without any: what was active while measuring has to be added"
 
 
@@ -74,7 +76,7 @@ def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> d
     if source.isdigit():
         return stored(int(source))
     try:
-        doc = json.loads(Path(source).read_text(encoding="utf-8"))
+        doc = json.loads(read_plain(Path(source), LARGEST_SOLUTION))
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read: {error.strerror}", "give the number of a solution or a file") from None
     except ValueError as error:
@@ -284,9 +286,9 @@ def read_files(path: Path) -> tuple[TextFile, ...]:
         paths = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")) if path.is_dir() else [path]
         out = []
         for p in paths:
-            if p.stat().st_size > LARGEST_FILE:
-                raise FileFormatError(f"{p}: {p.stat().st_size} bytes is no compensation table", "give the table's file")
-            out.append(TextFile(p.name, p.read_text(encoding="utf-8")))
+            out.append(TextFile(p.name, io.StringIO(read_plain(p, LARGEST_FILE).decode("utf-8"), None).read()))
+    except NotPlainError as error:
+        raise FileFormatError(f"{error.filename}: {error.strerror}: no compensation table", "give the table's file") from None
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read: {error.strerror}", "give a file or a folder") from None
     except UnicodeDecodeError:

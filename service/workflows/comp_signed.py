@@ -11,11 +11,13 @@ from typing import Any
 
 from service.config_schema import MachineFile
 from service.errors import FileFormatError, SignatureRefused
+from service.files import NotPlainError, read_plain
 from service.formats.text import TextFile
 from service.report.page_file import write_page
 from service.signed.container import LARGEST, NO_BASE, Claims, Expected, check, claims_of, sign
 from service.signed.keys import read_key
 from service.site import site_of
+from service.workflows.comp_export import LARGEST_FILE
 
 LONGEST_DAYS = 366.0
 
@@ -106,8 +108,9 @@ def standing(path: Path, read: Sequence[TextFile], config: MachineFile | None, a
     if config is None:
         return Standing(None, "signed, but for which machine has to be known: give --machine")
     try:
-        with seal.open("rb") as file:
-            sealed = file.read(LARGEST + 1)
+        sealed = read_plain(seal, LARGEST)
+    except NotPlainError as error:
+        raise SignatureRefused(f"{seal}: {error.strerror}", "remove it: then the files are a candidate") from None
     except OSError as error:
         raise FileFormatError(
             f"{seal}: cannot be read: {error.strerror}", "make it readable, or remove it: then it is a candidate"
@@ -130,6 +133,6 @@ def contents(path: Path) -> dict[str, bytes]:
     """
     try:
         paths = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")) if path.is_dir() else [path]
-        return {p.name: p.read_bytes() for p in paths}
+        return {p.name: read_plain(p, LARGEST_FILE) for p in paths}
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read: {error.strerror}", "give a file or a folder") from None

@@ -11,11 +11,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from models.arrays import F1, F2
+from models.machine import AXES
 from models.solvers.observations import RunData
 from models.solvers.priors import U_WAVELENGTH
 from models.verification import U_REPEAT_MM, helix_figure
 from service.report.document import Figure
 from service.report.numbers import COVERAGE, finite
+from service.runs.coverage import not_judged
+from service.runs.helix_axis import about_axis, helix_axis, path_axis
 
 MOST = 4
 NEAR_RAD = 0.05
@@ -95,10 +98,22 @@ def against(first: Loaded, other: Loaded) -> str:
     if first.run["test"] != other.run["test"]:
         return f"{other.label} is {other.run['test']}, {first.label} is {first.run['test']}: only runs of one test can be compared"
     for key in KIND:
-        a, b = (r.run["setup"].get(key) or "" for r in (first, other))
+        a, b = (_kind(r, key) for r in (first, other))
         if a != b:
             return f"{key} of {other.label} is {b or 'none'}, of {first.label} {a or 'none'}: they ran along different paths"
+    for one in (first, other):
+        if why := not_judged(one.run):
+            return f"{one.label}: {why}; a part of a path has no difference"
     return ""
+
+
+def _kind(one: Loaded, key: str) -> Any:
+    """What a set-up says under a key; the axis of a helix also where only its path tells it."""
+    setup = one.run["setup"]
+    if key == "axis" and one.run["test"] == "ballbar_helix":
+        axis = helix_axis(setup, one.data.axes_mm)
+        return "" if axis is None else AXES[axis]
+    return setup.get(key) or ""
 
 
 def _feed(mm_min: float) -> str:
@@ -153,18 +168,10 @@ def _bar(one: Loaded) -> Curve:
     assert data.centre_mm is not None
     left = helix_figure(data).deviation_mm
     at = data.axes_mm - data.centre_mm
-    setup = one.run["setup"]
-    axis = _helix_axis(setup, at) if data.test == "helix" else 3 - sum("XYZ".index(c) for c in str(setup["plane"]))
-    a, b = ((axis + 1) % 3, (axis + 2) % 3)
     noise = 1.4826 * float(np.median(np.abs(left[2:] - 2 * left[1:-1] + left[:-2]))) / np.sqrt(6.0)
-    angle = np.degrees(np.arctan2(at[:, b], at[:, a]))
+    angle = np.degrees(about_axis(at, path_axis(one.run, data.axes_mm)))
     place = at / np.linalg.norm(at, axis=1, keepdims=True)
     return Curve(True, angle, left * UM, np.full(left.size, np.hypot(noise, U_REPEAT_MM) * UM), place)
-
-
-def _helix_axis(setup: dict[str, Any], at: F2) -> int:
-    """The axis as stated; else the one along which the hemisphere of the path lies to one side of the cup."""
-    return "XYZ".index(str(setup["axis"])) if setup.get("axis") else int(np.argmax(np.abs(at.mean(axis=0))))
 
 
 def _laser(one: Loaded) -> Curve:

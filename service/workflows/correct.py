@@ -22,6 +22,7 @@ from service.sequences.campaigns import verification
 from service.sequences.check import paced
 from service.sequences.control import Control
 from service.sequences.interlocks import Suspending
+from service.sequences.needed import check_devices
 from service.site import Site
 from service.storage.store import Store
 from service.workflows.bar_places import BarPlaces, Readings
@@ -121,6 +122,7 @@ async def correct(
         An unverified table could not be taken back yet.
     """
     await recover(session.controller, store, site)
+    await _check_can_verify(session, site, rate_hz)
     await check_level(session.controller, store, site)
     await check_commissioned(session.controller, store, site)
     gathered = await gather(session.controller, store, site, campaign)
@@ -170,6 +172,7 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
         Asked for; the old table is in force.
     """
     await recover(session.controller, store, site)
+    await _check_can_verify(session, site, rate_hz)
     clock = clock or SystemClock()
     proposed = await asyncio.to_thread(load, store, number)
     against = (await hold(session.controller, store, site, number, proposed, clock, attended=attended)).reasons()
@@ -192,6 +195,11 @@ async def reasons_now(session: Session, store: Store, site: Site, number: int, c
     """
     proposed = await asyncio.to_thread(load, store, number)
     return (await hold(session.controller, store, site, number, proposed, clock or SystemClock())).reasons()
+
+
+async def _check_can_verify(session: Session, site: Site, rate_hz: int) -> None:
+    """No table is written that could not be measured afterwards; errors as of `check_devices`."""
+    await check_devices(session, verification(site.machine, rate_hz=rate_hz), air=site.watching.air_c is not None)
 
 
 def check_promise(predicted: Predicted) -> None:

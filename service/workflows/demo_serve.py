@@ -11,7 +11,6 @@ import asyncio
 import json
 import secrets
 import socket
-import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from drivers.links.shielded import run_to_end
+from service.children import python_words
 from service.clock import Clock, SystemClock
 from service.devices.session import Session, open_session
 from service.errors import AbbeError, StoreError
@@ -49,7 +49,6 @@ EVERY_MIN = 2.0
 """Minutes of the real clock between checks: at the usual speed of the demonstration hours of the machine."""
 READY_S, STOP_S, LOOK_S = 30.0, 6.0, 0.5
 LOCKED_LOOKS = 60
-PROGRAM = "from service.cli import main; main()"
 ROOM_UM = {"body_diagonal_um": 10.0, "helix_rms_um": 0.5}
 """Nobody has corrected this machine, and it is good enough as it is: the limits are what it does today, U and so much more."""
 
@@ -168,11 +167,7 @@ async def served(
     log = machine_file.with_name("service.log")
     with log.open("wb") as out_log:
         process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-c",
-            PROGRAM,
-            "serve",
-            str(machine_file),
+            *python_words("service.cli", "serve", machine_file),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=out_log,
             stderr=out_log,

@@ -24,11 +24,12 @@ from service.runs.cases import case_of
 from service.runs.observations import run_data
 from service.storage.records import ModelRecord
 from service.workflows.axis_test import SLOW_DRIFT
-from service.workflows.campaign_checks import check_files, check_readings, copies, refuse
+from service.workflows.campaign_checks import check_files, check_readings, refuse
 from service.workflows.campaign_folder import Campaign
 from service.workflows.changed_since import Since
+from service.workflows.copied_runs import copies
 from service.workflows.discovery_doc import finding_doc
-from service.workflows.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering
+from service.workflows.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering, taken_back
 from service.workflows.known_effects import applies, readings_of, without
 from service.workflows.model_book import grown
 from service.workflows.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
@@ -183,7 +184,7 @@ class Journal:
     @property
     def finding(self) -> dict[str, Any] | None:
         """What the search found, as soon as it has."""
-        return next((doc["finding"] for _, doc in self.states if "finding" in doc), None)
+        return next((taken_back(doc["finding"]) for _, doc in self.states if "finding" in doc), None)
 
     @property
     def ended(self) -> bool:

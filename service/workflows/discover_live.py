@@ -15,6 +15,7 @@ from service.devices.session import Session
 from service.errors import CampaignRefused, UnsafeToMove
 from service.events import ProgressSink
 from service.sequences.interlocks import MOVING
+from service.sequences.needed import check_devices
 from service.sequences.steps import CampaignPlan, TestPlan, Unmount
 from service.site import Site
 from service.storage.records import RUNNING, CampaignRecord
@@ -139,6 +140,7 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
         return wait_s
     if status.bits >> MOVING & 1:  # nobody is asked to reach into it
         raise UnsafeToMove("the machine is moving: it may run the path of a run that was broken off", "wait until it stands, then go on")
+    await check_devices(session, what.left, air=site.watching.air_c is not None)
     if what.begun is None:
         begun = await start_campaign(session, store, site, what.plan.name, {"continues": what.link})
     else:

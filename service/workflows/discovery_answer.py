@@ -30,6 +30,8 @@ def answer_doc(found: Discovery, case: Case, thinning: Thinning | None = None) -
         doc["beside"] = [{"label": label, "evidence": evidence} for label, evidence in found.beside]
     if found.agreement:
         doc["agreement"] = [asdict(a) for a in found.agreement]
+    if found.fitted:
+        doc["fitted"] = [asdict(f) for f in found.fitted]
     if found.unseen:
         doc["unseen"] = [asdict(u) for u in found.unseen]
     if thinning is not None:
@@ -63,4 +65,4 @@ def _effect(e: NamedEffect) -> dict[str, Any]:
 
 def where_doc(where: Where) -> dict[str, Any]:
     """What is known of the place, without the table of tests."""
-    return {k: v for k, v in asdict(where).items() if k != "table" and v not in (None, (), [])}
+    return {k: v for k, v in asdict(where).items() if k != "table" and v not in (None, (), [], "")}

@@ -14,6 +14,7 @@ from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Where
 from models.discovery.case import Case, CaseRun
 from models.effects.effect import Effect
 from service.workflows.discovery_answer import answer_doc
+from service.workflows.discovery_states import taken_back
 from service.workflows.packed import packed, packed_covariance
 from service.workflows.thinned import Thinning
 
@@ -48,6 +49,7 @@ def finding_doc(
         "agreement": [{"run": a.run, "times": a.times, "p": a.p} for a in found.agreement],
         "unjudged": [asdict(u) for u in found.unjudged],
         "unseen": [asdict(u) for u in found.unseen],
+        "fitted": [asdict(f) for f in found.fitted],
         "thinning": None if thinning is None else thinning.doc(),
         "answer": answer_doc(found, case, thinning),
         "series": {r.path.label: _series(found, r) for r in case.runs},
@@ -57,7 +59,7 @@ def finding_doc(
             "covariance": packed_covariance(found.theta_covariance),
         },
     }
-    return {key: finite(value) for key, value in doc.items()}
+    return taken_back({key: finite(value) for key, value in doc.items()})
 
 
 def finite(value: Any) -> Any:
@@ -110,6 +112,8 @@ def where_doc(where: Where) -> dict[str, Any]:
         value = getattr(where, name)
         if value:
             out[name] = list(value)
+    if where.shape:
+        out["shape"] = where.shape
     for name in ("radius_mm", "period_s", "period_mm", "angular_lobes"):
         value = getattr(where, name)
         if value is not None:

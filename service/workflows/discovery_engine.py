@@ -12,7 +12,7 @@ from models.effects.effect import Effect
 from service.clock import SystemClock
 from service.errors import EffectUnknown
 from service.events import Progress, ProgressSink
-from service.workflows.axis_test import SLOW_DRIFT, drift_found, is_axis_test
+from service.workflows.axis_test import SLOW_DRIFT, is_axis_test
 from service.workflows.effect_plugins import Plugins, installed
 
 
@@ -47,14 +47,11 @@ def effect_named(name: str) -> Effect:
 def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:
     """Find what a case's present model lacks (`models.discovery.discover`), and tell how far it is and how long it will take.
 
-    A positioning test of one axis alone cannot carry the model of a machine: its repeats are asked instead (`models.discovery.repeats`).
+    In a positioning test of one axis alone repeats are asked for a drift first (`service.workflows.axis_search`).
     """
     from models.discovery.discover import discover
+    from service.workflows.axis_search import axis_discovery
 
-    if is_axis_test(case):
-        told = drift_found(case)
-        if told is not None:
-            return told
     clock = SystemClock()
     begun = clock.monotonic_s()
 
@@ -62,6 +59,6 @@ def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Disco
         spent = clock.monotonic_s() - begun
         sink(Progress("discover", share, 1.0, spent * (1.0 - share) / share if share > 0.0 else None, text))
 
-    found = discover(case, effects, progress=tell)
+    found = (axis_discovery if is_axis_test(case) else discover)(case, effects, progress=tell)
     sink(Progress("discover", 1.0, 1.0, 0.0, "done"))
     return found

@@ -7,7 +7,7 @@ from typing import Any
 
 from service.report.numbers import NOT_AVAILABLE, plain, with_uncertainty
 from service.workflows.changed_words import changed_lines
-from service.workflows.discovery_states import closed, entering, judge, not_entered
+from service.workflows.discovery_states import LEFT, closed, entering, judge, not_entered
 from service.workflows.model_book import REMEDIES, name_of
 from service.workflows.never_fitted import disagreeing, told_missing
 
@@ -54,6 +54,12 @@ def size_text(effect: dict[str, Any]) -> str:
 
 def verdict_of(finding: dict[str, Any]) -> tuple[str, str, str]:
     """Sign, word and sentence of a finding."""
+    sign, word, text = _verdict_of(finding)
+    fitted = "; ".join(f"{f['name']} of {f['key']} {_plus_minus(f['value'], f['u'], unit(f['unit']))}" for f in finding.get("fitted", []))
+    return sign, word, f"{text} In the present model, as fitted: {fitted}." if fitted else text
+
+
+def _verdict_of(finding: dict[str, Any]) -> tuple[str, str, str]:
     gap = _gap_words(finding)
     judged = judge(finding)
     if finding["verdict"] == "none" and set(finding["where"]) == {"tests", "table"}:
@@ -64,14 +70,33 @@ def verdict_of(finding: dict[str, Any]) -> tuple[str, str, str]:
         return "open" if disagreeing(finding) else "ok", word, f"{told[:1].upper()}{told[1:]}: {gap}."
     names = " and ".join(f"{name_of(e)} {size_text(e)}" for e in finding["effects"])
     if finding["verdict"] == "unknown":
-        beside = f" Beside it: {names}." if names else ""
+        beside = f" Beside it: {names}." if names else _suspect_words(finding)
         there = "; ".join(where_lines(finding["where"])) or "it could not be located"
         return "bad", "Something is missing that the catalogue does not explain", f"{gap[0].upper()}{gap[1:]}. {there}.{beside}"
-    if judged["proved"] is False:
-        return "bad", "Named, but not proved", f"{names} fits the fitted runs, but runs that only judge do not agree: {gap}."
-    proof = "also on runs that were never fitted" if judged["proved"] else judged["rule"]
+    proof = _proof_words(judged) if judged["proved"] else judged["rule"]
     word = "Found" if not finding["confounded_with"] else "Found, but these runs cannot tell it from something else"
-    return ("ok" if word == "Found" else "open"), word, f"{names}. {gap[0].upper()}{gap[1:]}; {proof}."
+    left = _left_words(finding)
+    sign = "ok" if word == "Found" and not left else "open"
+    return sign, word, f"{names}. {gap[0].upper()}{gap[1:]}; {proof}.{left}"
+
+
+def _left_words(finding: dict[str, Any]) -> str:
+    """That more than noise is left beside what was found; empty where it is not, or where readings scatter and no model takes it out."""
+    gap = finding["gaps"].get("identify")
+    more = gap is not None and entering(finding) and gap["after_um"] > LEFT * gap["floor_um"]
+    return " More than noise is left: something else is missing, too." if more else ""
+
+
+def _proof_words(judged: dict[str, Any]) -> str:
+    """What closed on the runs that only judge: their own figures, not those of the fitted runs."""
+    before, after = (plain(judged["gap"][k]) for k in ("before_um", "after_um"))
+    return f"also on runs that were never fitted, from {before} to {after} µm rms ({judged['closed']:.0%} closed)"
+
+
+def _suspect_words(finding: dict[str, Any]) -> str:
+    """Names that were taken back; empty where there are none."""
+    names = " and ".join(f"{name_of(e)} {size_text(e)}" for e in finding.get("suspects", []))
+    return f" Suspected: {names}; but {finding['proof']}." if names else ""
 
 
 def _repeat_words(finding: dict[str, Any]) -> str:
@@ -201,6 +226,8 @@ def where_lines(where: dict[str, Any]) -> list[str]:
     if "position_mm" in where:
         near = f", within {plain(where['radius_mm'])} mm" if "radius_mm" in where else ""
         out.append("about X {:.0f}, Y {:.0f}, Z {:.0f} mm".format(*where["position_mm"]) + near)
+    if where.get("shape"):
+        out.append(str(where["shape"]))
     for key, text in (("period_s", "every {} s"), ("period_mm", "every {} mm"), ("angular_lobes", "{} lobes a turn")):
         if key in where:
             out.append(text.format(plain(where[key])))

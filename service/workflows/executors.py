@@ -8,6 +8,7 @@ from contextlib import closing
 from multiprocessing import get_context
 from typing import Any, Protocol, TypeVar
 
+from service.children import started_safely
 from service.errors import ConfigError
 
 J = TypeVar("J")
@@ -44,8 +45,11 @@ class Processes:
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
         """Results in the order of the jobs."""
-        with ProcessPoolExecutor(self._workers, mp_context=get_context("spawn")) as pool:
-            yield from pool.map(work, jobs)
+        with started_safely():  # all of them start here; making the pool starts the first, which watches over what they share
+            pool = ProcessPoolExecutor(self._workers, mp_context=get_context("spawn"))
+            found = pool.map(work, jobs)
+        with pool:
+            yield from found
 
 
 class Dask:

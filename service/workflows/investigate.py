@@ -19,7 +19,7 @@ from models.machine import Machine
 from service.capture.live import LiveFeed
 from service.clock import Clock
 from service.devices.alone import alone
-from service.devices.session import DeviceUrls, open_session
+from service.devices.session import DeviceUrls
 from service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
 from service.events import Progress, ProgressSink
 from service.sequences.campaigns import identification
@@ -44,7 +44,7 @@ from service.workflows.measure import Manner, measure
 from service.workflows.model_book import REMEDIES, current, name_of
 from service.workflows.proposal_diff import compare, largest
 from service.workflows.proposals import Made, check_temperature, gather, make
-from service.workflows.recover import recover
+from service.workflows.recovered import recovered_session
 from service.workflows.table_out import table_then
 
 BESIDE = 0.5
@@ -113,8 +113,7 @@ async def _measured(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
     plan = replace(bench.plan, name=f"alarm {alarm.number} {bench.clock.utc():%Y-%m-%d %H:%M:%S}")
     site, manner = bench.site, Manner(control=bench.control, part=True, live=bench.live)
     with alone(site.urls.cnc):
-        async with open_session(site.urls) as session:
-            await recover(session.controller, bench.store, site)
+        async with recovered_session(bench.store, site) as session:
             # Only now: while another process has the machine nothing of this try has begun.
             await note(Kind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
             plan = paced(plan, site.max_feed_mm_min)
@@ -192,8 +191,7 @@ async def made_of(bench: Bench, campaign: str, agree: Callable[[Predicted], None
     """
     site, store = bench.site, bench.store
     with alone(site.urls.cnc):
-        async with open_session(DeviceUrls(site.urls.cnc)) as session:
-            await recover(session.controller, store, site)
+        async with recovered_session(store, site, DeviceUrls(site.urls.cnc)) as session:
             gathered = await gather(session.controller, store, site, campaign)
             check_temperature(site, gathered.runs)
             return await make(store, site, gathered, clock=bench.clock, progress=bench.progress, agree=agree, by=by)

@@ -19,6 +19,7 @@ from service.report.model import PolarTrace
 from service.report.numbers import plain
 from service.report.plots.polar import polar_plot
 from service.report.plots.positioning import PositioningCurves, positioning_plot
+from service.runs.coverage import not_judged
 from service.workflows.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
 
 UM = 1e3
@@ -58,7 +59,8 @@ def evaluate(runs: Sequence[dict[str, Any]], instruments: dict[str, Any] | None 
     """
     out = Evaluated()
     budget = scale_budget(instruments or {})
-    refused: list[str] = []
+    refused = [f"run {run['run_id']}: {why}" for run in runs if (why := not_judged(run))]
+    runs = [run for run in runs if not not_judged(run)]
     linear, along, circles = linear_tests(runs, refused), diagonal_tests(runs, refused), circle_tests(runs, refused)
     out.not_observable += [f"figures by ISO 230 of {line}" for line in refused]
     for test in linear:

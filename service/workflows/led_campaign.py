@@ -13,20 +13,22 @@ from typing import Any
 from models.compensation.tables import Predicted
 from models.machine import Machine
 from service.devices.alone import alone
-from service.devices.session import Session, open_session
-from service.errors import TableMismatch
+from service.devices.session import Session
+from service.errors import TableMismatch, TableRefused
 from service.sequences.campaigns import identification
 from service.sequences.check import paced
 from service.sequences.control import Control, State
 from service.sequences.interlocks import COMPENSATION_ON
+from service.sequences.needed import check_devices, needed_by
 from service.sequences.recipe_file import parse_recipe, recipe_source
-from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser
+from service.sequences.steps import CampaignPlan
 from service.workflows.base_table import read_base
 from service.workflows.correct import check_promise
 from service.workflows.investigate import NO, Bench, made_of, promise_words
 from service.workflows.measure import Manner, measure, start_campaign
+from service.workflows.plausible import certificates
 from service.workflows.proposals import check_certificates
-from service.workflows.recover import recover
+from service.workflows.recovered import recovered_session
 from service.workflows.shipped import IDENTIFICATION, USUAL_HZ, parted
 
 SOLVING = "all is measured, and nothing moves while it is solved"
@@ -92,6 +94,7 @@ async def led_campaign(bench: Bench, source: dict[str, Any], by: str) -> Led:
     await bench.control.gate()
     try:
         check_certificates(bench.site)
+        _check_not_ended(bench)
     except NO as no:
         return Led("ended", f"no proposal: {no}")
     await _measured(bench, source)
@@ -110,10 +113,9 @@ async def _measured(bench: Bench, source: dict[str, Any]) -> None:
     whoever = _Whoever(bench.control)
     manner = Manner(control=bench.control, source=source, part=True, live=bench.live)
     with alone(site.urls.cnc):
-        async with open_session(site.urls, whoever.ask) as session:
+        async with recovered_session(store, site, ask=whoever.ask) as session:
             whoever.session = session
-            _check_instruments(session, plan)
-            await recover(session.controller, store, site)
+            await check_devices(session, plan, air=site.watching.air_c is not None)
             await bench.control.gate()
             await _check_table_acts(session)
             begun = await start_campaign(session, store, site, name)
@@ -142,14 +144,11 @@ async def _proposed(bench: Bench, by: str) -> Led:
     return Led("proposed", await asyncio.to_thread(promise_words, bench.store, made), solution, made.number)
 
 
-def _check_instruments(session: Session, plan: CampaignPlan) -> None:
-    """What is not configured is said now, not at the set-up that needs it, half an hour later."""
-    steps = [step for test in plan.tests for step in test.steps]
-    if any(isinstance(step, MountBar | ChangeBar) for step in steps):
-        session.need_ballbar()
-    if any(isinstance(step, MountLaser) for step in steps):
-        session.need_laser()
-    session.need_fixture()
+def _check_not_ended(bench: Bench) -> None:
+    """No hour is measured for a table that no certificate carries any more."""
+    ended = certificates(bench.site, bench.clock.utc().date(), needed_by(bench.plan).first)
+    if ended:
+        raise TableRefused("; ".join(ended), "have it calibrated, then start again; nothing was measured")
 
 
 async def _check_table_acts(session: Session) -> None:

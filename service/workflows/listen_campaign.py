@@ -11,6 +11,7 @@ from service.clock import Clock, SystemClock
 from service.devices.session import Session
 from service.errors import AbbeError
 from service.sequences.check import dry_run_campaign
+from service.sequences.needed import check_devices
 from service.sequences.steps import CampaignPlan, Unmount
 from service.site import Site
 from service.storage.store import Store
@@ -32,6 +33,7 @@ async def listen(session: Session, store: Store, site: Site, plan: CampaignPlan,
     dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     for test in plan.tests:
         wanted(test)
+    await check_devices(session, plan)
     under_way = OpenCampaign(*await start_campaign(session, store, site, plan.name, {"listened": True}))
     run_ids = []
     for test in plan.tests:

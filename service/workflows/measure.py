@@ -17,7 +17,7 @@ from service.capture.recorder import CaptureRecorder, close_run, recording
 from service.clock import Clock, SystemClock
 from service.devices.clock_notes import notes_since
 from service.devices.session import Session
-from service.errors import AbbeError, Aborted, ConfigError, DiskFull, RunInterrupted, Stopped, StoreError
+from service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
 from service.events import ProgressSink, ignore_progress
 from service.sequences.check import dry_run_campaign, step_seconds
 from service.sequences.control import Control, State
@@ -25,10 +25,11 @@ from service.sequences.guard import warnings_of
 from service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
 from service.sequences.interlocks import COMPENSATION_ON
 from service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
+from service.sequences.needed import check_devices
 from service.sequences.preconditions import Expected
 from service.sequences.rewind import Attempt
 from service.sequences.runner import Runner, Tick
-from service.sequences.steps import CampaignPlan, MoveTo, RecordPath, TestPlan
+from service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
 from service.site import Site
 from service.storage.owner import this_process
 from service.storage.records import DISK_FULL
@@ -118,8 +119,8 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
 
     Raises
     ------
-    StrokeError
-        Before anything moves.
+    StrokeError, ConfigError, DevicesNotReady, DriverError
+        The plan does not fit the machine, or a device that it needs is missing, silent or not what it should be: before anything moves.
     Interlock, MeasurementFault, DriverError
         The run in hand is closed as failed, with the reason; earlier runs stay.
     Stopped, Aborted
@@ -128,11 +129,7 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
     clock, manner = clock or SystemClock(), manner or Manner()
     control, resumed = manner.control or Control(), manner.resumed
     dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
-    if site.watching.air_c is not None and session.laser is None:
-        raise ConfigError(
-            "run_temperature_c is set, but no laser is configured whose sensor could read the air",
-            "add laser = ... under [devices], or take run_temperature_c out of [limits]",
-        )
+    await check_devices(session, plan, air=site.watching.air_c is not None)
     if resumed is not None:
         campaign = resumed.campaign
     campaign = campaign or await start_campaign(session, store, site, plan.name)
@@ -264,7 +261,7 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
 ) -> int:
     """One test as one run; whatever ends it early is written into the run before it is raised again."""
     runner, attempt, journal = (how.runner, how.attempt, how.journal) if how is not None else (Runner(session), Attempt(), NoJournal())
-    doc = await start_document(session, site, campaign, test, clock)
+    doc = await start_document(session, site, campaign, test, clock) | _standstills(test, attempt)
     if attempt.onward is not None:
         doc["path"] |= attempt.onward.doc()
     run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, doc)
@@ -345,3 +342,9 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
             doc["path"] |= {} if step.measured is None else {"measured": list(step.measured)}
             doc["rate_hz"] = step.rate_hz
     return doc
+
+
+def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
+    """How many readings at standstill a whole run has: those of its steps, and those carried over, the last of which is read again."""
+    count = sum(isinstance(step, ReadLaser | ReadBar) for step in test.steps)
+    return {"standstills": count + max(0, len(attempt.rewind.carried) - 1)} if count else {}

@@ -50,7 +50,7 @@ async def finish_when_safe(controller: Controller, store: Store, site: Site, *, 
     TableMismatch
         The controller holds a table that the journal does not know: a person must look.
     """
-    book = await StoreBook.last(store, site.name, clock)
+    book = await StoreBook.last(store, site.name, clock, site.control)
     if book is None or (await book.entries())[-1].state in TERMINAL - {State.OPERATOR}:
         return None
     port = ControllerPort(controller, nobody(), clock)

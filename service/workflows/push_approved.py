@@ -14,7 +14,7 @@ from typing import Any
 from drivers.errors import DriverError
 from service.clock import Clock
 from service.devices.alone import alone
-from service.devices.session import Session, open_session
+from service.devices.session import Session
 from service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
 from service.events import ProgressSink
 from service.sequences.campaigns import verification
@@ -34,7 +34,7 @@ from service.workflows.proposal_states import standing
 from service.workflows.proposals import load_runs
 from service.workflows.proved_levels import check_level
 from service.workflows.push_word import STOPPED, Outcome
-from service.workflows.recover import recover
+from service.workflows.recovered import recovered_session
 
 WAIT_S = 600.0
 """So long a machine that does not let the old table back at once is watched; after that the service tries again and again, and says so."""
@@ -103,8 +103,7 @@ async def push_approved(site: Site, store: Store, order: Order, *, clock: Clock,
     """
     with alone(site.urls.cnc):
         try:
-            async with open_session(site.urls) as session:
-                await recover(session.controller, store, site)
+            async with recovered_session(store, site) as session:
                 await order.begun()
                 return await _heard(_Bench(session, site, store, clock, rate_hz), order)
         except MachineInUse:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.errors import StoreError, TableMismatch, TableRefused
-from service.push.entries import Entry, Journal, JournalBroken, check_chain, facts
+from service.push.entries import WORD, Entry, Journal, JournalBroken, check_chain, facts
 from service.push.states import TERMINAL, State
 
 KIND = "rollback"
@@ -12,7 +12,7 @@ STILL_ACTIVE = "the unverified table is STILL ACTIVE"
 
 
 def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
-    """Journals of all pushes of a machine, by number.
+    """Journals of all pushes of a machine, by number; a person's word before the first is none.
 
     Raises
     ------
@@ -23,8 +23,13 @@ def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
         check_chain(entries)
     except JournalBroken as error:
         raise StoreError(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
-    numbers = sorted({e.push for e in entries})
+    numbers = sorted({e.push for e in entries} - {WORD})
     return {n: tuple(e for e in entries if e.push == n) for n in numbers}
+
+
+def ended_as(journal: Journal) -> State:
+    """The state in which a push stands or came to its end: a person's word for a table, given later, changes nothing of that."""
+    return next((e.state for e in reversed(journal) if e.state is not State.ACCEPTED), State.ACCEPTED)
 
 
 def push_log(journal: Journal) -> tuple[str, ...]:
@@ -65,7 +70,7 @@ def last_kept(entries: list[Entry], rollbacks: frozenset[int]) -> Journal:
     TableRefused
         None was kept, or it was a rollback itself.
     """
-    kept = [j for j in pushes_of(entries).values() if j[-1].state is State.KEEP]
+    kept = [j for j in pushes_of(entries).values() if ended_as(j) is State.KEEP]
     if not kept:
         raise TableRefused("no push of this machine was kept: there is nothing to take back", "nothing was written")
     last = kept[-1]

@@ -11,6 +11,7 @@ from service.push.entries import Journal, facts
 from service.push.states import BEFORE_ACTIVATION, State
 from service.storage.store import Store
 from service.workflows.push_history import operator_needed, pushes_of
+from service.workflows.unverified import Pushed, known_tables
 
 OPEN, STOPPED = "open", "stopped"
 
@@ -67,11 +68,26 @@ def _last_own(store: Store, machine: str, own: Callable[[int, dict[str, Any]], b
     return outcome_of(mine[-1], names) if mine else None
 
 
-def open_push(store: Store, machine: str) -> str:
-    """What is open of the last push of a machine, as a sentence; empty if nothing is."""
-    journals = pushes_of(read_entries(store, machine))
+def open_push(store: Store, machine: str, control: str = "") -> str:
+    """What is open of the last push into a machine's control, as a sentence; empty if nothing is."""
+    journals = pushes_of(read_entries(store, machine, control))
     found = outcome_of(journals[max(journals)]) if journals else None
     return found.text if found is not None and found.word == OPEN else ""
+
+
+def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
+    """The same, and every push of another journal whose table nothing has verified and may be in force: it may be that of this control,
+    under another name or address.
+    """
+    chain, own = store.push_chain(machine, control), open_push(store, machine, control)
+    others = [p for p in known_tables(store).unverified.values() if p.may_be_active and p.chain != chain]
+    return [*filter(None, [own]), *map(_other, others)]
+
+
+def _other(push: Pushed) -> str:
+    at = f" at {push.control}" if push.control else ""
+    what = "its table was never verified; if this is that control, nothing is measured on it"
+    return f"push {push.push} of machine {push.machine!r}{at} stands at {push.state}: {what}"
 
 
 def by_journal(store: Store, machine: str, proposal: int, after: int, said: Outcome) -> Outcome:

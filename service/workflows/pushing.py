@@ -8,15 +8,17 @@ from __future__ import annotations
 import asyncio
 import secrets
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 
 from drivers.api import Controller
 from drivers.cnc.tables import crc32, encode
+from drivers.errors import DriverError
 from drivers.links.shielded import run_to_end
 from models.compensation.tables import NineTables
 from service.clock import Clock, SystemClock
-from service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableRefused
+from service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from service.push import conduct
 from service.push.adapter import ControllerPort, People
 from service.push.approval import approval_digest
@@ -37,13 +39,16 @@ from service.workflows.push_history import STILL_ACTIVE, operator_needed, push_l
 from service.workflows.tables import table_image
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"
+NOT_TO_BE_TRUSTED = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"
 PERHAPS = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
+AGAIN_S = 2.0
+"""So long after a push that was given up although its activation had been sent, the controller is asked once more what is in force."""
 STILL_S, STILL_POLL_S, STILL_LIMIT_S = 1.2, 0.05, 15.0
 """The axes have to stand for so long before a table may change; how often that is asked, and for how long."""
 
 _under_way: set[tuple[str, str]] = set()
-"""Machines into which this process pushes now, by database and name."""
+"""Controls into which this process pushes now, by database and control (or name, where no address is given)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +140,7 @@ class Pushing:
         StillActive
             The old table could not be made active again (yet).
         TableMismatch
-            The controller holds what the journal does not know; or encoding is not what the tables mean.
+            The controller holds what the journal does not know, or activated what it had refused; or encoding is not what the tables mean.
         MachineInUse, UnsafeToMove
             Another push on this machine is under way, or has not come to an end.
         Stopped, Aborted
@@ -146,7 +151,7 @@ class Pushing:
             When nothing is on its way any more; a note says which table is in force.
         """
         order = await self._order(wanted)
-        key = (str(self.store.url), self.site.name)
+        key = _place(self.store, self.site)
         if key in _under_way:
             raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
         _under_way.add(key)
@@ -154,9 +159,10 @@ class Pushing:
         self.control.hurry = "a table that nobody has verified may be in force: stop it, or let it end"
         try:
             await self.control.gate()
-            book = await StoreBook.new(self.store, self.site.name, self.clock)
+            book = await StoreBook.new(self.store, self.site.name, self.clock, self.site.control)
             await self._stand_still()
             ended = await self._drive(book, order, wanted, questions)
+            await self._look_again(ended)
         finally:
             _under_way.discard(key)
             self.control.hurry = ""
@@ -174,7 +180,7 @@ class Pushing:
         return Order(
             self.site.name, image, crc32(image), meaning, self.site.limits.digest(),
             owner=(secrets.randbits(15) + 1) << 16, level=level, attended=self.attended, table=table_id,
-            process=asdict(this_process()),
+            process=asdict(this_process()), control=self.site.control,
         )  # fmt: skip
 
     async def _stand_still(self) -> None:
@@ -209,6 +215,25 @@ class Pushing:
         if failed is not None:
             raise failed
         return task.result()
+
+    async def _look_again(self, ended: Ended) -> None:
+        """A control that refused the activation, or was fenced off, must not do it all the same a moment later.
+
+        Raises
+        ------
+        TableMismatch
+            It did.
+        """
+        if ended.state is not State.ABORTED or State.ACTIVATING not in {entry.state for entry in ended.journal}:
+            return
+        known = facts(ended.journal)
+        await self.clock.sleep(AGAIN_S)
+        with suppress(DriverError):  # nothing was activated as far as the controller said; the next command looks again
+            now = await self.controller.comp_status()
+            if now.bank_crc[now.active_bank] == known["crc"] != known["base_crc"]:
+                said = f"push {ended.journal[-1].push} was given up ({known.get('why', '')})"
+                why = f"{said}, and the control made its table active all the same"
+                raise TableMismatch(f"{why}: {STILL_ACTIVE} (CRC {known['crc']:08X})", NOT_TO_BE_TRUSTED)
 
     def _told_to_stop(self) -> str:
         return self._stop or ("stopped by a person" if self.control.stopping or self.control.aborting else "")
@@ -338,6 +363,10 @@ def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
     return "the old table is in force"
 
 
-def pushes_here(store: Store, machine: str) -> bool:
-    """Whether this process is pushing into a machine now."""
-    return (str(store.url), machine) in _under_way
+def pushes_here(store: Store, site: Site) -> bool:
+    """Whether this process is pushing into a machine's control now."""
+    return _place(store, site) in _under_way
+
+
+def _place(store: Store, site: Site) -> tuple[str, str]:
+    return str(store.url), site.control or site.name

@@ -12,24 +12,32 @@ from service.clock import Clock, SystemClock
 from service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
 from service.push import conduct
 from service.push.adapter import ControllerPort, nobody
-from service.push.book import StoreBook, read_entries
-from service.push.entries import Journal, facts
+from service.push.book import StoreBook
+from service.push.entries import WORD, Journal, facts
 from service.push.staging import LAID_ASIDE
-from service.push.states import TERMINAL, State
+from service.push.states import BEFORE_ACTIVATION, TERMINAL, State
 from service.site import Site
 from service.storage.owner import Owner, this_process
 from service.storage.store import Store
 from service.workflows.old_pushes import finish_old_push
 from service.workflows.push_history import operator_needed
 from service.workflows.pushing import pushes_here
-from service.workflows.unverified import unverified_crcs
+from service.workflows.table_gate import accept_strange, check_in_force, said, vouch
+from service.workflows.unverified import Known, known_tables
+from service.workflows.whose_push import check_own, is_own
 
-LOOK = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
 READY = "make the machine ready (interlocks, link), then start again"
 
 
-async def recover(controller: Controller, store: Store, site: Site) -> str | None:
+async def recover(controller: Controller, store: Store, site: Site, *, accept_by: str = "") -> str | None:
     """Finish what the last push left open, and take over what interrupted runs left; returns what was done in a sentence or two, or None.
+
+    Everything that moves the machine, or builds on its table, calls this first (tests/unit/service_jobs/test_every_door.py).
+
+    Parameters
+    ----------
+    accept_by : str
+        Who vouches for a table in force that this database did not push; empty: nobody does.
 
     Raises
     ------
@@ -38,18 +46,20 @@ async def recover(controller: Controller, store: Store, site: Site) -> str | Non
     StillActive
         The unverified table is still active, because the controller refuses or does not answer.
     TableMismatch
-        The controller holds a table that the journal does not know: a person must look (`abbe accept-table`).
+        The controller holds a table that nothing has verified, under whatever name it was pushed, or that this database did not push: a
+        person must look (`abbe accept-table`).
     StoreError, CaptureFault
         The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only told.
     """
     # First: whatever is wrong with a segment, no unverified table stays active.
-    pushed = [await finish_old_push(controller, store, site), await finish_push(controller, store, site)]
+    pushed = [await finish_old_push(controller, store, site), await finish_push(controller, store, site, accept_by=accept_by)]
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
     return "; ".join([*filter(None, pushed), *(run.text for run in runs)]) or None
 
 
-async def finish_push(controller: Controller, store: Store, site: Site, clock: Clock | None = None) -> str | None:
-    """Bring the last push of this machine to its end, from its journal and from what the controller says.
+async def finish_push(controller: Controller, store: Store, site: Site, clock: Clock | None = None, *, accept_by: str = "") -> str | None:
+    """Bring the last push into this machine's control to its end, from its journal and from what the controller says; then look at the
+    table in force (`check_in_force`).
 
     Returns
     -------
@@ -61,33 +71,31 @@ async def finish_push(controller: Controller, store: Store, site: Site, clock: C
     MachineInUse, StillActive, TableMismatch
         As of `recover`.
     """
-    clock = clock or SystemClock()
-    book = await StoreBook.last(store, site.name, clock)
-    if book is None:
-        return None
-    journal = await book.entries()
-    before = journal[-1].state
-    if before is State.OPERATOR:
-        raise operator_needed(journal)
-    _refuse_if_under_way(store, site, journal)
-    ended = await run_to_end(conduct.recover(ControllerPort(controller, nobody(), clock), book))
-    told = _told(ended, before)
+    told = await _ended(controller, store, site, clock or SystemClock())
     try:
-        await _refuse_unverified(controller, store, site)
+        accepted = await accept_strange(controller, store, site, accept_by) if accept_by else None
+        await check_in_force(controller, store, site)
     except (AbbeError, DriverError) as error:
         if told:
             error.add_note(told)
         raise
-    return told
+    return "; ".join(filter(None, (told, accepted))) or None
 
 
-async def _refuse_unverified(controller: Controller, store: Store, site: Site) -> None:
-    """Whoever made a table the active one that no push has kept: nothing is measured or written on it."""
-    unverified = unverified_crcs(await asyncio.to_thread(read_entries, store, site.name))
-    now = await controller.comp_status()
-    crc = now.bank_crc[now.active_bank]
-    if crc in unverified:
-        raise TableMismatch(f"the table in force (CRC {crc:08X}) is that of push {unverified[crc]}, which was never verified", LOOK)
+async def _ended(controller: Controller, store: Store, site: Site, clock: Clock) -> str | None:
+    """The same without the look at the table: what was done of the last push."""
+    book = await StoreBook.last(store, site.name, clock, site.control)
+    journal: Journal = () if book is None else await book.entries()
+    if book is None or journal[-1].push == WORD:
+        return None
+    before = journal[-1].state
+    if before not in TERMINAL or before is State.OPERATOR:
+        await check_own(controller, site, journal)
+    if before is State.OPERATOR:
+        raise operator_needed(journal)
+    _refuse_if_under_way(store, site, journal)
+    ended = await run_to_end(conduct.recover(ControllerPort(controller, nobody(), clock), book))
+    return _told(ended, before)
 
 
 def _told(ended: conduct.Ended, before: State) -> str | None:
@@ -105,10 +113,20 @@ def _told(ended: conduct.Ended, before: State) -> str | None:
     raise StillActive(f"the unverified table of push {number} is still active: {known.get('pending', ended.why)}", READY)
 
 
-async def accept(controller: Controller, store: Store, site: Site) -> str:
-    """A person vouches for the table that is active now: the last push is closed. Returns what was done.
+async def accept(controller: Controller, store: Store, site: Site, by: str = "a person") -> str:
+    """A person vouches for the table that is active now: every push that is open with it is closed, under whatever name it was begun.
 
     An interrupted push that can be finished is finished instead, and nothing is accepted: the person has looked at another table then.
+
+    Parameters
+    ----------
+    by : str
+        Who; it is kept in the journal.
+
+    Returns
+    -------
+    str
+        What was done.
 
     Raises
     ------
@@ -117,9 +135,9 @@ async def accept(controller: Controller, store: Store, site: Site) -> str:
     """
     clock = SystemClock()
     await finish_old_push(controller, store, site, accepted=True)
-    book = await StoreBook.last(store, site.name, clock)
+    book = await StoreBook.last(store, site.name, clock, site.control)
     journal: Journal = () if book is None else await book.entries()
-    if book is not None and journal[-1].state not in TERMINAL:
+    if book is not None and journal[-1].state not in TERMINAL and await is_own(controller, site, journal):
         _refuse_if_under_way(store, site, journal)
         before = await controller.comp_status()
         ended = await run_to_end(conduct.recover(ControllerPort(controller, nobody(), clock), book))
@@ -130,10 +148,10 @@ async def accept(controller: Controller, store: Store, site: Site) -> str:
                 "the table from before it was made active again: look at the controller once more" if changed else "its table is as it was"
             )
             return f"push {journal[-1].push} was interrupted and is finished now ({journal[-1].state}); {what}; nothing was accepted"
-    return await _accepted(controller, book, journal)
+    return await _accepted(controller, store, site, by)
 
 
-async def _accepted(controller: Controller, book: StoreBook | None, journal: Journal) -> str:
+async def _accepted(controller: Controller, store: Store, site: Site, by: str) -> str:
     now = await controller.comp_status()
     crc, other = now.bank_crc[now.active_bank], 1 - now.active_bank
     if now.bank_state[other] == LAID_ASIDE and now.bank_crc[other] != crc:
@@ -141,15 +159,36 @@ async def _accepted(controller: Controller, book: StoreBook | None, journal: Jou
             f"the control has another table laid aside (bank {other}, CRC {now.bank_crc[other]:08X}) and uses it after its next start",
             "take that one away at the control first; nothing was accepted",
         )
-    told = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted"
-    if book is None:
+    known = await asyncio.to_thread(known_tables, store)
+    chain = await asyncio.to_thread(store.push_chain, site.name, site.control)
+    await _given_to_a_person(store, site, chain)
+    for other_chain in _open_with(crc, known) - {chain}:
+        book = await _given_to_a_person(store, site, other_chain)
+        await book.append(await book.entries(), State.ACCEPTED, said(now, by))
+    await vouch(store, site, now, by)
+    told = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted by {by}"
+    push = known.unverified.get(crc)
+    if push is None:
         return told
-    known = facts(journal)
-    if journal[-1].state not in TERMINAL:
-        journal = (*journal, await book.append(journal, State.OPERATOR, {"why": "a person took the decision"}))
-    unverified = crc == known["crc"] and journal[-1].state is not State.KEEP
-    await book.append(journal, State.ACCEPTED, {"accepted_bank": now.active_bank, "accepted_crc": crc})
-    return told + (f"; it is that of push {journal[-1].push}, which no measurement has verified" if unverified else "")
+    name = "" if push.chain == chain and push.machine == site.name else f" of machine {push.machine!r}"
+    return f"{told}; it is that of push {push.push}{name}, which no measurement has verified"
+
+
+def _open_with(crc: int, known: Known) -> set[str]:
+    """Journal of the last push that brought this table, if it is still open: under another name or address it would be taken back."""
+    push = known.pushed.get(crc)
+    return {push.chain} if push is not None and push.chain and push.may_be_active else set()
+
+
+async def _given_to_a_person(store: Store, site: Site, chain: str) -> StoreBook:
+    """The last push of a journal, with the decision left to a person if it was open."""
+    book = await StoreBook.of_chain(store, chain, SystemClock()) or await StoreBook.word(store, site.name, SystemClock(), site.control)
+    journal = await book.entries()
+    if journal and journal[-1].state not in TERMINAL:
+        _refuse_if_under_way(store, site, journal)
+        state = State.ABORTED if journal[-1].state in BEFORE_ACTIVATION else State.OPERATOR
+        await book.append(journal, state, {"why": "a person took the decision"})
+    return book
 
 
 def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
@@ -160,5 +199,5 @@ def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
     process = facts(journal).get("process")
     owner = Owner(**process) if process else None
     ours = owner == this_process()
-    if owner is not None and (pushes_here(store, site.name) if ours else not owner.is_gone()):
+    if owner is not None and (pushes_here(store, site) if ours else not owner.is_gone()):
         raise MachineInUse(f"push {last.push} is under way (process {owner.pid})", "wait until it has ended")

@@ -20,6 +20,8 @@ from service.workflows.report_discovery import discovery_report
 from service.workflows.report_done import push_report, verification_report
 from service.workflows.report_measured import Measured, campaign_report, run_report
 from service.workflows.report_parts import Rules
+from service.workflows.report_table import table_said
+from service.workflows.report_then import of_then
 
 FORMS: dict[str, Callable[[Document], str | bytes]] = {
     ".pdf": document_pdf,
@@ -52,7 +54,8 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
     if what == "verification":
         return verification_report(store, number, rules)
     names = list(dict.fromkeys(m.name for m in store.machines())) if machine is None else [machine]
-    having = [n for n in names if any(e.push == number for e in store.push_entries(n))]
+    chains = {store.push_chain(n): n for n in names}  # machines that were renamed share one
+    having = [n for chain, n in chains.items() if any(e.push == number for e in store.push_entries_of(chain))]
     if len(having) != 1:
         told = f"machines {', '.join(having)} each have a push {number}" if having else f"no push {number} in the database"
         raise StoreError(told, "say of which machine: --of NAME" if having else "abbe correct pushes tables; pushes count from 1")
@@ -62,12 +65,16 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
 def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules) -> Document:
     """Report of a stored run or campaign."""
     if isinstance(record, CampaignRecord):
-        return campaign_report(_measured(store, record.name), rules)
+        found = _measured(store, record.name)
+        return of_then(campaign_report(found, rules), store, found.campaign.site.name, record.created_utc, found.campaign.runs)
     campaign = from_store(store, record.campaign)
     if all(r["run_id"] != record.label for r in campaign.runs):  # incomplete: what is there is reported and said to be so
         campaign = Campaign(campaign.name, campaign.site, [*campaign.runs, load_run(store, record.id)], None, campaign.doc)
     facts = {"Started": record.started_utc, "Ended": record.ended_utc or "not ended"}
-    return run_report(Measured(campaign, facts, [_state(record)]), record.label, rules)
+    runs = [r for r in campaign.runs if r["run_id"] == record.label]
+    table = table_said(store, campaign.site.name, runs)
+    document = run_report(Measured(campaign, facts, [_state(record)], table=table), record.label, rules)
+    return of_then(document, store, campaign.site.name, record.started_utc, runs)
 
 
 def folder_report(folder: Path, rules: Rules) -> Document:
@@ -83,7 +90,9 @@ def _measured(store: Store, name: str) -> Measured:
         ends = [r.ended_utc for r in runs if r.ended_utc]
         facts |= {"First run started": min(r.started_utc for r in runs)} | ({"Last run ended": max(ends)} if ends else {})
     solution = next(((s.id, s.doc) for s in reversed(store.solutions(record.id)) if "mean_over_volume" in s.doc), None)
-    return Measured(from_store(store, name), facts, [_state(r) for r in runs], solution)
+    campaign = from_store(store, name)
+    table = table_said(store, campaign.site.name, campaign.runs)
+    return Measured(campaign, facts, [_state(r) for r in runs], solution, table)
 
 
 def _state(run: RunRecord) -> tuple[str, ...]:

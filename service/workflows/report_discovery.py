@@ -13,6 +13,7 @@ from service.storage.store import Store
 from service.workflows import report_parts as parts
 from service.workflows.campaign_folder import from_store
 from service.workflows.discovery_pages import discovery_page
+from service.workflows.discovery_states import taken_back
 from service.workflows.discovery_words import book_lines, rival_lines, unit
 from service.workflows.model_book import name_of
 from service.workflows.report_parts import Rules
@@ -31,7 +32,7 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
     """
     record = store.discovery(number)
     steps = store.discovery_steps(number)
-    finding = next((s.doc["finding"] for s in steps if "finding" in s.doc), None)
+    finding = next((taken_back(s.doc["finding"]) for s in steps if "finding" in s.doc), None)
     if finding is None:
         raise StoreError(f"discovery {number} has not ended", "give the same abbe discover command again: it goes on there")
     name = next(c.name for c in store.campaigns() if c.id == record.campaign_id)

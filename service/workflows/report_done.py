@@ -11,7 +11,7 @@ import numpy as np
 from models.compensation.tables import NineTables
 from service.errors import StoreError, TableMismatch
 from service.push.book import read_entries
-from service.push.entries import Entry, JournalBroken, check_chain, facts
+from service.push.entries import WORD, Entry, JournalBroken, check_chain, facts
 from service.push.states import TERMINAL, State
 from service.report.document import Document, Figure, Picture, Sign, TextTable
 from service.report.model import TableCurve
@@ -23,6 +23,8 @@ from service.workflows.campaign_folder import Campaign, from_store
 from service.workflows.iso_report import Evaluated, evaluate
 from service.workflows.push_history import push_log
 from service.workflows.report_parts import Doc, Rules
+from service.workflows.report_table import table_said
+from service.workflows.report_then import of_then
 from service.workflows.tables import tables_from_image
 from service.workflows.verify import COVERAGE
 
@@ -54,26 +56,30 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
     campaign = None if record.campaign_id is None else from_store(store, store.campaign(record.campaign_id).name)
     runs = [] if campaign is None else campaign.runs
     told = Evaluated() if campaign is None else evaluate(runs, campaign.doc.get("instruments"))
+    table = table_said(store, machine.name, runs)
     figures = verification_figures(record, rules)
     condition, remarks = parts.conditions(runs, rules)
     about = parts.machine_facts(machine.doc) | {"Verification": str(number), "Decided": record.utc}
     about |= {"Campaign": campaign.name} if campaign is not None else {}
     about |= _occasion(record.doc)
     sign, word = VERDICTS.get(record.verdict, ("open", record.verdict[:1].upper() + record.verdict[1:]))
-    return Document(
+    verdict = (sign, word, str(record.doc.get("text", "")))
+    verdict = verdict if record.verdict == "fail" else table.verdict(verdict)  # a no needs no other
+    document = Document(
         kind="verification",
         title=f"Verification {number} of {machine.name}",
         about=about,
-        verdict=(sign, word, str(record.doc.get("text", ""))),
+        verdict=verdict,
         figures=[*figures, *told.figures],
         instruments=_instruments(campaign, rules),
         conditions=condition,
         not_observable=told.not_observable if campaign is not None else ["its readings: no campaign is stored with it"],
-        remarks=[*told.remarks, *remarks],
+        remarks=[*table.remarks, *told.remarks, *remarks],
         statements=[parts.VERIFICATION_STATEMENT, *told.statements],
         provenance=parts.provenance(parts.data_digest(runs) if runs else parts.doc_digest(record.doc)),
         pictures=told.pictures,
     )
+    return of_then(document, store, machine.name, str(record.doc.get("started_utc") or record.utc), runs)
 
 
 def verification_figures(record: VerificationRecord, rules: Rules) -> list[Figure]:
@@ -111,16 +117,18 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
         The machine has no push of this number.
     """
     entries = read_entries(store, machine)
-    journal = tuple(e for e in entries if e.push == number)
+    journal = tuple(e for e in entries if e.push == number != WORD)
     if not journal:
-        raise StoreError(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries})}, counted from 1")
-    known, doc = facts(journal), _machine_doc(store, machine)
+        raise StoreError(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {WORD})}, counted from 1")
+    known = facts(journal)
+    machine = str(known.get("machine", machine))  # as it was called then
+    doc = _machine_doc(store, machine)
     verified = [v for v in store.verifications(limit=MANY) if _is_of(store, v, machine, number)]
     campaigns = [from_store(store, store.campaign(v.campaign_id).name) for v in verified if v.campaign_id is not None]
     runs = [r for c in campaigns for r in c.runs]
     condition, remarks = parts.conditions(runs, rules) if runs else ({}, [])
     tables = _tables(str(known.get("image", "")))
-    return Document(
+    document = Document(
         kind="push",
         title=f"Push {number} into {machine}",
         about=parts.machine_facts(doc) | _about(store, journal, known),
@@ -144,6 +152,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
         if tables is None
         else [Picture("The new table: what is added to the command.", table_plot(_curves(tables)), wide=True)],
     )
+    return of_then(document, store, machine, journal[-1].utc, []) if journal[-1].state is State.KEEP else document
 
 
 def _is_of(store: Store, record: VerificationRecord, machine: str, push: int) -> bool:

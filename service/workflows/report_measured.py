@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from models.machine import AXES
 from models.solvers.observations import nominal_reading
 from models.verification import helix_figure
 from service.errors import AbbeError, MeasurementFault
@@ -17,11 +18,14 @@ from service.report.numbers import plain
 from service.report.plots.bars import uncertainty_bars
 from service.report.plots.polar import polar_plot
 from service.report.plots.residuals import residual_plot
+from service.runs.coverage import not_judged
+from service.runs.helix_axis import about_axis, path_axis
 from service.runs.observations import run_data
 from service.workflows import report_parts as parts
 from service.workflows.campaign_folder import Campaign
 from service.workflows.iso_report import Evaluated, evaluate
 from service.workflows.report_parts import Doc, Rules
+from service.workflows.report_table import NOTHING_SAID, TableSaid
 from service.workflows.verify import DIAGONALS, Verdict, figure_rows, figures
 
 SOLUTION_SIGNS: dict[str, Sign] = {"good": "ok", "usable with care": "open", "mostly assumption": "bad"}
@@ -33,13 +37,15 @@ class Measured:
     """What a report of a measurement is made of.
 
     ``runs``: ``abbe-run/1`` objects that are complete; ``facts``: further lines for the head; ``states``: run, test, role, state, why and
-    when of every run, also of incomplete ones; ``solution``: latest stored solution and its number.
+    when of every run, also of incomplete ones; ``solution``: latest stored solution and its number; ``table``: what is
+    known of the tables in force.
     """
 
     campaign: Campaign
     facts: dict[str, str] = field(default_factory=dict)
     states: Sequence[Sequence[str]] = ()
     solution: tuple[int, Doc] | None = None
+    table: TableSaid = NOTHING_SAID
 
 
 def campaign_report(found: Measured, rules: Rules) -> Document:
@@ -49,12 +55,12 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
     checked, verdict = _verification(campaign.runs, rules)
     condition, remarks = parts.conditions(campaign.runs, rules)
     solved = _solution(found.solution)
-    remarks = [*_unfinished(found.states), *solved.remarks, *told.remarks, *remarks]
+    remarks = [*found.table.remarks, *_unfinished(found.states, campaign.runs), *solved.remarks, *told.remarks, *remarks]
     return Document(
         kind="campaign",
         title=f"Campaign {campaign.name}",
         about=parts.machine_facts(campaign.site.doc) | {"Campaign": campaign.name} | found.facts,
-        verdict=parts.verdict_of(verdict, remarks, _solution_verdict(found.solution)),
+        verdict=found.table.verdict(parts.verdict_of(verdict, remarks, _solution_verdict(found.solution))),
         figures=[*checked, *solved.figures, *told.figures],
         instruments=parts.instruments(campaign.runs, campaign.doc, rules),
         conditions=condition,
@@ -72,18 +78,18 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
     run = next(r for r in found.campaign.runs if r["run_id"] == label)
     told = evaluate([run], found.campaign.doc.get("instruments"))
     condition, remarks = parts.conditions([run], rules)
-    own = _own(run)
+    own, why = _own(run), not_judged(run)
     setup = [(k, _words(v)) for k, v in sorted(run["setup"].items())]
     return Document(
         kind="run",
         title=f"Run {found.campaign.name}/{label}",
         about=parts.machine_facts(run["machine"]) | {"Campaign": found.campaign.name, "Run": label, "Test": run["test"]} | found.facts,
-        verdict=("open", "Not judged", NOT_JUDGED),
+        verdict=found.table.verdict(("open", "Not judged", f"{why}." if why else NOT_JUDGED)),
         figures=[*own.figures, *told.figures],
         instruments=parts.instruments([run], found.campaign.doc, rules),
         conditions=condition,
         not_observable=[*own.not_observable, *told.not_observable],
-        remarks=[*_unfinished(found.states), *told.remarks, *remarks],
+        remarks=[*found.table.remarks, *_unfinished(found.states, [run]), *told.remarks, *remarks],
         statements=told.statements,
         provenance=parts.provenance(parts.data_digest([run])),
         tables=[TextTable("Set-up", ("Name", "Value"), setup)],
@@ -93,7 +99,7 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
 
 def _verification(runs: Sequence[Doc], rules: Rules) -> tuple[list[Figure], Verdict | None]:
     """Figures that the machine file has limits for, where these runs hold the four body diagonals, once out and back."""
-    known = [r for r in runs if r["columns"].get("deviation_mm") is not None and r["setup"].get("cycles", 1) == 1]
+    known = [r for r in runs if r["columns"].get("deviation_mm") is not None and r["setup"].get("cycles", 1) == 1 and not not_judged(r)]
     body = {r["setup"].get("diagonal") for r in known if r["test"] == "laser_diagonal" and not r["setup"].get("order")}
     if not body >= DIAGONALS:
         return [], None
@@ -165,8 +171,20 @@ def _run_table(found: Measured) -> TextTable:
     return TextTable("Runs", head, rows)
 
 
-def _unfinished(states: Sequence[Sequence[str]]) -> list[str]:
-    return [f"run {s[0]} is {s[3]}, it is not in the figures" + (f": {s[4]}" if s[4] else "") for s in states if s[3] != "complete"]
+def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[str]:
+    """Runs that are in no figure; of one that was gone on with, where its readings are."""
+    whole = {piece["run"]: r["run_id"] for r in runs for piece in (r.get("timing") or {}).get("pieces", [])}
+    short = {r["run_id"]: why for r in runs if (why := not_judged(r))}
+    out = []
+    for label, _, _, state, why in states:
+        reason = f": {why}" if why else ""
+        if label in whole:
+            out.append(f"run {label} is {state}{reason}; {whole[label]} went on with it, its readings count there")
+        elif label in short:
+            out.append(f"run {label} is {short.pop(label)}, it is not in the figures{reason}")
+        elif state != "complete":
+            out.append(f"run {label} is {state}, it is not in the figures{reason}")
+    return [*out, *(f"run {label} is {why}, it is not in the figures" for label, why in short.items())]
 
 
 def _own(run: Doc) -> Evaluated:
@@ -180,14 +198,16 @@ def _own(run: Doc) -> Evaluated:
     above = (data.deviation_mm - nominal_reading(data)) * 1e3
     valid = int(np.sum(np.asarray(run["columns"].get("valid", np.ones(len(run["columns"]["t_s"]))), dtype=bool)))
     group = "Readings"
-    rows = [
-        Figure(group, "n", f"valid readings of {len(run['columns']['t_s'])}", float(valid), None, "", "count"),
-        Figure(group, "min", "smallest deviation", float(above.min()), None, "µm", "as read"),
-        Figure(group, "max", "largest deviation", float(above.max()), None, "µm", "as read"),
-    ]
+    rows = [Figure(group, "n", f"valid readings of {len(run['columns']['t_s'])}", float(valid), None, "", "count")]
     series = ResidualSeries(data.label, "time of the campaign in s", data.t_s, above)
     pictures = [
         Picture(f"Run {data.label}: deviation against time, as read.", residual_plot(series, noise_um=None, key="readings"), wide=True)
+    ]
+    if why := not_judged(run):
+        return Evaluated(figures=rows, pictures=pictures, not_observable=[f"any figure of the whole path: {why}"])
+    rows += [
+        Figure(group, "min", "smallest deviation", float(above.min()), None, "µm", "as read"),
+        Figure(group, "max", "largest deviation", float(above.max()), None, "µm", "as read"),
     ]
     if data.test == "helix":
         found = helix_figure(data)
@@ -202,16 +222,14 @@ def _own(run: Doc) -> Evaluated:
                 parts.VERIFICATION,
             )
         )
-        angle = _about_axis(data.axes_mm - np.asarray(data.centre_mm), str(run["setup"].get("axis", "Z")))
-        trace = PolarTrace(data.label, np.degrees(angle), found.deviation_mm * 1e3)
-        words = "Deviation of the helix around its axis, centre and length of the bar fitted away."
-        pictures.append(Picture(words, polar_plot([trace], heading="Helix")))
+        try:
+            axis = path_axis(run, data.axes_mm)
+        except MeasurementFault as error:
+            return Evaluated(figures=rows, pictures=pictures, not_observable=[f"its picture: {error.detail}"])
+        angle = np.degrees(about_axis(data.axes_mm - np.asarray(data.centre_mm), axis))
+        words = f"Deviation of the helix around its axis ({AXES[axis]}), centre and length of the bar fitted away."
+        pictures.append(Picture(words, polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")))
     return Evaluated(figures=rows, pictures=pictures)
-
-
-def _about_axis(at: Any, axis: str) -> Any:
-    a, b = ((k + 1) % 3 for k in ("XYZ".index(axis), "XYZ".index(axis) + 1))
-    return np.arctan2(at[:, b], at[:, a])
 
 
 def _words(value: Any) -> str:

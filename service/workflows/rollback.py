@@ -23,7 +23,7 @@ from service.storage.store import Store
 from service.workflows.base_table import Base, read_base
 from service.workflows.commission import check_commissioned
 from service.workflows.proposals import by_whom
-from service.workflows.push_history import KIND, last_kept, pushes_of
+from service.workflows.push_history import KIND, ended_as, last_kept, pushes_of
 from service.workflows.pushing import Pushed, Pushing, Questions, WantedAgain
 from service.workflows.recover import recover
 from service.workflows.unverified import unverified_crcs
@@ -84,7 +84,7 @@ async def rollback(controller: Controller, store: Store, site: Site, to: int | N
         As of any push.
     """
     await recover(controller, store, site)
-    entries = await asyncio.to_thread(read_entries, store, site.name)
+    entries = await asyncio.to_thread(read_entries, store, site.name, site.control)
     again = await asyncio.to_thread(_rollbacks, store)
     if not entries:
         raise TableRefused("no push of this machine is in the journal: there is nothing to take back", "nothing was written")
@@ -127,12 +127,12 @@ def _base(journal: Journal, how: str) -> Known:
 
 def _left(journal: Journal) -> Known:
     """What was in force when a push had ended."""
-    last, f = journal[-1], facts(journal)
-    if last.state is State.KEEP:
-        return Known(bytes.fromhex(f["image"]), str(f["meaning"]), f"the table that push {last.push} brought and kept")
-    if last.state in TERMINAL - {State.OPERATOR, State.ACCEPTED}:
-        return _base(journal, f"the table that was in force before and after push {last.push}")
-    raise TableRefused(f"push {last.push} ended {last.state}: the journal does not hold the table that was in force then", "name another")
+    state, number, f = ended_as(journal), journal[-1].push, facts(journal)
+    if state is State.KEEP:
+        return Known(bytes.fromhex(f["image"]), str(f["meaning"]), f"the table that push {number} brought and kept")
+    if state in TERMINAL - {State.OPERATOR, State.ACCEPTED}:
+        return _base(journal, f"the table that was in force before and after push {number}")
+    raise TableRefused(f"push {number} ended {state}: the journal does not hold the table that was in force then", "name another")
 
 
 def known_images(entries: list[Entry]) -> set[bytes]:
@@ -142,7 +142,7 @@ def known_images(entries: list[Entry]) -> set[bytes]:
         f = facts(journal)
         if int(f["base_crc"]) not in refuted:
             found.add(bytes.fromhex(f["base_image"]))
-        if journal[-1].state is State.KEEP:
+        if ended_as(journal) is State.KEEP:
             found.add(bytes.fromhex(f["image"]))
     return found
 

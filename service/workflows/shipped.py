@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from difflib import get_close_matches
 from typing import Protocol
 
 from models.machine import Machine
@@ -52,5 +53,7 @@ def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
     """
     recipe, rate_hz = parted(name)
     if recipe not in RECIPES:
-        raise ConfigError(f"there is no recipe {name!r}", f"use one of: {', '.join(sorted(RECIPES))}")
+        close = get_close_matches(recipe, RECIPES, n=1)
+        meant = f"did you mean {close[0]!r}? " if close else ""
+        raise ConfigError(f"there is no recipe {name!r}", f"{meant}use one of: {', '.join(sorted(RECIPES))}")
     return RECIPES[recipe](machine, rate_hz=rate_hz)

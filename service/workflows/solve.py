@@ -20,7 +20,8 @@ from models.solvers.step_diagonal import ORDER, closure_mm, increments, squarene
 from service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from service.runs.observations import bar_noise_mm, run_data
 from service.site import Site
-from service.workflows.campaign_checks import check_files, check_readings, copies, refuse
+from service.workflows.campaign_checks import check_files, check_readings, refuse
+from service.workflows.copied_runs import copies
 from service.workflows.finding import Finding
 from service.workflows.provenance import measured_digest, taken_from
 
@@ -72,8 +73,10 @@ class Solved:
     taken: tuple[str, ...] = ()
 
 
-def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid21", say: Say | None = None) -> Solved:
+def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model | None = "rigid21", say: Say | None = None) -> Solved:
     """Solve ``abbe-run/1`` objects together (role ``identify`` only), after it was checked that each can be what it says.
+
+    ``model`` None: rigid21, or rigid6 where there are too few readings for it; a flag tells.
 
     Raises
     ------
@@ -89,7 +92,8 @@ def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model = "rigid2
     if not used:
         raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
     say(f"{len(used)} runs: units, axes, copies, machine")
-    flags = check_campaign(site, used, [r for r in runs if r["role"] == "holdout"], model)
+    model, smaller = (model, []) if model is not None else _affordable([run_data(r, blocks=ALL_READINGS) for r in used])
+    flags = smaller + check_campaign(site, used, [r for r in runs if r["role"] == "holdout"], model)
     bars = [r for r in used if r["test"].startswith("ballbar")]
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
@@ -155,8 +159,7 @@ def check_enough(data: list[RunData], model: Model) -> None:
     CampaignRefused
         How many there are, how many are needed, and which run has the fewest.
     """
-    unknowns = (TWENTY_ONE if model == "rigid21" else SIX) + sum(4 if r.kind == "bar" else 2 for r in data)
-    count = sum(r.deviation_mm.size for r in data)
+    count, unknowns = sum(r.deviation_mm.size for r in data), _unknowns(data, model)
     if count < PER_UNKNOWN * unknowns:
         fewest = min(data, key=lambda r: r.deviation_mm.size)
         raise CampaignRefused(
@@ -164,6 +167,19 @@ def check_enough(data: list[RunData], model: Model) -> None:
             f"run {fewest.label} has the fewest, {fewest.deviation_mm.size}",
             "measure more positions" + (", or use --model rigid6" if model != "rigid6" else "") + "; nothing was stored",
         )
+
+
+def _unknowns(data: list[RunData], model: Model) -> int:
+    return (TWENTY_ONE if model == "rigid21" else SIX) + sum(4 if r.kind == "bar" else 2 for r in data)
+
+
+def _affordable(data: list[RunData]) -> tuple[Model, list[Finding]]:
+    """The largest model that there are enough readings for, and the flag that tells where it is not the usual one."""
+    count, wanted = sum(r.deviation_mm.size for r in data), PER_UNKNOWN * _unknowns(data, "rigid21")
+    if count >= wanted:
+        return "rigid21", []
+    what = f"{count} readings in all are too few for rigid21 ({wanted} are needed): solved for rigid6, scales and squareness only"
+    return "rigid6", [Finding(min(data, key=lambda r: r.deviation_mm.size).label, what, "measure more positions", False)]
 
 
 def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[Finding]:

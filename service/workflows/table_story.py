@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from service.errors import TableRefused
 from service.push.book import read_entries
-from service.push.entries import Entry, Journal, facts
+from service.push.entries import WORD, Entry, Journal, facts
 from service.push.states import State
 from service.storage.store import Store
 from service.workflows.push_history import KIND, last_kept, pushes_of, wanted_by
@@ -71,15 +71,15 @@ class Story:
     refusal: str
 
 
-def story(store: Store, machine: str) -> Story:
-    """Read the journal of a machine, newest push first.
+def story(store: Store, machine: str, control: str = "") -> Story:
+    """Read the journal of a machine, newest push first; ``control``: identity of its control, empty where it is not known.
 
     Raises
     ------
     StoreError
         It cannot be read, or is not what was written.
     """
-    entries = read_entries(store, machine)
+    entries = read_entries(store, machine, control)
     docs = {table.id: table.doc for table in store.tables()}
     told = tuple(_told(journal, _doc(journal, docs)) for journal in pushes_of(entries).values())
     try:
@@ -89,8 +89,8 @@ def story(store: Store, machine: str) -> Story:
     return Story(_now(entries, told), tuple(reversed(told)), offer, refusal)
 
 
-def offered(store: Store, machine: str) -> Offer:
-    """What can be ordered back now, by the journal.
+def offered(store: Store, machine: str, control: str = "") -> Offer:
+    """What can be ordered back now, by the journal (`story`).
 
     Raises
     ------
@@ -99,7 +99,7 @@ def offered(store: Store, machine: str) -> Offer:
     StoreError
         The journal cannot be read, or is not what was written.
     """
-    return offer_of(read_entries(store, machine), _rollbacks({table.id: table.doc for table in store.tables()}))
+    return offer_of(read_entries(store, machine, control), _rollbacks({table.id: table.doc for table in store.tables()}))
 
 
 def offer_of(entries: list[Entry], rollbacks: frozenset[int]) -> Offer:
@@ -150,6 +150,8 @@ def _now(entries: list[Entry], told: tuple[PushTold, ...]) -> Now:
     if crc is None or not settled:
         return Now(None, "", told[-1].push, told[-1].ended, told[-1].text)
     for entry in reversed(entries):
+        if entry.push == WORD:
+            return Now(crc, "accepted", 0, entry.utc, "a person vouches for the table that was there before the first push")
         one = next(t for t in told if t.push == entry.push)
         if entry.state is State.ACCEPTED and int(entry.doc["accepted_crc"]) == crc:
             return Now(crc, "accepted", one.push, entry.utc, one.text)

@@ -1,30 +1,161 @@
-"""Tables that were on their way once and that nothing has verified: whoever makes one the active one, nothing is built on it."""
+"""Which tables the journals of a database know, and which of them nothing has verified, whatever a machine is called.
+
+A control is known by its address alone (`service.devices.urls.control_of`), and a table carries a number drawn by lot: so the CRC in force
+is held against all journals, and nothing is built on a table that a push brought and that was neither kept nor vouched for. What is kept
+or vouched for on one control is so there only: the errors of another machine are others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 from service.push.entries import Entry
-from service.push.states import State
+from service.push.states import BEFORE_ACTIVATION, TERMINAL, State
+from service.storage.records import Doc, PushEntryRecord
+from service.storage.store import Store
+
+How = Literal["verified", "accepted", "found in force"]
+Row = tuple[Hashable, str, Doc]
+"""Push, state, and what became known with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pushed:
+    """A push as all journals tell it: under which machine's name, into which control (empty: not noted), and where it stands.
+
+    ``chain``: name of its journal, empty for one of before decision 0017.
+    """
+
+    chain: str
+    push: int
+    state: str
+    machine: str
+    control: str
+
+    @property
+    def open(self) -> bool:
+        """It has not come to its end, or a person has to look."""
+        return self.state not in TERMINAL or self.state == State.OPERATOR
+
+    @property
+    def may_be_active(self) -> bool:
+        """Its table may be in force."""
+        return self.open and self.state not in BEFORE_ACTIVATION
+
+
+@dataclass(frozen=True, slots=True)
+class Fine:
+    """Why a table is right on one control: a push kept it there, a person vouched for it, or the first push found it in force.
+
+    ``push``: 0 for a person's word before the first; ``by``: who vouched, empty for nobody.
+    """
+
+    how: How
+    machine: str
+    push: int
+    utc: str
+    by: str = ""
+
+    @property
+    def not_here(self) -> str:
+        """The same said of another machine."""
+        push = f" (push {self.push})" if self.push and self.how == "verified" else ""
+        return f"{self.how} on machine {self.machine!r}{push}, not on this one"
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Tables by their CRC, over all journals of a database.
+
+    ``unverified``: which push brought it; ``seen``: every table that a push brought or found in force, or that a person vouched for;
+    ``pushed``: the last push of each; ``fine``: in which journals it is right, and why.
+    """
+
+    unverified: dict[int, Pushed]
+    seen: frozenset[int]
+    pushed: dict[int, Pushed]
+    fine: dict[int, dict[str, Fine]]
+
+    def elsewhere(self, crc: int, chain: str) -> Fine | None:
+        """Where a table is right that is not known to be so in this journal; None if it is, or is nowhere."""
+        where = self.fine.get(crc, {})
+        return None if chain in where else max(where.values(), key=lambda one: (one.how == "verified", one.utc), default=None)
+
+
+def known_tables(store: Store) -> Known:
+    """Read the journals of all machines, without the images in them."""
+    marks = [*_old_marks(store), *store.push_marks()]
+    unverified = _unverified([((m.machine, m.push), m.state, m.doc) for m in marks])
+    last: dict[Hashable, Pushed] = {}
+    crc: dict[Hashable, int] = {}
+    fine: dict[int, dict[str, Fine]] = {}
+    seen: set[int] = set()
+    for mark in marks:
+        key, doc = (mark.machine, mark.push), mark.doc
+        named = (last[key].machine, last[key].control) if key in last else (doc.get("machine", mark.machine), doc.get("control", ""))
+        last[key] = Pushed(mark.machine if mark.prev else "", mark.push, mark.state, str(named[0]), str(named[1]))
+        seen.update(int(doc[name]) for name in ("base_crc", "crc", "accepted_crc") if name in doc)
+        if mark.state == State.SNAPSHOT and "crc" in doc:
+            base = int(doc["base_crc"])
+            if base in fine or base not in crc.values():
+                _add(fine, base, "found in force", last[key], mark)
+            crc[key] = int(doc["crc"])
+        elif mark.state == State.KEEP and key in crc:
+            _add(fine, crc[key], "verified", last[key], mark)
+        elif "accepted_crc" in doc:
+            _add(fine, int(doc["accepted_crc"]), "accepted", last[key], mark)
+    pushed = {number: last[key] for key, number in crc.items()}
+    return Known({number: last[key] for number, key in unverified.items()}, frozenset(seen), pushed, fine)
+
+
+def _add(fine: dict[int, dict[str, Fine]], crc: int, how: How, push: Pushed, mark: PushEntryRecord) -> None:
+    """Note why a table is right in a journal; that a later push found it in force says less than what is there."""
+    one = Fine(how, push.machine, push.push, mark.utc, str(mark.doc.get("by", "")) if how == "accepted" else "")
+    where, chain = fine.setdefault(crc, {}), push.chain or push.machine
+    if how != "found in force" or chain not in where:
+        where[chain] = one
 
 
 def unverified_crcs(entries: Sequence[Entry]) -> dict[int, int]:
-    """Which tables of a machine's journal were neither kept nor vouched for: CRC -> number of the push.
+    """Which tables of one journal were neither kept nor vouched for: CRC -> number of the push."""
+    found = _unverified([(e.push, e.state, e.doc) for e in entries])
+    return {crc: push for crc, push in found.items() if isinstance(push, int)}
 
-    A table that was in force before a push was put there by a person, unless an earlier push had brought it and not kept it.
-    """
-    candidates: dict[int, int] = {}
-    pushed: dict[int, int] = {}
+
+def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
+    """A table that was in force before a push was put there by a person, unless an earlier push had brought it and not kept it."""
+    candidates: dict[int, Hashable] = {}
+    pushed: dict[Hashable, int] = {}
     fine: set[int] = set()
-    for entry in entries:
-        if entry.state is State.SNAPSHOT:
-            base, crc = int(entry.doc["base_crc"]), int(entry.doc["crc"])
+    for push, state, doc in rows:
+        if state == State.SNAPSHOT and "crc" in doc:
+            base, crc = int(doc["base_crc"]), int(doc["crc"])
             if base not in candidates:
                 fine.add(base)
-            pushed[entry.push] = crc
-            candidates.setdefault(crc, entry.push)
-        elif entry.state is State.KEEP:
-            fine.add(pushed[entry.push])
-        elif entry.state is State.ACCEPTED:
-            fine.add(int(entry.doc["accepted_crc"]))
+            pushed[push] = crc
+            candidates.setdefault(crc, push)
+        elif state == State.KEEP and push in pushed:
+            fine.add(pushed[push])
+        elif state == State.ACCEPTED and "accepted_crc" in doc:
+            fine.add(int(doc["accepted_crc"]))
     return {crc: push for crc, push in candidates.items() if crc not in fine}
+
+
+def _old_marks(store: Store) -> list[PushEntryRecord]:
+    """Pushes of before decision 0017: one row each, read as its beginning and its end."""
+    found = []
+    names = {m.id: m.name for m in store.machines()}
+    for push in store.pushes():
+        name = names.get(push.machine_id, "")
+        doc = {key: value for key, value in push.doc.items() if key in ("base_crc", "crc", "accepted_crc")}
+        if {"base_crc", "crc"} <= doc.keys():
+            begun, ended = (
+                {"machine": name, "base_crc": doc["base_crc"], "crc": doc["crc"]},
+                {k: doc[k] for k in doc if k == "accepted_crc"},
+            )
+            old = f"{name} (decision 0008)"
+            found.append(PushEntryRecord(0, old, push.id, 0, State.SNAPSHOT, begun, push.created_utc, "", ""))
+            found.append(PushEntryRecord(0, old, push.id, 1, push.state, ended, push.updated_utc, "", ""))
+    return found

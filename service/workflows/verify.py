@@ -10,6 +10,7 @@ import numpy as np
 
 from models.verification import Figure, diagonal_figure, helix_figure
 from service.errors import MeasurementFault, TableRefused
+from service.runs.coverage import check_judged
 from service.runs.observations import run_data
 
 COVERAGE = 2.0
@@ -56,16 +57,18 @@ def figures(runs: list[dict[str, Any]]) -> Figures:
     Raises
     ------
     MeasurementFault
-        Not all four body diagonals are there, or a run has too few valid readings.
+        Not all four body diagonals are there, or a run is not judged (`service.runs.coverage`) or has too few valid readings.
     """
     diagonals, helix = {}, None
     for run in runs:
         if run["test"] == "laser_diagonal" and not run["setup"].get("order") and not run["setup"].get("face"):
+            check_judged(run)
             try:
                 diagonals[str(run["setup"]["diagonal"])] = diagonal_figure(run_data(run))
             except ValueError as error:
                 raise MeasurementFault(str(error), "measure it again") from None
         elif run["test"] == "ballbar_helix":
+            check_judged(run)
             helix = helix_figure(run_data(run))
     if set(diagonals) != DIAGONALS:
         lost = ", ".join(sorted(DIAGONALS - set(diagonals)))

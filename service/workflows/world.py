@@ -1,14 +1,13 @@
 """The simulated outside world as a child process: started, watched, and gone when we are gone.
 
-The product never imports the simulators: it starts `python -m simulators`, reads one line of JSON that says where the devices are, and
-talks to them over the wire like to any other device.
+The product never imports the simulators: it starts them as a program, reads one line of JSON that says where the devices are, and talks to
+them over the wire like to any other device.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.links.shielded import run_to_end
+from service.children import python_words
 from service.errors import AbbeError
 
 READY_S = 30.0
@@ -48,11 +48,7 @@ async def running_world(args: list[str]) -> AsyncIterator[World]:
         It did not start; the child's own line says why.
     """
     process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-m",
-        "simulators",
-        *args,
-        "--watch-stdin",
+        *python_words("simulators", *args, "--watch-stdin"),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
@@ -105,11 +101,11 @@ async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
     WorldError
         It failed; the child's own line says why.
     """
-    words = ["-m", "simulators", "truth", *args, "--arrows"]
+    words = python_words("simulators", "truth", *args, "--arrows")
     if bank is not None:
         words += ["--bank", str(bank)]
     process = await asyncio.create_subprocess_exec(
-        sys.executable, *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, start_new_session=True
+        *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, start_new_session=True
     )
     try:
         out, err = await process.communicate()

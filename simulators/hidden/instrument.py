@@ -6,8 +6,8 @@ from simulators.arrays import F
 from simulators.hidden.effect import MRAD, PPM, UM, URAD, Bend, Hidden, effect
 from simulators.hidden.track import Track
 
-AIR_PPM_PER_K = 0.93
-"""A warmer air is thinner: the laser counts this much more than the wavelength it was told."""
+AIR_PPM_PER_K = -0.93
+"""Warmer air is thinner: the light is longer in it than the laser was told, and it counts fewer waves on the same way."""
 DEAD_PATH_MM = 900.0
 
 
@@ -62,7 +62,7 @@ def air_rise(e: Hidden, t_s: F) -> F:
 
 @effect("air_refraction")
 def air_refraction(e: Hidden, track: Track, out: Bend) -> None:
-    """The measured path counts too long in warm air."""
+    """The measured path counts too short in warm air."""
     if track.kind == "laser":
         out.reading += AIR_PPM_PER_K * PPM * air_rise(e, track.t_s) * track.reach_mm
 

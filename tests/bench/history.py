@@ -41,6 +41,13 @@ Y = [0.0, 500.0]
 Z = [0.0, 450.0]
 [store]
 url = "sqlite:///abbe.sqlite3"
+[devices]
+cnc = "modbus+tcp://127.0.0.1:9"
+ballbar = "socket://127.0.0.1:9"
+laser = "modbus+tcp://127.0.0.1:9"
+fixture = "fixture+tcp://127.0.0.1:9"
+[alarm]
+watch_table = false
 [[schedule]]
 name = "yearly"
 cron = "0 6 1 1 *"

@@ -14,12 +14,14 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
+
 from models.discovery.discover import discover
 from models.effects.catalogue import CATALOGUE
 from service.runs.cases import case_of
 from service.runs.exchange import read_folder
 from service.site import machine_from_doc
-from service.workflows.discovery_answer import answer_doc
+from service.workflows.discovery_doc import finding_doc
 
 
 def answered(folder: Path, out: Path) -> tuple[str, float]:
@@ -29,7 +31,9 @@ def answered(folder: Path, out: Path) -> tuple[str, float]:
     start = time.process_time()
     found = discover(case, CATALOGUE)
     seconds = time.process_time() - start
-    doc = answer_doc(found, case) | {"cpu_s": round(seconds, 2), "rejected": [list(r) for r in found.rejected]}
+    nothing = {r.path.label: np.zeros(r.path.n) for r in case.runs}
+    answer = finding_doc(found, case, CATALOGUE, nothing)["answer"]
+    doc = answer | {"cpu_s": round(seconds, 2), "rejected": [list(r) for r in found.rejected]}
     (out / f"{folder.name}.json").write_text(json.dumps(doc))
     return folder.name, seconds
 

@@ -212,13 +212,28 @@ async def test_a_lease_whose_number_another_program_took_is_not_believed(control
     assert (cnc.comp.passed_over, cnc.log) == ([3], [])  # and whoever has it is not disturbed by a second try
 
 
-@pytest.mark.parametrize("command", ["lease", "release", "seal"])
-async def test_a_command_that_was_passed_over_is_sent_again_under_the_next_number(controller, cnc, command):
+@pytest.mark.parametrize(("command", "theirs"), [("lease", 7), ("release", 7), ("release", 0), ("seal", 7), ("seal", 0)])
+async def test_a_command_that_was_passed_over_is_sent_again_under_the_next_number(controller, cnc, command, theirs):
+    """Whatever the other's command was answered: who has the lease, and what the bank is, tell that ours was not executed."""
     cnc.peer.put(217, "I", 7)
-    another = cnc.comp = Another(cnc, 7, 7)
+    another = cnc.comp = Another(cnc, theirs, 7)
     number, words = {"seal": (1, (1, 7)), "lease": (3, (7, 1000)), "release": (4, (7,))}[command]
     await getattr(controller, command)(*words)
     assert (another.passed_over, cnc.log) == ([number], [("comp", number)])
+
+
+@pytest.mark.parametrize("answer", [0, 7])
+async def test_releasing_a_free_lease_is_done_at_once_whatever_the_control_calls_it(controller, cnc, answer):
+    cnc.comp_result = answer
+    await controller.release(7)
+    assert cnc.log == [("comp", 4)]  # the number is used up all the same: a command still on its way is shut out
+
+
+async def test_a_lease_that_is_free_and_refused_is_not_taken_for_given(controller, cnc):
+    cnc.comp_result = 7
+    with pytest.raises(DeviceFault, match="took its number"):
+        await controller.lease(7, 60_000)
+    assert cnc.log == [("comp", 3)] * banks_module._TRIES
 
 
 async def test_an_activation_that_was_passed_over_is_told_and_never_sent_again(controller, cnc):

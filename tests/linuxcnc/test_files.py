@@ -11,6 +11,7 @@ from drivers.cnc.tables import TableImage, crc32, encode
 from drivers.errors import Refused
 from service.storage.store import Store
 from service.workflows.commission_levels import commission_levels
+from service.workflows.recover import accept
 from tests.linuxcnc.test_control import FEED, OWNER, controller, nine, push, site_of, until, wanted
 
 POINTS = 121
@@ -57,6 +58,7 @@ async def test_a_table_of_files_is_staged_until_the_control_starts_anew_and_then
             (added,) = await machine.hal("abbe-corr-y")  # the same image's cross terms act in the network
             assert added == pytest.approx(wanted(image, (x, 0.0, 0.0))[1], abs=1e-9)
         with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+            await accept(cnc, store, site_of(machine), "a person")  # this database did not push it
             found = await commission_levels(cnc, store, site_of(machine))
         assert found.capabilities.level == 3, found.rows()
         now = await cnc.comp_status()

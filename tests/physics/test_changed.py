@@ -14,7 +14,7 @@ from models.solvers.joint import solve_joint
 from models.uncertainty.known_field import KnownField
 from tests.physics.truth import MACHINE, Truth
 
-SEEDS = range(40) if os.environ.get("ABBE_TEST_LONG") == "1" else range(3)
+SEEDS = range(40) if os.environ.get("ABBE_TEST_LONG") == "1" else range(1)
 Hide = Callable[[Truth, np.random.Generator], dict[str, float]]
 
 

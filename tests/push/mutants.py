@@ -80,6 +80,9 @@ MUTANTS: dict[str, Edits] = {
         ("machine", "if isinstance(known.verdict, Done):\n        return record(State.LEASED)", "if known.verdict is not None:\n        return record(State.LEASED)"),
         ("machine", 'if truth.owner != f["owner"]:', "if False:"),
     ),
+    "activated on a lease that ends": (("machine", "truth.lease_ms < LEASE_LEFT_MS", "truth.lease_ms < 0"),),
+    "pushed into axes that only just stand": (("machine", "STILL_S = 1.0", "STILL_S = 0.0"),),
+    "approval an hour longer": (("machine", "truth.now_s >= known.approved_until_s", "truth.now_s >= known.approved_until_s + 3600.0"),),
     "what is pending is forgotten": (("back", "    if known.rested:", "    if known.rested or state is State.ROLLBACK_PENDING:"),),
 }  # fmt: skip
 BY_PROBE = "sign exchanged in encoder and decoder"

@@ -20,6 +20,8 @@ CASES = (
     Case("another table approved", approved="another table", end="REJECTED"),
     Case("another base approved", approved="another base", end="REJECTED"),
     Case("approval ends early", approval_s=0.1, end="ABORTED"),
+    Case("lease about to end", lease_ms=4999, end="ABORTED"),
+    Case("axes just come to rest", still_s=0.99, end="ABORTED"),
     Case("unattended at level 2", level=2, end="REJECTED"),
 )
 PAIRED = CASES[:2]

@@ -10,7 +10,7 @@ import pytest
 from service.push.candidate import Candidate, Scene
 from service.push.limits import PushLimits
 from service.push.validate import reasons_against
-from tests.push.bad_tables import CLASSES, EACH, NOW_S, good, signed
+from tests.push.bad_tables import CLASSES, EACH, LSB_MM, NOW_S, good, signed
 from tests.push.loading import real
 from tests.push.world import Case, World
 
@@ -67,6 +67,17 @@ def test_what_the_classes_do_not_hold_is_rejected_too(name: str) -> None:
     limits = replace(LIMITS, value_mm=0.012) if word == "VALUE" else LIMITS
     made: tuple[Candidate, Scene] = change(candidate, scene)
     assert [r for r in reasons_against(*made, limits) if r.startswith(word)]
+
+
+@pytest.mark.parametrize(("units", "refused"), [(-9, True), (-2, True), (0, False), (2, True), (9, True)])
+def test_the_reference_stays_where_it_is_to_one_unit_of_the_table(units: int, refused: bool) -> None:
+    """More than a unit there moves the axis at once when the table comes into force."""
+    for at in range(9):
+        candidate, scene = good(Random(11))
+        columns = list(candidate.columns)
+        columns[at] = replace(columns[at], correction_mm=(units * LSB_MM, *columns[at].correction_mm[1:]))
+        reasons = reasons_against(signed(replace(candidate, columns=tuple(columns))), scene, LIMITS)
+        assert [reason.split(":")[0] for reason in reasons] == ["REFERENCE"] * refused, at
 
 
 def test_all_reasons_are_told_at_once() -> None:

@@ -62,6 +62,10 @@ class Case:
     base_bank: int = 0
     machine_sign: int = 1
     approval_s: float = 1e6
+    lease_ms: int = 60000
+    """What is left of a lease whenever somebody looks."""
+    still_s: float = 5.0
+    """How long the axes have stood."""
     end: str = "KEEP"
     """How it ends without any fault."""
 
@@ -188,8 +192,9 @@ class World:
         def do() -> Any:
             ctl = self.ctl
             truth = self.p.operations.Truth(
-                ctl.boot, ctl.gen, ctl.active, tuple(ctl.crc), tuple(ctl.states), ctl.owner, 60000 if ctl.owner else 0,
-                "the e-stop is pressed" if ctl.estop else "", 5.0, self.time_s, "map 1",
+                ctl.boot, ctl.gen, ctl.active, tuple(ctl.crc), tuple(ctl.states), ctl.owner,
+                self.case.lease_ms if ctl.owner else 0, "the e-stop is pressed" if ctl.estop else "", self.case.still_s, self.time_s,
+                "map 1",
             )  # fmt: skip
             self.last_look = (truth, ctl.in_force)
             return truth

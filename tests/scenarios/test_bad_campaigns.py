@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import AbbeError, CampaignRefused
-from service.workflows.campaign_checks import copies
+from service.workflows.copied_runs import copies
 from service.workflows.solve import check_campaign
 from tests.campaigns import population
 from tests.campaigns.population import CAMPAIGNS
@@ -210,6 +210,30 @@ def test_forty_good_campaigns_are_not_refused():
             assert not [f for f in found if f.refuse]
             flagged += [f"{kind} {seed}: {f.line}" for f in found[:1]]
     assert len(flagged) <= 2, flagged
+
+
+def coarse(name, later_s):
+    """Out and back over six places, read by a sensor of 1 um that repeats to less."""
+    x = [*range(0, 60, 10), *range(50, -10, -10)]
+    y = [0.001 * round(0.08 * v - 0.5 * (k > 5)) for k, v in enumerate(x)]
+    columns = {"t_s": [later_s + 10.0 * k for k in range(12)], "x_mm": [float(v) for v in x], "y_mm": [0.0] * 12, "z_mm": [0.0] * 12}
+    return {"run_id": name, "columns": columns | {"direction": [1] * 6 + [-1] * 6, "deviation_mm": y}}
+
+
+def test_repeats_of_a_coarse_sensor_are_no_copies():
+    """Alike to the last digit, at other times: the sensor shows no noise. With the same times it is one measurement."""
+    assert copies([coarse("a", 0.0), coarse("b", 300.0), coarse("c", 600.0)]) == []
+    twice = copies([coarse("a", 0.0), coarse("b", 0.0)])
+    assert [f.run for f in twice] == ["b"]
+    assert "its readings are those of run a" in twice[0].line
+
+
+def test_visits_at_one_place_are_no_copy_of_the_line_that_passes_it():
+    """Two values, each ten times, of which the line holds one each (shared/data/foreign/bifrost/11361-axis1-resolver)."""
+    line, visits = coarse("line", 0.0), coarse("visits", 500.0)
+    visits["columns"] |= {"x_mm": [20.0] * 12, "direction": [1, -1] * 6}
+    visits["columns"]["deviation_mm"] = [line["columns"]["deviation_mm"][k] for k in (2, 9)] * 6
+    assert copies([line, visits]) == []
 
 
 def test_noise_alone_makes_no_two_runs_alike():

@@ -323,7 +323,7 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
     assert "not pushed: BASE" in out
     assert shop.words() == pushed
 
-    assert abbe("rollback", shop.file)[0] == 0
+    assert abbe("rollback", shop.file, "--yes")[0] == 0
     assert active_crc(shop.sims) == base_crc(base)
     assert state() == "rolled back"
 

@@ -98,7 +98,7 @@ async def test_a_hand_set_table_is_not_overwritten(start_sims, tmp_path):
         await by_hand(session, encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7)))
         gen, entries = await generation(session), len(read_entries(store, "sim"))
         for to in (None, 0, 1):
-            with pytest.raises(TableMismatch, match="not one that the push journal knows"):
+            with pytest.raises(TableMismatch, match="a table that this database did not push"):
                 await rollback(session.controller, store, site, to)
         assert (await generation(session), len(read_entries(store, "sim"))) == (gen, entries)
 
@@ -141,11 +141,11 @@ def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, mo
     with monkeypatch.context() as patch:
         patch.setattr(StoreBook, "append", dies)
         kept = asyncio.run(kept_and_open())
-    assert run(["comp", "rollback", str(sims.machine_file)]) == 0
+    assert run(["comp", "rollback", str(sims.machine_file), "--yes"]) == 0
     assert "push 2 was open and is finished" in capsys.readouterr().out
     table, entries = asyncio.run(now())
     assert (table, entries[-1]) == (kept, (2, State.ROLLED_BACK))
-    assert run(["comp", "rollback", str(sims.machine_file)]) == 0  # ordered once more: further back
+    assert run(["comp", "rollback", str(sims.machine_file), "--yes"]) == 0  # ordered once more: further back
     assert "in force again (push 3" in capsys.readouterr().out
     assert asyncio.run(now())[0][1] != kept[1]
 

@@ -188,6 +188,16 @@ def test_what_is_refused_is_one_line_and_leaves_nothing(abbe, tmp_path):
     assert abbe("solve", bad, "--without", runs[2]["run_id"], "--model", "rigid6")[0] == 0
 
 
+def test_a_real_axis_with_a_coarse_sensor_and_few_readings_is_solved(abbe, shared):
+    """Its repeats are alike to the last digit, and 24 readings are too few for 21 error motions: the six are solved, and that is told."""
+    code, out, err = abbe("solve", shared / "data" / "foreign" / "bifrost" / "11361-axis1-resolver", "--json")
+    assert code == 0, err
+    doc = json.loads(out)
+    assert doc["model"].startswith("rigid6")
+    assert any("24 readings in all are too few for rigid21" in line for line in doc["flags"])
+    assert doc["parameters"]["backlash_X"]["value"] == pytest.approx(-0.2e-3, abs=0.1e-3)
+
+
 def test_a_bad_run_in_the_store_stores_no_solution(abbe, tmp_path):
     site, runs = measured(SEED, "one_tool")
     again = json.loads(json.dumps(runs[1])) | {"run_id": "twin"}

@@ -44,6 +44,16 @@ def test_the_unit_is_locked_down(unit: Path) -> None:
     assert done.returncode == 0, done.stdout[-300:]
 
 
+def test_the_page_s_memory_leaves_the_core_half_of_the_unit_s() -> None:
+    """And a page that the kernel ends does not end the service."""
+    text = (DEPLOY / "abbe.service").read_text()
+    most = re.search(r"(?m)^MemoryMax=(\d+)G$", text)
+    assert most is not None
+    assert setup_of(load_machine(DEPLOY / "machine.example.toml")).page_memory_mb <= int(most[1]) * 1024 / 2
+    assert re.search(r"(?m)^OOMPolicy=continue$", text)
+    assert f"mem_limit: {most[1]}g" in (DEPLOY / "compose.yaml").read_text()
+
+
 def test_the_broker_starts_with_its_file(tmp_path: Path) -> None:
     config = tmp_path / "mosquitto.conf"
     text = (

@@ -12,6 +12,13 @@ from pathlib import Path
 
 import pytest
 
+from service.audit.book import AuditBook, files_of, sqlite_base
+from service.audit.chain import Event
+from service.capture.settings import CaptureSettings, segment_folder
+from service.storage.migrate import known_revisions
+from service.storage.store import Store
+from service.workflows.restore import BESIDE
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("service", "drivers", "models", "simulators")
 LOCKS = ("requirements.lock", "requirements-dev.lock", "requirements-bench.lock")
@@ -47,6 +54,31 @@ def tracked_files() -> list[Path]:
 
 def tool(name: str) -> str:
     return str(Path(sys.executable).parent / name)
+
+
+def test_what_lies_beside_a_database_is_not_committed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """README lets Abbe work in the clone: a `git add .` must not take the key of the audit along. The names are those that are made."""
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("not a git repository")
+    monkeypatch.delenv("ABBE_AUDIT_FOLDER", raising=False)
+    names = set()
+    for stem in ("abbe", "my shop"):
+        file = tmp_path / f"{stem}.sqlite3"
+        key, heads = files_of(sqlite_base(file))
+        beside = [Path(f"{file}{ending}") for ending in (*BESIDE, *(f".before-{revision}" for revision in known_revisions()))]
+        names |= {one.name for one in (*beside, key, heads)} | {f"{segment_folder(f'sqlite:///{file}', CaptureSettings()).name}/run-1"}
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        AuditBook(store, f"sqlite:///{tmp_path / 'abbe.sqlite3'}").write(Event("a", "b", "c", "done", {}))
+        names |= {one.name for one in tmp_path.iterdir()}
+    assert len(names) > 12
+    done = subprocess.run(["git", "check-ignore", "--no-index", *names], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert names - set(done.stdout.replace('"', "").splitlines()) == set()
+
+
+def test_one_place_says_how_a_python_is_started() -> None:
+    """All others would have to remember that a child must not look for modules in the working directory."""
+    starts = {p.relative_to(ROOT).as_posix() for p in SOURCES if "sys.executable" in p.read_text()}
+    assert starts == {"service/children.py"}
 
 
 @pytest.mark.parametrize("package", PACKAGES)

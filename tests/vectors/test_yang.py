@@ -37,6 +37,17 @@ def test_an_altered_eighth_digit_is_found_in_the_slow_files_too(shared):
     assert not missed(shared, "yang_ballbar_complete", lambda path: path[0] in ("runs", "lsq9_run0_slide", "result"), count=2, seed=5)
 
 
+def test_a_null_vector_may_point_either_way_but_not_both(shared):
+    """A held-out file states some of its null vectors with the other sign: that is the same direction."""
+    key = "a1 one helix R175, no setup unknowns"
+    doc = load(shared, "yang_ranks")
+    vectors = doc["null_space_degree1"][key]
+    doc["null_space_degree1"][key] = [{name: -weight for name, weight in vector.items()} for vector in vectors]
+    assert read("yang_ranks", doc).ok
+    doc["null_space_degree1"][key][0] = vectors[0] | {name: -weight for name, weight in list(vectors[0].items())[:1]}
+    assert not read("yang_ranks", doc).ok
+
+
 def test_an_unaltered_file_passes_the_same_road(shared):
     assert read("yang_helix", load(shared, "yang_helix")).ok
 

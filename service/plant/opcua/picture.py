@@ -35,7 +35,7 @@ def picture_of(facts: Facts) -> Picture:
         "Version": Leaf(facts.version, "text"),
         "NextCheck": Leaf(facts.next_utc, "time"),
         **_running(facts),
-        **_last(facts.checks[0] if facts.checks else None),
+        **_last(facts.checks[0] if facts.checks else None, facts.verdict),
         **_past(facts.checks),
         **_alarms(facts.alarms),
         **_table(facts),
@@ -57,10 +57,11 @@ def _running(facts: Facts) -> Picture:
     }
 
 
-def _last(check: Check | None) -> Picture:
+def _last(check: Check | None, verdict: str | None) -> Picture:
+    """The last check. Its verdict stands only where it is of the table in force."""
     out = {
         "LastResult/Number": Leaf(check.number if check else None, "count"),
-        "LastResult/Verdict": Leaf(check.verdict if check else None, "text"),
+        "LastResult/Verdict": Leaf(verdict, "text"),
         "LastResult/Text": Leaf(_short(check.text) if check else None, "text"),
         "LastResult/Schedule": Leaf(check.schedule if check else None, "text"),
         "LastResult/Recipe": Leaf(check.recipe if check else None, "text"),
@@ -107,6 +108,8 @@ def _table(facts: Facts) -> Picture:
         "CompensationTable/Crc32": Leaf(f"{table.crc:08x}" if table else None, "text"),
         "CompensationTable/Push": Leaf(table.push if table else None, "count"),
         "CompensationTable/Since": Leaf(table.since_utc if table else None, "time"),
+        "CompensationTable/Verified": Leaf({"verified": True, "unverified": False}.get(facts.verified.state), "flag"),
+        "CompensationTable/VerifiedText": Leaf(facts.verified.text or None, "text"),
     }
 
 

@@ -26,7 +26,9 @@ from service.web.api.shapes_tables import (
 )
 from service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, read_as, storable
 from service.workflows.changed_words import proved
+from service.workflows.discovery_states import taken_back
 from service.workflows.trend_table import as_doc, trends
+from service.workflows.verified_by import verified_by
 
 CHECKS = 20_000
 """So many of the latest checks make a trend: more than ten years of four a day."""
@@ -53,13 +55,21 @@ def add_found(app: FastAPI, sources: Sources) -> None:
     @needs(Permission.READ)
     def trend(
         machine: Annotated[str | None, Query(description="Absent: the machine of this service.")] = None,
-        after: Annotated[Moment | None, Query(description="Only later checks, e.g. since the last push; UTC if it does not say.")] = None,
+        after: Annotated[
+            Moment | None, Query(description="Only later checks (UTC if it does not say); absent: since the table came.")
+        ] = None,
     ) -> Trends:
         """Do the figures of the checks drift, since when, and when do they reach their limits."""
         name = sources.machine if machine is None else machine
         since = after.replace(tzinfo=UTC) if after is not None and after.tzinfo is None else after
-        records = sources.store.verifications_of(name, limit=CHECKS) if storable(name) else []
-        return Trends.model_validate(as_doc(name, trends(records, since)) | {"machine": name})
+        if not storable(name):
+            return Trends.model_validate(as_doc(name, []) | {"machine": name})
+        known, records = (
+            verified_by(sources.store, name, control=sources.control_of(name)),
+            sources.store.verifications_of(name, limit=CHECKS),
+        )
+        found = as_doc(name, trends(records, known.since if since is None else since))
+        return Trends.model_validate(found | {"machine": name, "verified": known.as_doc() | {"changes": known.changes}})
 
 
 def _add_solutions(app: FastAPI, sources: Sources) -> None:
@@ -96,7 +106,7 @@ def _add_discoveries(app: FastAPI, sources: Sources) -> None:
         row = sources.row("discoveries", number, "discovery")
         steps = sources.store.discovery_steps(number)
         states = [DiscoveryState(state=one.state, utc=one.utc, why=str(one.doc.get("why", ""))) for one in steps]
-        found: Doc | None = next((one.doc["finding"] for one in steps if "finding" in one.doc), None)
+        found: Doc | None = next((taken_back(one.doc["finding"]) for one in steps if "finding" in one.doc), None)
         answer = None if found is None else read_as(DiscoveryFile, found.get("answer"))
         told = None if found is None else found.get("changed")
         changed = None if told is None else ChangedSince.model_validate(told | {"proved": proved(told)})

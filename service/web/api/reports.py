@@ -81,9 +81,11 @@ def _written(sources: Sources, kind: Kind, number: int, form: Form, machine: str
 def _document(sources: Sources, kind: Kind, number: int, machine: str | None) -> Document:
     store = sources.store
     if kind is Kind.PUSH:
-        if machine is not None and (not storable(machine) or not store.push_entries(machine)):
+        if machine is not None and (not storable(machine) or not store.push_entries(machine, sources.control_of(machine))):
             raise NotStored("this machine has no push")
-        found = store.page("pushes", {"push": number, "machine": machine}, None, 1)
+        found = store.page(
+            "pushes", {"push": number, "machine": machine and store.push_chain(machine, sources.control_of(machine))}, None, 1
+        )
         if not found:
             raise NotStored(f"there is no push {number}")
         return numbered_report(store, kind, number, sources.rules, machine)

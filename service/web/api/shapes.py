@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.runs.machine_object import MachineObject
-from service.web.schemas import Device, Verification
+from service.web.schemas import Device, Verification, Verified
 
 
 class Answer(BaseModel):
@@ -177,6 +177,7 @@ class Trends(Answer):
 
     machine: str
     figures: list[Figure]
+    verified: Verified = Field(default_factory=lambda: Verified(changes=[]))
 
 
 class Slot(Answer):

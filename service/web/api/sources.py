@@ -54,6 +54,8 @@ class Sources:
         What the machine file adds to reports.
     tail : LogTail, optional
         The latest lines of the log, for the diagnostics.
+    control : str
+        Identity of the machine's control (`control_of`); empty: not known.
     """
 
     store: ServiceStore
@@ -63,6 +65,11 @@ class Sources:
     devices: Callable[[], Sequence[Device]] = tuple
     rules: Rules = field(default_factory=Rules)
     tail: LogTail | None = None
+    control: str = ""
+
+    def control_of(self, machine: str) -> str:
+        """Identity of a machine's control, where it is the one of this service; else empty."""
+        return self.control if machine == self.machine else ""
 
     def page(self, kind: str, given: Mapping[str, object], cursor: int | None, limit: int) -> tuple[list[Doc], int | None]:
         """Rows of a page, and the cursor of the next one; None: there is none."""

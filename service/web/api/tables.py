@@ -122,7 +122,7 @@ def _standings(sources: Sources, rows: list[Doc]) -> list[s.Proposal]:
             with as_stored():
                 proposed = load(store, number)
                 if machine not in journals:
-                    journals[machine] = read_entries(store, machine)
+                    journals[machine] = read_entries(store, machine, sources.control_of(machine))
                 decided = (store.approvals(number), journals[machine], tables, now_s, store.rejections(number))
                 now = standing_of(number, proposed, *decided)
         except Unusable as error:  # one bad row must not hide the others
@@ -171,8 +171,9 @@ def _add_pushes(app: FastAPI, sources: Sources) -> None:
         cursor: Cursor = None,
         limit: Limit = 50,
     ) -> s.PushEntries:
-        """The journal of pushes, newest entry first."""
-        rows, after = sources.page("pushes", {"machine": machine, "push": push, "state": state}, cursor, limit)
+        """The journal of pushes, newest entry first; of a machine that was renamed under the name that its journal was begun with."""
+        journal = machine and sources.store.push_chain(machine, sources.control_of(machine))
+        rows, after = sources.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
         return s.PushEntries(entries=[s.PushEntry(number=row["id"], **row) for row in rows], next_cursor=after)
 
     @app.get("/api/v1/pushes/{number}")

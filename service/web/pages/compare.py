@@ -67,14 +67,14 @@ def compare_screen(store: Store, numbers: Sequence[int], say: Say, rules: Rules)
         return CompareScreen(choices, runs)
     try:
         loaded = [_load(store, record, rules) for record in there]
+        why = next((text for one in loaded[1:] if (text := against(loaded[0], one))), "")
+        curves = [] if why else [curve(one) for one in loaded]
     except AbbeError as error:
         return CompareScreen(choices, runs, trouble=error.detail)
     except UNUSED as error:  # a document of another version, or changed by hand
         return CompareScreen(choices, runs, trouble=f"{type(error).__name__}: {error}")
-    why = next((text for one in loaded[1:] if (text := against(loaded[0], one))), "")
     if why:
         return CompareScreen(choices, runs, trouble=why)
-    curves = [curve(one) for one in loaded]
     apart = difference(curves[0], curves[1]) if len(curves) == 2 else None
     said = [*remarks(loaded, _feed), *([_summary(apart, say)] if apart is not None else [])]
     return CompareScreen(choices, runs, [_line(r) for r in figure_rows(loaded)], pictures(curves, apart, say), said)

@@ -18,8 +18,8 @@ from service.workflows.alarm_states import folded, is_open
 
 SORTS = ("worst", "machine", "due")
 COLUMNS = (
-    "machine", "state", "last_check_utc", "verdict", "worst_figure", "value", "expanded_uncertainty_k2", "limit", "share_of_limit",
-    "next_due_utc", "next_recipe", "open_alarms",
+    "machine", "state", "last_check_utc", "verdict", "worst_figure", "value", "expanded_uncertainty_k2", "limit",
+    "share_of_limit", "next_due_utc", "next_recipe", "open_alarms", "table_in_force",
 )  # fmt: skip
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
@@ -91,8 +91,8 @@ def fleet_csv(lines: Sequence[FleetLine]) -> str:
     for line in lines:
         one, worst = line.machine, line.worst
         figure = ("", "", "", "", "") if worst is None else (worst.name, worst.value, worst.expanded, worst.limit, line.share)
-        write.writerow([_cell(v) for v in (one.machine, one.state, one.check_utc, one.verdict, *figure, one.next_due_utc, one.next_recipe)]
-                       + [line.alarms])  # fmt: skip
+        head = (one.machine, one.state, one.check_utc, one.verdict)
+        write.writerow([_cell(v) for v in (*head, *figure, one.next_due_utc, one.next_recipe)] + [line.alarms, one.verified.text])
     return out.getvalue()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from dataclasses import asdict
+from dataclasses import fields
 from typing import Annotated
 from urllib.parse import parse_qs
 
@@ -135,7 +135,7 @@ def _add_proposals(app: FastAPI, desk: Desk) -> None:
 
 
 def _add_approval(app: FastAPI, desk: Desk) -> None:
-    @app.post("/proposal/approve", include_in_schema=False)
+    @app.post("/proposal/approve", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.APPROVE)
     async def approve(request: Request) -> Response:
         visit: Visit = request.state.visit
@@ -185,7 +185,8 @@ def _add_times(app: FastAPI, desk: Desk) -> None:
     async def trends() -> HTMLResponse:
         past = await desk.source.verifications(times.CHECKS)
         moment = await desk.source.status()
-        return await desk.show("trends.html", **asdict(await desk.read(times.trend_screen, past, moment)))
+        screen = await desk.read(times.trend_screen, past, moment)
+        return await desk.show("trends.html", **{one.name: getattr(screen, one.name) for one in fields(screen)})
 
     @app.get("/schedule", include_in_schema=False)
     @needs(Permission.READ)

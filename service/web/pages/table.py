@@ -36,7 +36,7 @@ def add_table_screen(app: FastAPI, env: Environment, door: Door, source: Source,
     @needs(Permission.READ)
     async def table() -> HTMLResponse:
         try:
-            told = await desk.read(story, sources.store, sources.machine)
+            told = await desk.read(story, sources.store, sources.machine, sources.control)
         except StoreError as error:
             if not error.detail.startswith("the push journal is not"):
                 raise
@@ -48,6 +48,7 @@ def add_table_screen(app: FastAPI, env: Environment, door: Door, source: Source,
             broken="",
             pushes=told.pushes[:MOST],
             attention=status.attention,
+            verified=status.verified,
             job=status.job,
             may_order=current().may(Permission.APPROVE) and bool(current().csrf),
             key=secrets.token_hex(8),

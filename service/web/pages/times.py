@@ -13,7 +13,7 @@ from service.web import language
 from service.web.frame import current
 from service.web.page import trends
 from service.web.pages.desk import zone_of
-from service.web.schemas import Due, Status, Verification
+from service.web.schemas import Due, Status, Verification, Verified
 from service.workflows.trend_table import FigureTrend, in_words
 from service.workflows.trend_table import trends as figure_trends
 
@@ -38,8 +38,9 @@ class TrendLine:
 
 @dataclass(frozen=True, slots=True)
 class TrendScreen:
-    """Pictures and control charts."""
+    """Pictures and control charts, of checks with the table in force; ``verified``: whether there is one."""
 
+    verified: Verified
     plots: Sequence[Markup]
     charts: Sequence[TrendLine]
     checks: int
@@ -57,7 +58,9 @@ class ScheduleLine:
 def trend_screen(past: Sequence[Verification], moment: Status) -> TrendScreen:
     """Every judged figure of the latest checks."""
     records = [VerificationRecord(p.id, 0, None, p.verdict, p.model_dump(mode="json"), p.started_utc.isoformat()) for p in past]
-    return TrendScreen(trends(past, zone_of(moment)), [_line(t) for t in figure_trends(records)], len(past))
+    changes = moment.verified.changes
+    lines = [_line(t) for t in figure_trends(records, changes[-1] if changes else None)]
+    return TrendScreen(moment.verified, trends(past, zone_of(moment), changes), lines, len(past))
 
 
 def _line(one: FigureTrend) -> TrendLine:

@@ -74,6 +74,25 @@ def test_jitter_is_allowed():
     assert seqs == list(range(200))
 
 
+@pytest.mark.parametrize("rate_hz", [100, 500, 1000])
+@pytest.mark.parametrize("late", [-0.3, -0.06, 0.06, 0.1, 0.3])
+def test_a_clock_that_is_off_by_more_than_a_twentieth_of_a_period_does_not_confirm_the_number(rate_hz, late):
+    """At 0.1 of a period and 50 mm/s the reading belongs to another place, 5 µm away at 1 kHz: such a sample is missing, not taken."""
+    period_us = 1_000_000 // rate_hz
+    at_us = [5_000_000 + period_us * i for i in range(10)]
+    at_us[5] += round(late * period_us)
+    tracker = SequenceTracker(rate_hz, READS)
+    runs = tracker.accept([bar(i, us=us) for i, us in enumerate(at_us)])
+    assert [(run.missing, [sample.seq for sample in run.samples]) for run in runs] == [(0, [0, 1, 2, 3, 4]), (1, [6, 7, 8, 9])]
+    assert (tracker.strays, tracker.lost) == (1, 1)
+
+
+@pytest.mark.parametrize("late", [-0.04, 0.04])
+def test_a_clock_that_is_off_by_less_confirms_it(late):
+    _, seqs = run(*(bar(i, us=5_000_000 + 1000 * i + round(1000 * late) * (i == 5)) for i in range(10)))
+    assert seqs == list(range(10))
+
+
 def test_without_settings_only_number_and_clock_count():
     _, seqs = run(*(bar(i, nm=(-1) ** i * 2_000_000_000, status=i << 8 & 0xFF00) for i in range(20)), reads=None)
     assert seqs == list(range(20))

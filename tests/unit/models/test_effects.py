@@ -278,16 +278,16 @@ def test_one_milliradian_of_beam_makes_half_a_micrometre_per_metre() -> None:
     assert BY_NAME["laser_cosine"].strength(np.array([9.0, 0.0, 9.0]), {}) == pytest.approx(3.0)
 
 
-def test_air_is_0_93_ppm_per_kelvin() -> None:
+def test_warm_air_reads_0_93_ppm_per_kelvin_short() -> None:
     path = PATHS[run("l0")]
     quarter = 4.0 * path.at.t_s[30]
     columns = of("air_refraction", "", period_s=quarter)[run("l0")]
-    assert columns[30, 0] == pytest.approx(0.93e-6 * path.travel_mm[30])
+    assert columns[30, 0] == pytest.approx(-0.93e-6 * path.travel_mm[30])
 
 
 def test_the_dead_path_drifts_with_the_hours() -> None:
     path = PATHS[run("l0")]
-    wanted = 0.93e-6 * DEAD_PATH_MM * (path.at.t_s - path.at.t_s[0]) / 3600.0
+    wanted = -0.93e-6 * DEAD_PATH_MM * (path.at.t_s - path.at.t_s[0]) / 3600.0
     np.testing.assert_allclose(of("dead_path", "")[run("l0")][:, 0], wanted)
 
 

@@ -257,3 +257,38 @@ def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsy
     assert capsys.readouterr().err == (
         "error ILK-003: the door is open - close it; cup and bar may still be mounted: take them out before anything moves\n"
     )
+
+
+@pytest.mark.parametrize(
+    "helix",
+    [
+        *("300,250,nan,100", "inf,250,100,100", "300,250,100,1e999", "300,250,100", "a,b,c,d"),
+        *("300,250,100,-5", "300,250,100,0", "300,250,100,1e-300", "300,250,1e308,100"),
+    ],
+)
+def test_a_helix_that_is_none_is_one_line(abbe: Abbe, machine: Path, helix: str) -> None:
+    said = abbe.fails("measure", machine, "--helix", helix, "--dry-run")
+    assert said.startswith("error CFG-001: ")
+
+
+PLACES = {
+    "ascii": {"PYTHONIOENCODING": "ascii"},
+    "POSIX": {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    "latin-1": {"PYTHONIOENCODING": "latin-1"},
+}
+
+
+COMMANDS = ("effects backlash", "effects", "--help", "comp formats", "check-config machine.toml", "import µ→")
+
+
+@pytest.mark.parametrize(("words", "place"), [*((one, "ascii") for one in COMMANDS), *((COMMANDS[0], one) for one in ("POSIX", "latin-1"))])
+def test_a_place_that_has_no_letters_gets_plain_ones(machine: Path, words: str, place: str) -> None:
+    command = [sys.executable, "-m", "service.cli", *words.split()]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("LC_", "LANG"))} | PLACES[place]
+    done = subprocess.run(command, cwd=machine.parent, env=environment, capture_output=True, check=False, timeout=60)
+    assert done.returncode == (2 if words.startswith("import") else 0), done.stderr
+    assert b"Traceback" not in done.stderr
+    if place != "latin-1":
+        assert (done.stdout + done.stderr).isascii()
+    if words == "effects backlash":
+        assert ("µm".encode("latin-1") if place == "latin-1" else b"30.0 um") in done.stdout

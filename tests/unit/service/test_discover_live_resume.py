@@ -64,6 +64,7 @@ class Bench:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.url = f"sqlite:///{folder / 'abbe.sqlite3'}"
         self.measured: list[str] = []
+        self.accepting: list[bool] = []
         self.search = Asks()
         self.boot, self.writes = BOOT, 0
         self.now_s, self.bits = 7000.0, READY
@@ -73,6 +74,8 @@ class Bench:
         monkeypatch.setattr("service.workflows.discovery_engine.search", self.search)
         monkeypatch.setattr("service.cli.measure.ready_session", self._session)
         monkeypatch.setattr("service.workflows.measure.measure_test", self._measure_test)
+        for name in ("discover_live", "measure"):
+            monkeypatch.setattr(f"service.workflows.{name}.check_devices", self._answer)
         monkeypatch.setattr("service.workflows.provenance.revision", lambda: "r")  # asks git for a second, each time
         monkeypatch.setattr(Owner, "is_gone", lambda _self: True)
         for name in WRITES:
@@ -101,7 +104,9 @@ class Bench:
         return call
 
     @asynccontextmanager
-    async def _session(self, _store: Store, _site: Any) -> AsyncIterator[Any]:
+    async def _session(self, _store: Store, _site: Any, *, accept_table: bool) -> AsyncIterator[Any]:
+        self.accepting.append(accept_table)
+
         async def status() -> Any:
             return SimpleNamespace(ctrl_us=round(1e6 * self.now_s) + 1_000_000 * len(self.measured), bits=self.bits)
 
@@ -112,6 +117,9 @@ class Bench:
             """A hold that a killed process may have left is taken away; nothing moves here."""
 
         yield SimpleNamespace(ballbar=None, laser=None, controller=SimpleNamespace(status=status, comp_status=comp_status, abort=abort))
+
+    async def _answer(self, *_: Any, air: bool) -> None:
+        """No device is played here, so none is asked."""
 
     async def _measure_test(self, _session: Any, store: Store, _site: Any, campaign: Any, test: Any, *_rest: Any) -> int:
         number = 5 + len(self.measured)
@@ -125,11 +133,11 @@ class Bench:
         await store.write(store.finish_run, run_id, "complete", "", {})
         return int(run_id)
 
-    def live(self, end_after: int | None = None, campaign: str = "june") -> int | None:
+    def live(self, end_after: int | None = None, campaign: str = "june", *more: str) -> int | None:
         """The command; None: it was ended after so many writes."""
         self.left, self.writes = end_after, 0
         try:
-            return cli.run(["discover", campaign, "--machine", str(self._folder / "machine.toml"), "--live"])
+            return cli.run(["discover", campaign, "--machine", str(self._folder / "machine.toml"), "--live", *more])
         except Ended:
             return None
         finally:
@@ -183,6 +191,12 @@ def test_undisturbed_it_measures_twice_and_done_again_it_does_nothing(bench: Ben
     assert ": 2 of 2 runs are measured" in said
     assert ": 1 of 1 runs are measured" in said
     assert "stored: discovery 3, EXPLAINED, model version 3 of VMC-1" in said
+
+
+def test_a_person_s_word_for_the_table_in_force_is_not_said_again_in_later_rounds(bench: Bench) -> None:
+    assert bench.live(None, "june", "--accept-table") == 0
+    assert bench.measured == [*ROUND_1, *ROUND_2]
+    assert bench.accepting == [True, False]
 
 
 # First discovery opened, searched, ended; added campaign begun; its first run started, read, complete; its last one complete; second

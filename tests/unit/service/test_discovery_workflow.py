@@ -18,13 +18,14 @@ import pytest
 from models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
 from service.errors import CampaignRefused, NotObservable, StoreError
 from service.events import ignore_progress
+from service.runs.discovery_file import DiscoveryFile
 from service.storage.store import Store
 from service.workflows.campaign_folder import from_folder
 from service.workflows.discover import Job, Journal, discover, prepare
 from service.workflows.discovery_doc import finite
 from service.workflows.discovery_engine import catalogue
 from service.workflows.discovery_pages import discovery_page, gap_rows
-from service.workflows.discovery_states import closed, entering, judge, not_entered
+from service.workflows.discovery_states import closed, entering, judge, not_entered, taken_back
 from service.workflows.discovery_store import StoredJournal, journal_of
 from service.workflows.discovery_words import lines_of, next_of, rival_lines, verdict_of
 from service.workflows.model_book import current
@@ -96,9 +97,37 @@ def test_a_wrong_name_that_only_fits_is_not_proved(folder: Path) -> None:
     assert closed({"before_um": 0.29, "after_um": 0.29, "floor_um": 0.3}) is None
 
 
+def test_a_name_that_is_taken_back_is_a_suspect_in_text_answer_and_page(folder: Path) -> None:
+    """What the text takes back no script may read as a name; found by an older version and stored, it comes out alike."""
+    job = job_of(folder)
+    bad = discover(job, Journal(), Search(holds=False), ignore_progress)
+    for told in (bad, bad["answer"]):
+        assert (told["verdict"], told["effects"], told["proved"]) == ("unknown", [], False)
+        assert [e["name"] for e in told["suspects"]] == ["backlash"]
+        assert [e["proved"] for e in told["suspects"]] == [False]
+    DiscoveryFile.model_validate(json.loads(json.dumps(bad["answer"])))
+    assert "Something is missing that the catalogue does not explain" in verdict_of(bad)[1]
+    assert "Suspected: backlash" in verdict_of(bad)[2]
+    assert not any("enter the width" in line for line in lines_of(bad))  # no remedy for what is not confirmed
+    page = discovery_page(bad, job.runs, {}, {"title": "", "flags": [], "states": [], "provenance": {}})
+    assert (page.effects, page.rejected[0][0]) == ([], "backlash:X")
+    named = {"verdict": "named", "effects": bad["suspects"], "answer": {"verdict": "named", "effects": bad["answer"]["suspects"]}}
+    older = {k: v for k, v in bad.items() if k not in ("proved", "proof", "suspects")} | named
+    assert taken_back(older)["verdict"] == taken_back(older)["answer"]["verdict"] == "unknown"
+
+
+def test_the_answer_says_what_is_proved_and_by_which_rule(folder: Path) -> None:
+    answer = discover(job_of(folder), Journal(), Search(), ignore_progress)["answer"]
+    assert (answer["verdict"], answer["proved"]) == ("named", True)
+    assert answer["proof"] == "at least 50% of the gap closes on the runs that judge"
+    assert [e["proved"] for e in answer["effects"]] == [True]
+    assert discover(job_of(folder), Journal(), Search("none"), ignore_progress)["answer"]["proved"] is False
+
+
 def variant(finding: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """A finding with a second effect that is noise, beside its first one."""
-    return finding | {"effects": [*finding["effects"], finding["effects"][0] | {"kind": "variance", "label": "stick_slip:X"} | changes]}
+    key = "effects" if finding["effects"] else "suspects"
+    return finding | {key: [*finding[key], finding[key][0] | {"kind": "variance", "label": "stick_slip:X"} | changes]}
 
 
 def test_noise_that_is_named_does_not_excuse_a_name_beside_it(folder: Path) -> None:

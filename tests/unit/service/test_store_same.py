@@ -110,6 +110,9 @@ def found(ask: Any) -> None:
     entry = PushEntryRecord(0, "mill-7", 1, 0, "SNAPSHOT", DOC, "then", "", "1" * 64)
     ask.add_push_entry(entry), ask.add_push_entry(entry), ask.add_push_entry(replace(entry, seq=1, prev="1" * 64, digest="2" * 64))
     ask.push_entries("mill-7"), ask.push_entries("MILL-7"), ask.last_push("mill-7"), ask.last_push("none")
+    whose = {"machine": "mill-8", "control": "modbus+tcp://a:502", "base_crc": 1, "crc": 2**32 - 1, "image": "00"}
+    ask.add_push_entry(replace(entry, machine="mill-1", doc=whose)), ask.push_marks(), ask.push_entries_of("mill-1")
+    ask.push_chain("mill-8"), ask.push_chain("new", "modbus+tcp://a:502"), ask.push_chain("mill-1", "modbus+tcp://b:502")
     ask.add_discovery(1, "ab" * 32, DOC), ask.add_discovery_step(1, 0, "BEGUN", DOC)
     ask.add_discovery_step(1, 1, "NAMED", DOC, NewVersion("mill-7", None, DOC))
     (

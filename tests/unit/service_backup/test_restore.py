@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 import subprocess
@@ -205,3 +206,21 @@ def test_in_a_folder_for_several_databases_the_audits_are_kept_apart(
         assert run(["backup", str(machine), str(tmp_path / f"again-{machine.parent.name}")]) == 0
         assert run(["audit", "verify", "--machine", str(machine)]) == 0
     assert len(list((tmp_path / "audit").glob("abbe.sqlite3*.audit-key"))) == 2
+
+
+@pytest.mark.parametrize("odd", ["link to a device", "link to a folder", "pipe", "list"])
+def test_what_no_backup_holds_is_not_followed(
+    shop: Shop, made: Path, elsewhere: Path, odd: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A copy would read the device for ever, wait at the pipe, or take a strange folder along."""
+    if odd == "list":
+        (made / "backup.json").unlink()
+    path = made / ("backup.json" if odd == "list" else "more")
+    if odd in {"pipe", "list"}:
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero" if odd == "link to a device" else "/etc")
+    assert run(["restore", str(elsewhere), str(made)]) == 2
+    said = capsys.readouterr().err
+    assert "it is a pipe" in said if odd == "list" else f"{path} is not of this backup" in said
+    assert not (elsewhere.parent / "abbe.sqlite3").exists()

@@ -30,7 +30,7 @@ def store(tmp_path: Path):
 async def test_the_push_is_taken_back_before_a_segment_is_looked_at(store: Store, monkeypatch) -> None:
     done: list[str] = []
 
-    async def pushed(*words: object) -> str:
+    async def pushed(*words: object, **more: object) -> str:
         done.append("push")
         return "the old table was made active again"
 

@@ -9,6 +9,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,10 +18,13 @@ import pytest
 
 from service.cli.measure import _plan
 from service.cli.serve import _campaigns
+from service.clock import SystemClock
 from service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
 from service.sequences.control import Control, State
+from service.sequences.interlocks import Watching
 from service.sequences.recipe_file import recipe_text
-from service.sequences.recipes import Helix
+from service.sequences.recipes import Helix, Linear
+from service.sequences.steps import CampaignPlan
 from service.workflows import led_campaign as work
 from service.workflows.campaign_run import plan_hash
 from service.workflows.led_campaign import Led
@@ -41,14 +45,32 @@ def test_what_was_broken_off_is_gone_on_with_by_the_command_line(recipe: str, tm
 
 
 def pretended(**site: Any) -> Any:
-    told = {"calibrated_until": {"laser": 1}, "name": "mill-7"} | site
+    told = {"calibrated_until": {"laser": date(2099, 12, 31)}, "name": "mill-7", "watching": Watching()} | site
     return SimpleNamespace(
-        plan=SimpleNamespace(name="full 1"), site=SimpleNamespace(**told), control=Control(), store=None, progress=None, clock=None
+        plan=CampaignPlan("full 1", ()),
+        site=SimpleNamespace(**told),
+        control=Control(),
+        store=None,
+        progress=None,
+        clock=SystemClock(),
     )
 
 
 async def measured(bench: Any, source: Any) -> None:
     """All of it, without a device."""
+
+
+async def all_there(*_: object, **__: object) -> None:
+    """Every device answers."""
+
+
+async def test_after_the_last_day_of_a_certificate_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(work, "_measured")
+    bench = pretended(calibrated_until={"laser": date(2020, 5, 31), "ballbar": date(2020, 4, 30)})
+    line = Linear("l", "L1", "identify", 0, n=5).plan(MACHINE)
+    bench.plan = CampaignPlan("full 1", (line,))
+    led = await work.led_campaign(bench, {}, "bob")
+    assert (led.word, "certificate of the laser has ended on 2020-05-31" in led.text, "ball-bar" in led.text) == ("ended", True, False)
 
 
 async def test_without_certificates_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,15 +92,13 @@ async def test_a_stop_while_a_push_is_taken_back_begins_no_campaign(monkeypatch:
     bench = pretended(max_feed_mm_min=6000.0, urls=SimpleNamespace(cnc="cnc"))
 
     @asynccontextmanager
-    async def session(*_: object) -> AsyncIterator[Any]:
+    async def session(*_: object, **__: object) -> AsyncIterator[Any]:
+        bench.control.stop()
         yield SimpleNamespace(controller=None)
 
-    async def recover(*_: object) -> None:
-        bench.control.stop()
-
-    for name, instead in (("alone", lambda _: nullcontext()), ("open_session", session), ("recover", recover)):
+    for name, instead in (("alone", lambda _: nullcontext()), ("recovered_session", session)):
         monkeypatch.setattr(work, name, instead)
-    for name, instead in (("paced", lambda plan, _: plan), ("_check_instruments", lambda *_: None)):
+    for name, instead in (("paced", lambda plan, _: plan), ("check_devices", all_there)):
         monkeypatch.setattr(work, name, instead)
     monkeypatch.delattr(work, "start_campaign")
     bench.live = None
@@ -163,10 +183,3 @@ async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wai
         await asyncio.wait({asking}, timeout=10)
         assert control.prompts.now is None
         assert isinstance(asking.exception(), Stopped) == (number == 2)
-
-
-def test_every_instrument_is_asked_for_before_anything_moves() -> None:
-    asked: list[str] = []
-    session: Any = SimpleNamespace(**{f"need_{name}": lambda name=name: asked.append(name) for name in ("ballbar", "laser", "fixture")})
-    work._check_instruments(session, work.full_campaign("identification", MACHINE, Path())[0])
-    assert asked == ["ballbar", "laser", "fixture"]

@@ -251,6 +251,7 @@ def test_the_commands_plan_write_and_dry_run(tmp_path):
     html = page.read_text()
     assert "<polyline" in html
     assert "http" not in html
+    machine.write_text(MACHINE_TOML + '[devices]\ncnc = "modbus+tcp://h:1"\nballbar = "socket://h:1"\nfixture = "fixture+console:"\n')
     dry = CliRunner().invoke(app, ["measure", str(machine), "--recipe", str(out), "--dry-run"])
     assert dry.exit_code == 0, dry.output
     assert "of machine time" in dry.output

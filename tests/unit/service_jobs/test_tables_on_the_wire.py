@@ -56,6 +56,16 @@ def test_an_encoder_that_lies_is_caught_by_the_independent_decoder(wrong):
     assert meaning_of_bytes(encode(table_image(lied, 100, 7))) != meaning_of_tables(want)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_entry_goes_to_the_nearest_unit_whichever_side_it_is_on(sign):
+    positions = tuple(np.linspace(0.0, 500.0, 6) for _ in range(3))
+    units = sign * np.array([0.0, 1.4, 1.6, 2.0, 7.49, 7.51])
+    curve = np.repeat(1e-4 * units[:, None], 3, axis=1)
+    found = quantise(NineTables(positions, (curve, curve, curve), (curve, curve, curve)), 1e-4)
+    for rounded in found.correction_mm:
+        assert rounded / 1e-4 == pytest.approx(np.repeat(sign * np.array([0.0, 1.0, 2.0, 2.0, 7.0, 8.0])[:, None], 3, axis=1))
+
+
 def test_an_honest_encoder_means_what_was_computed_once_it_is_quantised():
     want = quantise(tables(1.2345), 1e-4)
     assert meaning_of_bytes(encode(table_image(want, 100, 7))) == meaning_of_tables(want)

@@ -124,7 +124,7 @@ async def test_a_table_of_slots_is_not_read_every_second(store: ServiceStore) ->
             asked[0] += 1
             return []
 
-        def last_push(self, machine: str, /) -> list[Any]:
+        def last_push(self, machine: str, control: str = "", /) -> list[Any]:
             return []
 
     gatherer = Gatherer(View("mill-7", "0.1.0", board, store, lambda: [], "", clock).status, Counted())

@@ -75,6 +75,8 @@ CORE = [
         m.RulesTold({}, None, None),
         m.MachineTold("w-Y-X-b-Z-t", {"X": (0.0, 600.0)}, {"X": (0.0, 0.0, 0.0)}, (0.0, 0.0, 150.0), 6000.0),
         ("identification",),
+        1024,
+        "modbus+tcp://127.0.0.1:502",
     ),
     MOMENT,
     m.Jobs("jobs", (JOB, replace(JOB, ended_utc=NOW, verification=7))),

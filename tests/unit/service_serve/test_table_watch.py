@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.errors import LinkDown
-from service.core.table_watch import AGAIN_S, CODE, LOOK_S, NOBODY_PUSHED, TableWatch
+from service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWatch
 from service.push.entries import Entry
 from service.push.states import State
 from service.workflows.in_force import InForce
@@ -98,21 +98,54 @@ async def test_one_look_in_the_middle_of_an_end_is_no_alarm() -> None:
         assert bench.shelf.alarms == []
 
 
-async def test_without_a_push_the_first_look_is_what_counts() -> None:
-    """There is nothing that a person could accept: he looks, and begins anew with what is right."""
+async def test_without_a_push_a_control_as_it_comes_is_what_counts() -> None:
+    """A table that corrects nothing needs nobody's word; what takes its place is an alarm, and a person looks."""
     bench = Bench(InForce(0, 0xA, None))
     async with watched(bench):
+        await bench.then(InForce(0, 0xA, None), 100.0)
+        assert (bench.shelf.alarms, bench.attention) == ([], ["another line"])
         for strange in (0xB, 0xC):
-            await bench.then(InForce(1, strange, None), 100.0)
+            await bench.then(InForce(1, strange, None, strange=True), 100.0)
             assert f"{strange:08X}, expected is 0000000A" in bench.attention[-1]
-            assert bench.attention[1:] == [f"{CODE}: {bench.shelf.alarms[-1]['what']} - {NOBODY_PUSHED}"]
-        assert [alarm["remedy"] for alarm in bench.shelf.alarms] == [NOBODY_PUSHED] * 2
+            assert bench.attention[1:] == [f"{CODE}: {bench.shelf.alarms[-1]['what']} - {REMEDY}"]
+        assert [alarm["remedy"] for alarm in bench.shelf.alarms] == [REMEDY] * 2
         await bench.then(InForce(0, 0xA, None), 100.0)
         assert (len(bench.shelf.alarms), bench.attention) == (2, ["another line"])
-    bench.seen = InForce(1, 0xC, None)
+
+
+@pytest.mark.parametrize(
+    ("first", "words"),
+    [
+        (InForce(1, 0xC, None, strange=True), "a table that this database did not push is in force: bank 1 has CRC 0000000C"),
+        (InForce(1, 0xC, 0xC, strange=True), "a table that this database did not push is in force: bank 1 has CRC 0000000C"),
+        (
+            InForce(1, 0xC, None, unverified="push 2 of machine 'mill'"),
+            "the compensation in force is unverified: bank 1 has CRC 0000000C, that of push 2 of machine 'mill', which was never verified",
+        ),
+        (InForce(1, 0xC, 0xC, unverified="push 2 of machine 'mill'"), "unverified: bank 1 has CRC 0000000C, that of push 2"),
+        (
+            InForce(1, 0xC, 0xA, unverified="push 2 of machine 'mill'"),
+            "expected is 0000000A; it is that of push 2 of",
+        ),
+    ],
+)
+async def test_a_table_that_the_gate_refuses_is_an_alarm_at_the_first_look_and_never_expected(first: InForce, words: str) -> None:
+    """Before, a service took whatever it found first for good."""
+    bench = Bench(first)
     async with watched(bench):
-        await bench.then(InForce(1, 0xC, None), 100.0)
-        assert (len(bench.shelf.alarms), bench.attention) == (2, ["another line"])
+        await bench.then(first, 2 * AGAIN_S)
+        (alarm,) = bench.shelf.alarms
+        assert words in alarm["what"]
+        assert bench.attention[1:] == [f"{CODE}: {alarm['what']} - {REMEDY}"]
+        await bench.then(InForce(0, 0xA, first.wanted and 0xA), 100.0)  # restored at the controller
+        assert (len(bench.shelf.alarms), bench.attention) == (1, ["another line"])
+
+
+def test_the_remedy_names_nothing_that_is_refused_then() -> None:
+    """A rollback and a push look at the table in force first, and refuse this one."""
+    assert "rollback" not in REMEDY
+    assert "push" not in REMEDY
+    assert "accept-table" in REMEDY
 
 
 def entries(state: State, *docs: dict[str, int], push: int = 1) -> list[Entry]:

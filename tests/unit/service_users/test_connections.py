@@ -40,6 +40,10 @@ def small_app() -> FastAPI:
     async def form(request: Request) -> PlainTextResponse:
         return PlainTextResponse(str(len(await request.body())))
 
+    @app.post("/early")
+    async def early() -> PlainTextResponse:
+        return PlainTextResponse("no", 413)
+
     return app
 
 
@@ -147,6 +151,21 @@ async def test_what_does_not_come_to_its_end_is_cut(said: bytes, drop_by_drop: b
         answer = await ended
         assert time.monotonic() - began_s < 5.0  # not uvicorn's: it has no such end
         assert answer.count(b"200 OK") == said.count(ASK + b"\r\n")
+
+
+@pytest.mark.parametrize("how", [b"Content-Length: 100000000", b"Transfer-Encoding: chunked"])
+async def test_a_body_that_was_refused_is_thrown_away_for_a_while_then_cut(how: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "LINGER_S", 0.5)
+    async with serving() as site:
+        stream = await site.opened(b"POST /early HTTP/1.1\r\nHost: a\r\n" + how + b"\r\n\r\n")
+        assert (await stream[0].readuntil(b"no")).startswith(b"HTTP/1.1 413")
+        began_s = time.monotonic()
+        with pytest.raises(ConnectionError):  # noqa: PT012 - it goes on sending until it is cut
+            while time.monotonic() - began_s < PATIENCE_S:
+                stream[1].write(b"5\r\nslow!\r\n" if b"chunked" in how else b"slow!")
+                await stream[1].drain()
+                await asyncio.sleep(0.01)
+        assert 0.3 < time.monotonic() - began_s < 10.0
 
 
 async def test_an_answer_that_nobody_reads_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,7 @@ def test_the_csv_holds_si_and_no_formula() -> None:
     line = FleetLine(MachineLine('=cmd("x")', "waiting", verdict="pass"), Figure("body_diagonal_um", 8.0, 2.0, 20.0), 1)
     head, row = fleet_csv([line]).splitlines()
     assert head.startswith("machine,state,")
-    assert row == '"\'=cmd(""x"")",waiting,,pass,body_diagonal_um,8.0,2.0,20.0,0.4,,,1'
+    assert row == '"\'=cmd(""x"")",waiting,,pass,body_diagonal_um,8.0,2.0,20.0,0.4,,,1,not checked yet'
 
 
 def test_a_certificate_says_how_long_it_holds(tmp_path: Path) -> None:

@@ -149,7 +149,8 @@ def runs_of(running: Served, test: str) -> list[int]:
 
 
 def test_runs_of_one_kind_are_compared_and_others_refused(running: Served) -> None:
-    a, b, *_ = runs_of(running, "ballbar_helix")
+    about_x, a, b, *_ = runs_of(running, "ballbar_helix")
+    assert "they ran along different paths" in got(running, f"/compare?run={about_x}&run={a}", 409)
     page = got(running, f"/compare?run={a}&run={b}")
     assert "Polar plot" in page
     assert "B − A" in page

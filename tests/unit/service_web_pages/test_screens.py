@@ -81,7 +81,7 @@ def test_who_may_approve(running: Served, filled: Filled, name: str) -> None:
         ({"number": "-1", "hours": "1"}, 422),
         ({"number": "99", "hours": "1"}, 404),
         ({"number": "1", "hours": "1"}, 409),  # it has reasons against it
-        ({"number": "1", "hours": "1", "more": "x" * 5000}, 422),
+        ({"number": "1", "hours": "1", "more": "x" * 5000}, 413),
         ({str(k): "x" for k in range(20)}, 422),
     ],
 )

@@ -150,9 +150,9 @@ def test_instrument_effects_are_the_published_formulas() -> None:
     diagonal = np.arange(t.n) % 3 == 0
     outward = diagonal & (np.arange(t.n) <= 36)
     assert askew[outward] == pytest.approx(0.5 * (2e-3) ** 2 * t.reach_mm[outward], abs=2e-8)
-    air = 0.93e-6 * 2.0 * np.sin(2.0 * np.pi * t.t_s / 6000.0 + 1.0) * t.reach_mm
+    air = -0.93e-6 * 2.0 * np.sin(2.0 * np.pi * t.t_s / 6000.0 + 1.0) * t.reach_mm
     assert trace(hidden("air_refraction"), LASER) == pytest.approx(air, abs=1e-12)
-    dead = 0.93e-6 * 900.0 * 3.0 * (t.t_s - t.t_s[0]) / 3600.0
+    dead = -0.93e-6 * 900.0 * 3.0 * (t.t_s - t.t_s[0]) / 3600.0
     assert trace(hidden("dead_path"), LASER) == pytest.approx(dead, abs=1e-12)
     saw = trace(hidden("mirror_tilt", strength=500.0), LASER)
     assert np.abs(saw[outward]).max() < 1e-6, "back at zero on the diagonal itself"

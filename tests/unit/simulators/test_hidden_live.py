@@ -95,10 +95,10 @@ def test_what_the_laser_alone_has() -> None:
     cosine = reading(world("laser_cosine", strength=4.0), 400.0, 60.0)
     assert cosine == pytest.approx(400.0 * 0.5 * 4e-3**2, rel=0.08)
     dead = reading(world("dead_path", strength=5.0), 400.0, 570.0)
-    assert dead == pytest.approx(0.93e-6 * 900.0 * 5.0 * 600.0 / 3600.0, rel=0.02)
+    assert dead == pytest.approx(-0.93e-6 * 900.0 * 5.0 * 600.0 / 3600.0, rel=0.02)
     w = world("air_refraction", strength=3.0, period_s=6000.0, phase=1.0)
     thin = reading(w, 400.0, 60.0)
-    assert thin == pytest.approx(0.93e-6 * 400.0 * 3.0 * np.sin(2.0 * np.pi * w.time_s / 6000.0 + 1.0), rel=0.02)
+    assert thin == pytest.approx(-0.93e-6 * 400.0 * 3.0 * np.sin(2.0 * np.pi * w.time_s / 6000.0 + 1.0), rel=0.02)
 
 
 def bar_um(w: World, seconds: float = 0.1) -> float:

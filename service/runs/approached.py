@@ -1,0 +1,70 @@
+"""From which side the axis of a positioning test came to a place where two rows stand: it may have gone beyond and come back (ISO 230-2).
+
+Rows say where the axis stood, not how it got there. One that stands at a place with ``direction`` +1 and then -1 either never moved, or
+went beyond the place and came back between the rows.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.geometry.chain import REST_MM
+
+BEYOND_MM = 5.0
+"""So far beyond a place an axis is taken to have turned: farther than any lost motion."""
+NEAR_MM = 0.05
+"""Positions closer than this are the same one."""
+FEWEST = 3
+"""Places seen from both sides that tell how far the two differ."""
+
+
+def came_from(run: dict[str, Any], q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dtype[np.intp]]]:
+    """Positions with the turns that the rows leave out, shape (m, 3), and which of them are the rows, shape (n,).
+
+    Parameters
+    ----------
+    run : dict
+        ``abbe-run/1``; anything but a ``laser_linear`` comes back as it is.
+    q_mm : array, shape (n, 3)
+        Its positions.
+    """
+    rows, direction = np.arange(len(q_mm)), run["columns"].get("direction")
+    if run["test"] != "laser_linear" or direction is None or not np.isfinite(q_mm).all() or run["setup"].get("end_mm") is None:
+        return q_mm, rows
+    moved = np.abs(np.diff(q_mm, axis=0)).max(axis=1, initial=0.0) > REST_MM
+    way = np.sign(np.asarray(direction, dtype=np.float64))
+    turned = np.flatnonzero(~moved & (way[1:] * way[:-1] < 0)) + 1
+    if not turned.size:
+        return q_mm, rows
+    if not moved.any():
+        turned = np.concatenate([[0], turned])
+    elif not _went_beyond(run, q_mm, way, turned):
+        return q_mm, rows
+    beyond = q_mm[turned] - BEYOND_MM * way[turned, None] * _along(run)
+    return np.insert(q_mm, turned, beyond, axis=0), rows + np.searchsorted(turned, rows, side="right")
+
+
+def _along(run: dict[str, Any]) -> F1:
+    """Unit vector from start to end of a test."""
+    way = np.subtract(run["setup"]["end_mm"], run["setup"]["start_mm"]).astype(np.float64)
+    return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
+
+
+def _went_beyond(run: dict[str, Any], q_mm: F2, way: F1, turned: np.ndarray[tuple[int], np.dtype[np.intp]]) -> bool:
+    """Whether the two readings at turns differ as those of the other places do from one side to the other, and not as repeats do."""
+    if run["columns"]["deviation_mm"] is None:
+        return False
+    y = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
+    good = np.isfinite(y) & np.asarray(run["columns"].get("valid", np.ones(len(y)))).astype(bool)
+    pairs = turned[good[turned] & good[turned - 1]]
+    good[np.concatenate([turned, turned - 1])] = False
+    place = np.round(q_mm @ _along(run) / NEAR_MM)
+    sides = [[y[good & (place == p) & (way == s)] for s in (1, -1)] for p in np.unique(place[good])]
+    differ = np.array([a.mean() - b.mean() for a, b in sides if a.size and b.size])
+    if differ.size < FEWEST or not pairs.size:
+        return False
+    jump = way[pairs] * (y[pairs] - y[pairs - 1])
+    return bool(np.median(np.abs(jump - np.median(differ))) < np.median(np.abs(jump)))

@@ -1,0 +1,156 @@
+"""How much of its commanded path a run has read, and whether it may be judged: the one rule for figures, reports, screens and comparisons.
+
+A run that was stopped, aborted, interrupted or failed gives no figure of its path, and neither does one that has read less than `LEAST`
+of it. A complete run with a few counted gaps stays judged. Runs that were measured in pieces count with all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from models.arrays import F1, F2
+from service.errors import AbbeError, MeasurementFault
+from service.runs.helix_axis import about_axis, helix_axis
+from service.runs.pieces import arc_of
+from service.storage.records import Doc, RunRecord
+
+LEAST = 0.9
+"""Share of the commanded path that a run has to have read, to be judged: what is left out may hold the largest deviation."""
+COMPLETE = "complete"
+KEY = "state"
+"""Where an ``abbe-run/1`` object says that it is not complete: ``status`` and, where it is known, ``covered`` (share of the path)."""
+GAP_MM, GAP_SAMPLES = 5.0, 10.0
+"""Between two valid readings farther apart than both the path was not read."""
+LEAST_A_TURN = 8
+"""With fewer readings a turn the turns cannot be counted: so many are a turn that was read."""
+GAP_STEPS, GAP_SHARE = 3.0, 0.15
+"""Of a file, whose commanded path is not known: what lies between neighbours farther apart than so many middle steps, and than this share
+of a laser run or of a turn, was not read."""
+
+
+def with_state(document: Doc, record: RunRecord, begun: Doc | None = None) -> Doc:
+    """A run as read from the store, and what a reader must know of its state; a complete one that was read whole stays as it is.
+
+    ``begun``: start document of the run that began the path, where this one went on with it.
+    """
+    share = _of_path(document, begun or record.start_doc)
+    status = record.visible_status
+    if status == COMPLETE and (share is None or share >= LEAST):
+        return document
+    return document | {KEY: {"status": status} | ({} if share is None else {"covered": round(share, 4)})}
+
+
+def covered_share(run: Mapping[str, Any]) -> float | None:
+    """Share of its commanded path that a run has read, 0 to 1.
+
+    None where neither the store nor its set-up states a path; not a number for a helix that is too short to tell the axis it winds about.
+    """
+    if KEY in run:
+        share = run[KEY].get("covered")
+        return None if share is None else float(share)
+    return _of_setup(run)
+
+
+def not_judged(run: Mapping[str, Any]) -> str:
+    """Why an ``abbe-run/1`` object gives no figure: ``stopped: 4.5 % of the path; not judged``. Empty: it is judged."""
+    status = str((run.get(KEY) or {}).get("status", COMPLETE))
+    share = covered_share(run)
+    if status == COMPLETE and (share is None or share >= LEAST):
+        return ""
+    word = "incomplete" if status == COMPLETE else status.replace("_", " ")
+    part = "" if share is None else "its share of the path cannot be told; " if np.isnan(share) else f"{100 * share:.1f} % of the path; "
+    return f"{word}: {part}not judged"
+
+
+def check_judged(run: Mapping[str, Any]) -> None:
+    """Refuse a run that gives no figure.
+
+    Raises
+    ------
+    MeasurementFault
+        It was not measured to its end, or less than `LEAST` of its path was read.
+    """
+    why = not_judged(run)
+    if why:
+        raise MeasurementFault(f"run {run['run_id']}: {why}", "measure it again, or go on with it: abbe measure MACHINE.toml --resume")
+
+
+def _of_path(document: Doc, start: Doc) -> float | None:
+    """By what was commanded: the length of the path, or the number of standstills."""
+    columns = document["columns"]
+    if columns.get("deviation_mm") is None:
+        return None
+    valid = _valid(columns)
+    path = start.get("path")
+    if path:
+        points = path["points_mm"]
+        last = path["measured"][1] if path.get("measured") else len(points) - 1
+        first = path["measured"][0] if path.get("measured") else 0
+        arc = arc_of(points)
+        whole = float(path.get("offset_mm", 0.0)) + float(arc[last] - arc[first])
+        return _share(_read_mm(_positions(columns)[valid], path["feed_mm_min"] / 60.0 / float(start.get("rate_hz", 1.0))), whole)
+    planned = start.get("standstills")
+    return None if not planned else _share(float(valid.sum()), float(planned))
+
+
+def _of_setup(run: Mapping[str, Any]) -> float | None:
+    """By the set-up of a run that came from a file: turns of a helix, angle of a circle, way out of a laser run."""
+    columns, setup = run["columns"], run["setup"]
+    if columns.get("deviation_mm") is None:
+        return None
+    at = _positions(columns)[_valid(columns)]
+    if len(at) < 3 or not np.isfinite(at).all():
+        return None
+    try:
+        if run["test"].startswith("ballbar"):
+            return _turned(run, at - np.asarray(setup["centre_mm"], dtype=np.float64))
+        way = np.subtract(setup["end_mm"], setup["start_mm"]).astype(np.float64)
+        along = at @ way
+        return _share(_read(np.sort(along), GAP_SHARE * float(way @ way)), float(way @ way))
+    except (AbbeError, KeyError, TypeError, ValueError):
+        return None
+
+
+def _turned(run: Mapping[str, Any], at: F2) -> float | None:
+    setup = run["setup"]
+    if run["test"] == "ballbar_circle":
+        axis: int | None = 3 - sum("XYZ".index(c) for c in str(setup["plane"]))
+        whole = float(setup.get("span_deg") or 360.0) / 360.0
+    else:
+        axis, whole = helix_axis(setup, at), float(setup["turns"])
+    if not whole > 0.0:
+        return None
+    if axis is None:
+        return np.nan
+    if len(at) < LEAST_A_TURN * whole:
+        return _share(float(len(at)), LEAST_A_TURN * whole)
+    return _share(_read(np.unwrap(about_axis(at, axis)), GAP_SHARE * 2.0 * np.pi) / (2.0 * np.pi), whole)
+
+
+def _read(x: F1, least: float) -> float:
+    """How far readings reach, less the gaps between neighbours that are too wide for their usual step."""
+    steps = np.abs(np.diff(x))
+    moved = steps[steps > 0.0]
+    wide = steps[steps > max(least, GAP_STEPS * float(np.median(moved)))] if moved.size else steps
+    return float(np.ptp(x)) - float(wide.sum())
+
+
+def _share(part: float, whole: float) -> float | None:
+    return float(np.clip(part / whole, 0.0, 1.0)) if np.isfinite(part) and np.isfinite(whole) and whole > 0.0 else None
+
+
+def _read_mm(at: F2, step_mm: float) -> float:
+    """Length of path between valid readings that follow each other."""
+    steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
+    return float(steps[steps <= max(GAP_MM, GAP_SAMPLES * step_mm)].sum()) + step_mm
+
+
+def _positions(columns: Mapping[str, Any]) -> F2:
+    return np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
+
+
+def _valid(columns: Mapping[str, Any]) -> Any:
+    return np.asarray(columns.get("valid", np.ones(len(columns["t_s"])))).astype(bool)

@@ -1,0 +1,70 @@
+"""The axis of a ball-bar path, and the angle about it: the one rule for reports, comparisons, screens and the live picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from models.arrays import F1, F2
+from models.machine import AXES
+from service.errors import MeasurementFault
+
+STRAIGHT = 0.8
+"""Along its axis a helix goes one way: its way forth is at least this share of all the way that it makes there."""
+ROUND = 0.5
+"""Across its axis it goes round: its way forth is at most this share of all the way there. Less than a turn is no helix."""
+
+
+def helix_axis(setup: Mapping[str, Any], at_mm: F2) -> int | None:
+    """Axis that a helix winds about: as the set-up states it, else the one along which the commanded path advances.
+
+    Parameters
+    ----------
+    setup : mapping
+        Set-up of an ``abbe-run/1`` object.
+    at_mm : array, shape (n, 3)
+        Commanded positions in the order of time, mm.
+
+    Returns
+    -------
+    int or None
+        0, 1 or 2; None where neither tells: the set-up states none, and the path advances along no axis or along several.
+    """
+    if setup.get("axis"):
+        return AXES.index(str(setup["axis"]))
+    if len(at_mm) < 3:
+        return None
+    way = np.abs(np.diff(at_mm, axis=0)).sum(axis=0)
+    forth = np.divide(np.abs(at_mm[-1] - at_mm[0]), way, out=np.ones(3), where=way > 0.0)
+    forth[way <= 0.0] = 0.0
+    along = int(np.argmax(forth))
+    across = np.delete(forth, along)
+    return along if forth[along] >= STRAIGHT and (across <= ROUND).all() else None
+
+
+def about_axis(at_mm: F2, axis: int) -> F1:
+    """Angle of points about an axis, rad, shape (n,): from the axis that follows it to the one after that (about Z: from X to Y)."""
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    return np.asarray(np.arctan2(at_mm[:, b], at_mm[:, a]), dtype=np.float64)
+
+
+def path_axis(run: Mapping[str, Any], at_mm: F2) -> int:
+    """Axis of a ball-bar run: of a circle the normal of its plane, of a helix by `helix_axis`.
+
+    Raises
+    ------
+    MeasurementFault
+        Neither set-up nor path tells the axis of a helix: nothing is drawn about a guess.
+    """
+    setup = run["setup"]
+    if run["test"] == "ballbar_circle":
+        return 3 - sum(AXES.index(c) for c in str(setup["plane"]))
+    found = helix_axis(setup, at_mm)
+    if found is None:
+        raise MeasurementFault(
+            f"run {run['run_id']}: its set-up states no axis of the helix, and its path advances along none",
+            'state it in the set-up: "axis": "X", "Y" or "Z"',
+        )
+    return found

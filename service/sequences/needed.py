@@ -1,0 +1,155 @@
+"""Which devices a campaign needs, and whether all of them are there and answer: asked before anything moves.
+
+A laser is asked for a reading, never for its beam: it is aligned and zeroed when it is mounted, in the middle of the campaign.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.api import LaserReading
+from drivers.errors import DriverError, ReplyTimeout, WrongDevice
+from drivers.fixture.driver import ConsoleFixture
+from service.devices.session import Session, raise_all
+from service.errors import AbbeError, ConfigError
+from service.sequences.rewind import BY_HAND
+from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, ReadBar, ReadLaser, RecordPath, ZeroLaser
+
+CNC, BALLBAR, LASER, FIXTURE = "cnc", "ballbar", "laser", "fixture"
+IN_WORDS = {CNC: "a controller", BALLBAR: "a ball-bar", LASER: "a laser", FIXTURE: "a fixture"}
+USED_BY: dict[str, Any] = {
+    BALLBAR: MountBar | ChangeBar | RecordPath | ReadBar,
+    LASER: MountLaser | ZeroLaser | ReadLaser,
+    FIXTURE: BY_HAND,
+}
+BEFORE_S = 5.0
+"""So long the ball-bar's box is looked for before a run."""
+BAR_RANGE_MM = 0.1
+"""Stroke of the bar to either side that a test needs at least: machines are off by tens of micrometres, a clamped reading says nothing."""
+LASER_S = 2.0
+"""Longest wait for a new sample of the laser, which gives twenty a second."""
+POLL_S = 0.02
+AIR_C, AIR_PA = (-20.0, 60.0), (50_000.0, 120_000.0)
+"""What the laser's sensors can read where a machine stands. Outside of it a sensor is broken, and every length with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Needed:
+    """What a campaign is measured with. ``first``: role to what needs it first; ``rate_hz``: fastest stream of the ball-bar, 0: none."""
+
+    first: dict[str, str] = field(default_factory=dict)
+    rate_hz: int = 0
+
+
+def needed_by(plan: CampaignPlan, *, air: bool = False) -> Needed:
+    """The devices that the steps of a campaign use.
+
+    Parameters
+    ----------
+    air : bool
+        The air is watched meanwhile (``run_temperature_c``): the laser has the sensor.
+    """
+    first = {CNC: "all motion"}
+    for role, kinds in USED_BY.items():
+        test = next((t for t in plan.tests if any(isinstance(s, kinds) for s in t.steps)), None)
+        if test is not None:
+            first[role] = f"test {test.label}"
+    if air:
+        first.setdefault(LASER, "run_temperature_c")
+    rates = [step.rate_hz for test in plan.tests for step in test.steps if isinstance(step, RecordPath | ReadBar)]
+    return Needed(first, max(rates, default=0))
+
+
+def check_configured(needed: Needed, there: Collection[str]) -> None:
+    """Refuse a campaign for which the machine file names too few devices; nothing is connected.
+
+    Parameters
+    ----------
+    there : collection of str
+        Roles that the machine file names.
+
+    Raises
+    ------
+    ConfigError
+        All that are missing, and what needs them first.
+    """
+    missing = [role for role in needed.first if role not in there]
+    if missing:
+        listed = " and ".join(f"{IN_WORDS[role]} for {needed.first[role]}" for role in missing)
+        keys = ", ".join(f"{role} = ..." for role in missing)
+        raise ConfigError(f"this needs {listed}, and the machine file names none", f"add {keys} under [devices]")
+
+
+async def check_devices(session: Session, plan: CampaignPlan, *, air: bool = False) -> None:
+    """Every device that a campaign needs is configured, answers now, and can do what is asked of it; else nothing begins.
+
+    Raises
+    ------
+    ConfigError, DriverError
+        The one thing that is wrong.
+    DevicesNotReady
+        All that is wrong, in one line.
+    """
+    needed = needed_by(plan, air=air)
+    there = [role for role in needed.first if role != CNC and getattr(session, role) is not None]
+    troubles: list[AbbeError | DriverError] = []
+    try:
+        check_configured(needed, [CNC, *there])
+    except ConfigError as error:
+        troubles.append(error)
+    ask: dict[str, Callable[[Session, Needed], Awaitable[None]]] = {BALLBAR: _ballbar, LASER: _laser, FIXTURE: _fixture}
+    for role in there:
+        try:
+            await ask[role](session, needed)
+        except (AbbeError, DriverError) as error:
+            troubles.append(error)
+    raise_all(troubles)
+
+
+async def _ballbar(session: Session, needed: Needed) -> None:
+    bar = session.need_ballbar()
+    await bar.make_ready(within_s=BEFORE_S)
+    await bar.check(needed.rate_hz, range_mm=BAR_RANGE_MM)
+
+
+async def _laser(session: Session, needed: Needed) -> None:
+    laser = session.need_laser()
+    first = await laser.peek()
+    clock = asyncio.get_running_loop().time
+    until_s = clock() + LASER_S
+    name = getattr(laser, "name", LASER)
+    while (reading := await laser.peek()).sample_count == first.sample_count:
+        if clock() > until_s:
+            raise ReplyTimeout(name, "read", f"no new sample within {LASER_S:g} s", "is the meter measuring?")
+        await asyncio.sleep(POLL_S)
+    check_sensors(name, reading)
+
+
+def check_sensors(name: str, reading: LaserReading) -> None:
+    """Refuse a laser whose sensors read what no air in a workshop can be: it counts lengths with them.
+
+    Raises
+    ------
+    WrongDevice
+        Which sensor, what it reads.
+    """
+    for what, value, (low, high), unit in (
+        ("air temperature", reading.air_temp_c, AIR_C, "C"),
+        ("air pressure", reading.air_pressure_pa, AIR_PA, "Pa"),
+    ):
+        if not low <= value <= high:
+            detail = f"its {what} reads {value:g} {unit}, which no workshop has"
+            raise WrongDevice(name, "read", detail, "is the sensor connected? is this the laser?")
+
+
+async def _fixture(session: Session, needed: Needed) -> None:
+    fixture = session.need_fixture()
+    if isinstance(fixture, ConsoleFixture) and not session.attended:
+        raise ConfigError(
+            "bar and mirror are mounted by the person at the console, and nobody is there",
+            "run it from a terminal, or configure a remote fixture; nothing has moved",
+        )
+    await fixture.identify()

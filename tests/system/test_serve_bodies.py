@@ -1,0 +1,116 @@
+"""A body of a gigabyte at every route that takes one, by everybody: the page refuses it as it begins, and its memory does not grow.
+
+A page that grows all the same has a limit of its own, which the core is not under.
+"""
+
+from __future__ import annotations
+
+import resource
+import select
+import socket
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.channel.messages import PAGE_MEMORY_MB
+from service.core.limits import FIRST_TO_GO
+from service.users.roles import Role
+from tests.system.test_serve_processes import YEARLY, Running, bench, ended
+
+GIGABYTE, PIECE_B, GROWTH_KB = 1 << 30, 1 << 18, 8 * 1024
+BY_FORM = ("/login", "/logout", "/proposal/approve")
+"""Not in the OpenAPI document; that these are all is asked in tests/unit/service_web/test_bodies.py."""
+PATIENCE_S = 30.0
+
+
+def routes(made: Running) -> list[str]:
+    """Every route that is asked by POST, with numbers in its path."""
+    paths = made.http.get("/api/v1/openapi.json", headers=made.who["viewer"]).json()["paths"]
+    found = [path for path, methods in paths.items() if "post" in methods]
+    assert not any(set(methods) & {"put", "patch", "delete"} for methods in paths.values())
+    return [path.replace("{job}", "0" * 12).replace("{prompt}", "1").replace("{number}", "1") for path in found] + [*BY_FORM]
+
+
+def memory_kb(pid: int, name: str) -> int:
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith(f"{name}:")).split()[1])
+
+
+def head(path: str, how: str, who: dict[str, str]) -> bytes:
+    lines = [f"POST {path} HTTP/1.1", "Host: 127.0.0.1", "Content-Type: application/json", how, *(f"{k}: {v}" for k, v in who.items())]
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()
+
+
+def pour(port: int, path: str, who: dict[str, str], *, chunked: bool) -> tuple[int, bytes, int]:
+    """Send until there is an answer; its status, the answer, and how many bytes were taken."""
+    how = "Transfer-Encoding: chunked" if chunked else f"Content-Length: {GIGABYTE}"
+    frame = b"%x\r\n" % PIECE_B + b"x" * PIECE_B + b"\r\n" if chunked else b"x" * PIECE_B
+    sent, rest, until_s = 0, b"", time.monotonic() + PATIENCE_S
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as connection:
+        connection.sendall(head(path, how, who))
+        connection.setblocking(False)
+        while sent < GIGABYTE:
+            assert time.monotonic() < until_s, f"{path}: no answer; {sent} bytes were taken"
+            readable, writable, _ = select.select([connection], [connection], [], 1.0)
+            if readable:
+                answer = connection.recv(1 << 16)
+                return int(answer.split()[1]), answer, sent
+            if writable:
+                rest = rest or frame
+                taken = connection.send(rest)
+                rest, sent = rest[taken:], sent + taken
+    raise AssertionError(f"{path}: the whole gigabyte was taken")
+
+
+@pytest.mark.timeout(300)
+def test_a_gigabyte_at_every_route_costs_no_memory(tmp_path: Path) -> None:
+    with bench(tmp_path, YEARLY) as made:
+        everybody = [*((str(role), made.who[str(role)]) for role in Role), ("anonymous", {})]
+        paths, page, began_s = routes(made), made.web, time.monotonic()
+        for path in paths:  # what a first answer costs is not counted
+            made.http.post(path, content=b"x" * 100, headers=made.who["admin"])
+        Path(f"/proc/{page}/clear_refs").write_text("5")  # the highest from here on
+        before_kb, most = memory_kb(page, "VmRSS"), 0
+        for path in paths:
+            for name, who in everybody:
+                for chunked in (False, True):
+                    status, answer, sent = pour(made.port, path, who, chunked=chunked)
+                    wanted = 401 if name == "anonymous" and path != "/login" else 413
+                    assert status == wanted, (path, name, chunked, answer)
+                    assert b"application/problem+json" in answer
+                    most = max(most, sent)
+        grown_kb = memory_kb(page, "VmHWM") - before_kb
+        assert made.web == page
+        assert made.http.get("/healthz").status_code == 200
+    print(  # noqa: T201 - figures for whoever runs it by hand
+        f"{len(paths)} routes, {len(everybody)} roles: {grown_kb} kB more, at most {most} bytes taken, {time.monotonic() - began_s:.1f} s"
+    )
+    assert grown_kb < GROWTH_KB
+
+
+def limit_b(pid: int) -> int:
+    return resource.prlimit(pid, resource.RLIMIT_DATA)[0]
+
+
+def last_to_go(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/oom_score_adj").read_text())
+
+
+def test_a_page_without_memory_is_replaced_and_the_core_stays(tmp_path: Path) -> None:
+    with bench(tmp_path, YEARLY) as made:
+        page, core = made.web, made.process.pid
+        assert (limit_b(page), limit_b(core)) == (PAGE_MEMORY_MB << 20, resource.RLIM_INFINITY)
+        assert (last_to_go(page), last_to_go(core)) == (FIRST_TO_GO, 0)
+        used_b = memory_kb(page, "VmData") << 10
+        resource.prlimit(page, resource.RLIMIT_DATA, (used_b, PAGE_MEMORY_MB << 20))  # nothing more: the limit has been reached
+        until_s = time.monotonic() + PATIENCE_S
+        while not ended(page, 0.1):
+            assert time.monotonic() < until_s, "it goes on without memory"
+            with suppress(httpx.TransportError):
+                made.http.get("/api/v1/openapi.json", headers=made.who["viewer"])
+        made.process.expect("starting it again")
+        assert made.http.get("/readyz").status_code == 200
+        assert (made.process.pid, limit_b(made.web)) == (core, PAGE_MEMORY_MB << 20)
