@@ -85,10 +85,9 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     from service.workflows.at_start import recover_at_start
     from service.workflows.check import run_check
     from service.workflows.in_force import look_at_table
-    from service.workflows.investigate import campaign_plan
     from service.workflows.plausible import check_unattended, doubts
     from service.workflows.report import rules_of
-    from service.workflows.shipped import RECIPES
+    from service.workflows.shipped import RECIPES, campaign_plan
 
     config = loaded.machine
     check_unattended(config, loaded.path.resolve().parent)

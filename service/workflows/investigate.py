@@ -11,21 +11,17 @@ import math
 import threading
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from models.compensation.tables import Predicted
-from models.machine import Machine
 from service.capture.live import LiveFeed
 from service.clock import Clock
 from service.devices.alone import alone
 from service.devices.session import DeviceUrls
 from service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
 from service.events import Progress, ProgressSink
-from service.sequences.campaigns import identification
 from service.sequences.check import paced
 from service.sequences.control import Control, State
-from service.sequences.recipe_file import read_recipe
 from service.sequences.steps import CampaignPlan
 from service.site import Site
 from service.storage.store import Store
@@ -68,20 +64,6 @@ class Bench:
     control: Control = field(default_factory=Control)
     """Who may pause and stop it."""
     live: LiveFeed | None = None
-
-
-def campaign_plan(recipe: str, machine: Machine, folder: Path) -> CampaignPlan:
-    """The campaign that the machine file names for investigations: ``identification``, or a recipe file beside it.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, or is no recipe.
-    """
-    if recipe == "identification":
-        return identification(machine)
-    name, recipes = read_recipe(folder / recipe)
-    return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
 
 
 async def investigate(bench: Bench, alarm: Alarm, note: Note) -> None:

@@ -18,8 +18,7 @@ from service.sequences.check import dry_run_campaign, paced
 from service.sequences.needed import BALLBAR, LASER, check_configured, needed_by
 from service.sequences.steps import CampaignPlan
 from service.site import Site, site_of
-from service.workflows.investigate import campaign_plan
-from service.workflows.shipped import recipe_plan
+from service.workflows.shipped import campaign_plan, recipe_plan
 
 SMALL_MM, LARGE_MM = 200.0, 20_000.0
 """A machine whose longest axis is shorter, or that has a longer one, is possible and rare."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Protocol
 
 from models.machine import Machine
 from service.errors import ConfigError
-from service.sequences.campaigns import quick_check, verification
+from service.sequences.campaigns import identification, quick_check, verification
+from service.sequences.recipe_file import read_recipe
 from service.sequences.steps import CampaignPlan
 
 IDENTIFICATION = "identification"
@@ -57,3 +59,17 @@ def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
         meant = f"did you mean {close[0]!r}? " if close else ""
         raise ConfigError(f"there is no recipe {name!r}", f"{meant}use one of: {', '.join(sorted(RECIPES))}")
     return RECIPES[recipe](machine, rate_hz=rate_hz)
+
+
+def campaign_plan(recipe: str, machine: Machine, folder: Path) -> CampaignPlan:
+    """The campaign that the machine file names for investigations: ``identification``, or a recipe file beside it.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or is no recipe.
+    """
+    if recipe == IDENTIFICATION:
+        return identification(machine)
+    name, recipes = read_recipe(folder / recipe)
+    return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))

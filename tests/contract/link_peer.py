@@ -10,7 +10,8 @@ from drivers.links.backoff import Backoff
 from drivers.links.modbus_link import ModbusLink
 from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 
-TIMEOUT_S = 0.4
+TIMEOUT_S = 1.0
+"""Of a reply, and of a connection to a peer on a loaded computer."""
 
 
 @pytest.fixture

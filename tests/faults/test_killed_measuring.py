@@ -32,7 +32,7 @@ class Zygote:
     """The process that forks measuring children."""
 
     def __init__(self, log: Path) -> None:
-        self._log = log.open("w")
+        self.log, self._log = log, log.open("w")
         command = [sys.executable, "-m", "tests.faults.measuring_child"]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True)
         assert self.line() == "ready"
@@ -70,9 +70,9 @@ def sims(tmp_path: Path) -> Iterator[Sims]:
     assert not wrong.read_text(), wrong.read_text()
 
 
-@pytest.fixture
-def zygote(tmp_path: Path) -> Iterator[Zygote]:
-    made = Zygote(tmp_path / "children.log")
+@pytest.fixture(scope="module")
+def zygote(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Zygote]:
+    made = Zygote(tmp_path_factory.mktemp("zygote") / "children.log")
     yield made
     made.close()
 
@@ -115,7 +115,7 @@ def test_a_campaign_that_is_killed_again_and_again_becomes_complete(tmp_path, si
                 code = zygote.ended_within(30.0)
                 killed += 1
             done = code == 0
-            assert code in (0, -signal.SIGKILL), (tmp_path / "children.log").read_text()[-3000:]
+            assert code in (0, -signal.SIGKILL), zygote.log.read_text()[-3000:]
             now = complete_runs(tmp_path, name)
             assert now.items() >= known.items(), "a complete run was changed"
             known = now

@@ -2,7 +2,10 @@
 
 The priors were shaped on cosines and bumps. A guideway bent like a polynomial, a machine most of whose angles are zero, and coefficients
 that fade slowly and then stop are something else; what is learned of sizes and smoothness must not promise too much on them.
+Three machines of each kind; six with ``ABBE_TEST_LONG=1``.
 """
+
+import os
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from models.solvers.joint import JointSolution, solve_joint
 from tests.campaigns.statistics import share
 from tests.physics.truth import MACHINE, Truth
 
-SEEDS = range(201, 207)
+SEEDS = range(201, 207 if os.environ.get("ABBE_TEST_LONG") == "1" else 204)
 SIZE = np.r_[[3e-3] * 3, [8e-6] * 3]
 HIGHEST = 12
 
@@ -70,7 +73,7 @@ def distances(truth: Truth, s: JointSolution) -> tuple[np.ndarray, np.ndarray]:
 def test_what_is_stated_as_seen_is_within_its_uncertainty_on_other_machines(family):
     solved = [distances(t, solve_joint(MACHINE, t.campaign())) for t in map(family, SEEDS)]
     found = share([np.abs(z) < 1.96 for z, _ in solved], [z for z, _ in solved])
-    assert found.count > 100
+    assert found.count > 100 * len(SEEDS) / 6
     assert found.share + 3.0 * found.se > 0.93
     assert found.share > 0.85
     assert max(np.abs(z).max() for z, _ in solved) < 6.0

@@ -1,7 +1,11 @@
-"""Runs that were never fitted: clean machines of the simulators raise no alarm, a run that is off does."""
+"""Runs that were never fitted: clean machines of the simulators raise no alarm, a run that is off does.
+
+Six machines; twelve with ``ABBE_TEST_LONG=1``.
+"""
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -22,7 +26,7 @@ from tests.bench.discovery_case import read_case
 
 FIRST_SEED = 5_910_000
 """Used for nothing else: the test was made with other cases (CHANGELOG has the figures)."""
-CASES = 12
+CASES = 12 if os.environ.get("ABBE_TEST_LONG") == "1" else 6
 
 
 @cache
@@ -55,8 +59,8 @@ def _off(case: Case, change: dict[str, np.ndarray]) -> Case:
 
 def test_clean_machines_raise_no_alarm(folder: Path) -> None:
     worst = [found[0].p for found in (judged(folder, k) for k in range(CASES)) if found]
-    assert len(worst) >= 10
-    assert sum(p < ALARM for p in worst) <= 1  # two of twelve by chance: in 1 of 160 repetitions of this test
+    assert len(worst) >= CASES * 10 / 12
+    assert sum(p < ALARM for p in worst) <= CASES // 12  # two of twelve by chance: in 1 of 160 repetitions of this test
     assert 0.2 < float(np.median(worst)) < 0.9  # p of agreement is neither always small nor always one
 
 

@@ -2,12 +2,13 @@
 
 The cases come from `simulators.hidden`, whose formulas are its own. The exchange format has no units to choose (they are in its keys), so
 "units converted" means here what a converter may leave behind: numbers that went through another unit and back, and another zero of the
-clock.
+clock. Every question is asked of one or two cases, of all with ``ABBE_TEST_LONG=1``.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from functools import cache
 from typing import Any
 
@@ -29,7 +30,12 @@ Doc = dict[str, Any]
 CASES = (("single", 9238, "servo_mismatch:Y"), ("single", 9223, "spindle_thermal_drift:Z"), ("null", 9425, ""))
 """Kind and seed of small cases (a few ball-bar runs, laser runs only, a few of both), and what is hidden in them."""
 SHIFT_S = 900.0
-each = pytest.mark.parametrize(("kind", "seed", "hidden"), CASES)
+
+
+def each(*short: int) -> Any:
+    """All cases in the long run, otherwise those of these numbers."""
+    chosen = CASES if os.environ.get("ABBE_TEST_LONG") == "1" else [CASES[k] for k in short]
+    return pytest.mark.parametrize(("kind", "seed", "hidden"), chosen)
 
 
 @cache
@@ -82,12 +88,12 @@ def _label(label: str, key: Any) -> str:
     return name + colon + key(at)
 
 
-@each
+@each(0, 1, 2)
 def test_what_is_hidden_is_found(kind: str, seed: int, hidden: str) -> None:
     assert [e.label for e in plain(kind, seed).effects] == ([hidden] if hidden else [])
 
 
-@each
+@each(0)
 def test_asked_twice_it_answers_the_same_to_the_last_digit(kind: str, seed: int, hidden: str) -> None:
     again = answer(*read(kind, seed))
     same(plain(kind, seed), again, 1e-15)
@@ -95,14 +101,14 @@ def test_asked_twice_it_answers_the_same_to_the_last_digit(kind: str, seed: int,
     assert again.rejected == plain(kind, seed).rejected
 
 
-@each
+@each(1)
 def test_the_order_of_the_runs_does_not_matter(kind: str, seed: int, hidden: str) -> None:
     doc, runs = read(kind, seed)
     order = np.random.default_rng(seed).permutation(len(runs))
     same(plain(kind, seed), answer(doc, [runs[i] for i in order]), 1e-9)
 
 
-@each
+@each(0)
 def test_axes_by_other_names_are_found_by_their_other_names(kind: str, seed: int, hidden: str) -> None:
     doc, runs = read(kind, seed)
     found = answer(doc | {"machine": turned_machine(doc["machine"])}, [turned_run(r) for r in runs])
@@ -151,7 +157,7 @@ def test_renaming_three_times_gives_the_files_back() -> None:
         assert turned_run(turned_run(once)) == run
 
 
-@each
+@each(2)
 def test_numbers_that_went_through_inches_and_minutes_are_the_same(kind: str, seed: int, hidden: str) -> None:
     doc, runs = read(kind, seed)
     for run in runs:
@@ -163,7 +169,7 @@ def test_numbers_that_went_through_inches_and_minutes_are_the_same(kind: str, se
     same(plain(kind, seed), answer(doc, runs), 1e-3 if searched else 1e-6)
 
 
-@each
+@each(1, 2)
 def test_another_zero_of_the_clock(kind: str, seed: int, hidden: str) -> None:
     """The clock's zero is physical for what warms up: the machine was cold then, and the strength is what it comes to from there.
 

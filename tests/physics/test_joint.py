@@ -1,4 +1,9 @@
-"""The joint solution on machines it cannot represent: smooth functions outside of its basis, exact kinematics, set-up errors, noise."""
+"""The joint solution on machines it cannot represent: smooth functions outside of its basis, exact kinematics, set-up errors, noise.
+
+Two machines; three with ``ABBE_TEST_LONG=1``.
+"""
+
+import os
 
 import numpy as np
 import pytest
@@ -15,7 +20,7 @@ from models.volumetric import field_figures, remove_rigid, rigid_design, volume_
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3])
+@pytest.fixture(scope="module", params=[1, 2, 3] if os.environ.get("ABBE_TEST_LONG") == "1" else [1, 2])
 def solved(request) -> tuple[Truth, JointSolution]:
     truth = Truth(request.param)
     return truth, solve_joint(MACHINE, truth.campaign(), order=9, sigma_mm=SIGMA, floor_mm=FLOOR)

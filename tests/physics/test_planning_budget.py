@@ -1,9 +1,11 @@
 """What a plan promises against what the solution of the same campaign states: both budgets must speak of the same uncertainty."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 
+from models.planning.instruments import Instruments
 from models.planning.plan import plan_campaign
 from models.solvers.joint import solve_joint
 from models.uncertainty.frame import volume_frame
@@ -15,6 +17,8 @@ from tests.campaigns.accuracy_plan import measured
 from tests.campaigns.population import draw_machine
 
 SEEDS = (4, 6, 7) if os.environ.get("ABBE_TEST_LONG") else (4,)
+TOOLS = Instruments() if os.environ.get("ABBE_TEST_LONG") else replace(Instruments(), bar_lengths_mm=(150.0,))
+"""All bars in the long run, otherwise one: a plan is found sooner."""
 MINUTES = 50.0
 """Enough that the readings, not the priors, decide what is left: priors are wide, and the solution learns that a machine is better."""
 
@@ -22,7 +26,7 @@ MINUTES = 50.0
 def ratio(seed: int) -> float:
     """U of the solution over the planned U at the worst node of the inner volume, for one simulated machine."""
     scenario, machine = draw_machine(seed, np.random.default_rng([seed, 7]))
-    plan = plan_campaign(machine, minutes=MINUTES)
+    plan = plan_campaign(machine, minutes=MINUTES, tools=TOOLS)
     conditions = Conditions(bar_noise_mm=0.5e-3, laser_noise_mm=0.3e-3, bar_length_sd_mm=plan.tools.u_bar_length_mm)
     solution = solve_joint(machine, measured(Rig(scenario, conditions), machine, plan))
     middle = machine.centre_mm[:, None]

@@ -1,5 +1,6 @@
 """Tables for controllers that take less than a grid: nothing counted twice, the order of compensation, single motions, what each leaves."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from models.uncertainty.sources import error_sources
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 
 COUNTS = (25, 21, 19)
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 PAIRS = random_pairs(inner_box_mm(MACHINE), 2000, seed=6)
 POINTS = np.random.default_rng(4).uniform(MACHINE.stroke_mm[:, 0] + 5, MACHINE.stroke_mm[:, 1] - 5, (3000, 3))
 
@@ -87,15 +89,16 @@ def test_squareness_parameters_carry_the_uncertainty_of_the_very_slopes_they_are
     """Slopes of the tables, for draws of the machine from its covariance: their scatter is u, and they are not the mean over the volume."""
     _, s = solved
     data = error_sources(s, Inputs().of_the_data_alone())
-    found = squareness_tables(s, COUNTS, sources=data).parameters
+    counts = (9, 8, 7)
+    found = squareness_tables(s, counts, sources=data).parameters
     root = np.linalg.cholesky(s.term_covariance + 1e-32 * np.eye(len(s.terms)))
     rng, drawn = np.random.default_rng(5), []
-    for _ in range(60):
+    for _ in range(60 if LONG else 30):
         coefficients = {t.name.replace(".", "_"): v for t, v in zip(s.terms, root @ rng.standard_normal(len(root)), strict=True)}
-        nine = nine_tables(only(s, **coefficients), COUNTS, sources=replace(data, coefficients=np.array(list(coefficients.values()))))
+        nine = nine_tables(only(s, **coefficients), counts, sources=replace(data, coefficients=np.array(list(coefficients.values()))))
         slope = [np.polyfit(nine.position_mm[a], nine.correction_mm[a], 1)[0] for a in range(3)]
         drawn.append([-sign * (slope[a][b] + slope[b][a]) for _, a, b, sign in SQUARENESS])
-    assert [p.u for p in found] == pytest.approx(np.std(drawn, axis=0), rel=0.3)  # 60 draws know it to 9 %
+    assert [p.u for p in found] == pytest.approx(np.std(drawn, axis=0), rel=0.3)  # 60 draws (of the long run) know it to 9 %, 30 to 13 %
     mean = [p.value for p in mean_linear(s)[3:]]
     assert max(abs(p.value - m) / p.u for p, m in zip(found, mean, strict=True)) > 3.0
 

@@ -1,5 +1,7 @@
 """Where the error is known worse than it is large: not compensated, no step, and by the identified field never worse than nothing."""
 
+import os
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -135,10 +137,13 @@ def true_rms(truth, correction):
     return float(np.sqrt(np.mean(PAIRS.error_mm(*off) ** 2)))
 
 
-def test_what_a_campaign_in_one_corner_does_not_know_is_marked_and_eight_machines_together_are_not_harmed():
-    """ "No worse" is promised for the identified field. A true machine may become worse; all together may not, and less than unmasked."""
+def test_what_a_campaign_in_one_corner_does_not_know_is_marked_and_machines_together_are_not_harmed():
+    """ "No worse" is promised for the identified field. A true machine may become worse; all together may not, and less than unmasked.
+
+    Four machines; eight with ``ABBE_TEST_LONG=1``.
+    """
     before, masked, full = [], [], []
-    for seed in range(1, 9):
+    for seed in range(1, 9 if os.environ.get("ABBE_TEST_LONG") == "1" else 5):
         truth = Truth(seed)
         s = solve_joint(MACHINE, corner_campaign(truth))
         mask = compensable_nodes(s, (7, 6, 5))

@@ -14,7 +14,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.push.bench import Bench, image
+from tests.push.bench import Bench, Zygote, image
 
 DATABASES = {"one database": ("abbe", "abbe"), "two databases": ("first", "second")}
 SPREAD_S = 0.35
@@ -173,9 +173,18 @@ def _outcomes(two: tuple[Racer, Racer], log: list[Access], base: str) -> list[st
     return wrong
 
 
-def races(cnc: str, ask: Callable[..., dict[str, Any]], folder: Path, databases: tuple[str, str], count: int, seed: int) -> Races:
+def races(
+    cnc: str,
+    ask: Callable[..., dict[str, Any]],
+    folder: Path,
+    databases: tuple[str, str],
+    count: int,
+    seed: int,
+    *,
+    zygotes: tuple[Zygote | None, Zygote | None] = (None, None),
+) -> Races:
     """Let two processes race ``count`` times, with the journal in these databases: one service's, or of two that do not know each other."""
-    benches = tuple(Bench(cnc, folder, database=name, number=k + 1) for k, name in enumerate(databases))
+    benches = tuple(Bench(cnc, folder, database=name, number=k + 1, zygote=zygotes[k]) for k, name in enumerate(databases))
     try:
         return _races(benches, ask, count, seed)
     finally:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.push.bench import Bench, image
+from tests.push.bench import Bench, Zygote, image
 from tests.push.random_kills import kills
 from tests.scenarios.conftest import simulated
 
@@ -18,10 +18,17 @@ LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 EVERY = 1 if LONG else 5
 
 
+@pytest.fixture(scope="module")
+def zygote(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Zygote]:
+    made = Zygote(tmp_path_factory.mktemp("zygote") / "children.log")
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
+def bench(tmp_path: Path, zygote: Zygote) -> Iterator[Bench]:
     with simulated(tmp_path, "--speed", "60") as sims:
-        made = Bench(sims.ready["cnc"], tmp_path)
+        made = Bench(sims.ready["cnc"], tmp_path, zygote=zygote)
         yield made
         made.close()
 

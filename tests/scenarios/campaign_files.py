@@ -34,6 +34,11 @@ def measured(seed: int, kind: population.Kind = "joint") -> tuple[Site, list[Doc
     return site, json.loads(text)
 
 
+def machine_of(seed: int, kind: population.Kind = "joint") -> Site:
+    """Machine number ``seed`` alone."""
+    return _measured(seed, kind)[0]
+
+
 def _document(run: RunData, machine: Doc) -> Doc:
     if run.kind == "bar":
         run = replace(run, **{k: getattr(run, k)[::EVERY] for k in ("axes_mm", "deviation_mm", "sign", "t_s", "weight_n")})

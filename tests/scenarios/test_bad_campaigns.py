@@ -1,6 +1,8 @@
 """A campaign in which one run is not what it says is refused or flagged, and the line names that run; good campaigns are left alone."""
 
+import os
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,9 +12,11 @@ from service.workflows.copied_runs import copies
 from service.workflows.solve import check_campaign
 from tests.campaigns import population
 from tests.campaigns.population import CAMPAIGNS
-from tests.scenarios.campaign_files import measured
+from tests.scenarios.campaign_files import machine_of, measured
 
-SEEDS = (3, 11, 29)
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
+"""Every spoiled run on three machines and forty good campaigns; every day one machine each, and ten campaigns."""
+SEEDS = (3, 11, 29) if LONG else (11,)
 AXES = ("x_mm", "y_mm", "z_mm")
 
 
@@ -27,9 +31,8 @@ def exchanged(run, first, second):
 
 
 def refusal(seed, runs, kind="joint", model="rigid21"):
-    site, _ = measured(seed, kind)
     with pytest.raises(AbbeError) as told:
-        check_campaign(site, runs, [], model)
+        check_campaign(machine_of(seed, kind), runs, [], model)
     assert "\n" not in str(told.value)
     assert told.value.remedy
     return str(told.value)
@@ -130,12 +133,11 @@ def test_a_cropped_copy_among_the_held_out_runs():
 @pytest.mark.parametrize("key", ["name", "chain", "stroke_mm", "pivots_mm"])
 def test_a_run_of_a_machine_that_is_described_otherwise(key):
     site, runs = measured(7)
-    other, _ = measured(8)
-    runs[2]["machine"] = site.doc | {key: other.doc[key]}
+    runs[2]["machine"] = site.doc | {key: machine_of(8).doc[key]}
     assert refusal(7, runs).startswith(f"run {runs[2]['run_id']}: measured on another machine")
 
 
-@pytest.mark.parametrize("seed", [3, 7, 11])
+@pytest.mark.parametrize("seed", [3, 7, 11] if LONG else [11])
 @pytest.mark.parametrize("test", ["ballbar_helix", "laser_diagonal", "laser_linear"])
 def test_a_run_of_another_machine_of_the_same_make(seed, test):
     """Same description, same path, other errors: only the readings can tell, and the line names the run.
@@ -155,13 +157,17 @@ def test_a_run_of_another_machine_of_the_same_make(seed, test):
 
 def twin_readings(seed, label):
     """The readings of a run on another machine of the same make: geometry and path the same, errors drawn anew."""
+    run = next(r for r in _twin_runs(seed) if r.label == label)
+    return run.deviation_mm[:: 4 if run.kind == "bar" else 1].tolist()
+
+
+@cache
+def _twin_runs(seed):
     drawn = population.draw_machine
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(population, "BLOCKS", 10**6)
         patch.setattr(population, "draw_machine", lambda s, rng: _twin(drawn(s, rng)))
-        case = population.draw_case(seed, "joint")
-    run = next(r for r in case.runs if r.label == label)
-    return run.deviation_mm[:: 4 if run.kind == "bar" else 1].tolist()
+        return population.draw_case(seed, "joint").runs
 
 
 def _twin(found):
@@ -201,15 +207,15 @@ def test_times_and_readings_that_cannot_be(column, value, word):
 
 
 def test_forty_good_campaigns_are_not_refused():
-    """Measured over 100 campaigns of 20 other machines: none refused, none flagged."""
-    flagged = []
+    """Measured over 100 campaigns of 20 other machines: none refused, none flagged. Of forty two may be flagged, of ten none."""
+    flagged, seeds = [], range(40, 48) if LONG else range(40, 42)
     for kind in CAMPAIGNS:
-        for seed in range(40, 48):
+        for seed in seeds:
             site, runs = measured(seed, kind)
             found = check_campaign(site, runs, [], "rigid21")
             assert not [f for f in found if f.refuse]
             flagged += [f"{kind} {seed}: {f.line}" for f in found[:1]]
-    assert len(flagged) <= 2, flagged
+    assert len(flagged) <= len(seeds) * len(CAMPAIGNS) // 20, flagged
 
 
 def coarse(name, later_s):

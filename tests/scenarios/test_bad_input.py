@@ -1,43 +1,93 @@
 """Whatever is wrong: one line with cause and remedy, exit code 2, nothing half-done."""
 
 import json
+import re
+import threading
+from contextlib import contextmanager
 
 import pytest
 
-from tests.scenarios.world import bar_chunks, laser_chunks, one_line, position_and_counters, runs_of, wait_for
+from service.cli import run
+from tests.scenarios.conftest import simulated
+from tests.scenarios.world import bar_chunks, laser_chunks, position_and_counters, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """One simulated machine that no test may move."""
+    with simulated(tmp_path_factory.mktemp("still"), "--speed", "60") as sims:
+        yield sims
+
+
+@pytest.fixture
+def abbe(tmp_path, monkeypatch, capsys):
+    """The command line in this process, in the test's folder: exit code, output, errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words):
+        capsys.readouterr()
+        code = run(list(words))
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def one_line(ended, code, *words):
+    """It ended with 2 and one line that holds code and words; lines of progress do not count."""
+    status, _, err = ended
+    lines = [line for line in err.strip().splitlines() if not re.match(r"^[\w-]+( [\d-]+ [\d:]+)?: ", line) or line.startswith("error")]
+    assert status == 2, err
+    assert len(lines) == 1, err
+    assert lines[0].startswith(f"error {code}: ")
+    for word in words:
+        assert word in lines[0]
+
+
+@contextmanager
+def meanwhile(condition, what, do):
+    """While the block runs: do something once the condition holds."""
+    done = []
+
+    def work():
+        wait_for(condition, 60, what)
+        done.append(do())
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield
+    thread.join(70)
+    assert done, what
 
 
 def test_missing_machine_file(abbe):
     one_line(abbe("measure", "nowhere.toml"), "CFG-001", "nowhere.toml")
 
 
-def test_unknown_key_names_the_nearest_valid_one(abbe, tmp_path, start_sims):
-    sims = start_sims(extra="[limits]\ntable_valu_um = 5\n")
-    one_line(abbe("measure", str(sims.machine_file)), "CFG-001", "table_valu_um", "table_value_um")
+def test_unknown_key_names_the_nearest_valid_one(abbe, tmp_path, still):
+    (tmp_path / "machine.toml").write_text(still.machine_file.read_text() + "[limits]\ntable_valu_um = 5\n")
+    one_line(abbe("measure", "machine.toml"), "CFG-001", "table_valu_um", "table_value_um")
 
 
-def test_port_refused(abbe, start_sims):
-    sims = start_sims()
-    sims.machine_file.write_text(sims.machine_file.read_text().replace(sims.ready["cnc"], "modbus+tcp://127.0.0.1:9?unit=1"))
-    one_line(abbe("measure", str(sims.machine_file)), "DRV-002", "127.0.0.1:9")
+def test_port_refused(abbe, tmp_path, still):
+    (tmp_path / "machine.toml").write_text(still.machine_file.read_text().replace(still.ready["cnc"], "modbus+tcp://127.0.0.1:9?unit=1"))
+    one_line(abbe("measure", "machine.toml"), "DRV-002", "127.0.0.1:9")
 
 
-def test_a_path_beyond_the_stroke_moves_nothing(abbe, start_sims):
-    sims = start_sims("--speed", "60")
-    before = position_and_counters(sims)
-    one_line(abbe("measure", str(sims.machine_file), "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
-    assert position_and_counters(sims) == before
-    assert not (sims.machine_file.parent / "abbe.sqlite3").exists() or runs_of(sims.machine_file.parent) == []
+def test_a_path_beyond_the_stroke_moves_nothing(abbe, tmp_path, still):
+    (tmp_path / "machine.toml").write_text(still.machine_file.read_text())
+    before = position_and_counters(still)
+    one_line(abbe("measure", "machine.toml", "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
+    assert position_and_counters(still) == before
+    assert not (tmp_path / "abbe.sqlite3").exists() or runs_of(tmp_path) == []
 
 
 def test_ball_bar_unplugged_in_mid_run(abbe, start_sims):
     sims = start_sims("--speed", "10")
-    process = abbe("measure", str(sims.machine_file), "--helix", "300,250,100,150")
-    wait_for(lambda: bar_chunks(sims.machine_file.parent) > 5, 60, "samples of the helix")
-    sims.ask("unplug_ballbar")
-    one_line(process, "DRV-002", "unplugged")
+    with meanwhile(lambda: bar_chunks(sims.machine_file.parent) > 5, "samples of the helix", lambda: sims.ask("unplug_ballbar")):
+        ended = abbe("measure", str(sims.machine_file), "--helix", "300,250,100,150")
+    one_line(ended, "DRV-002", "unplugged")
     run = runs_of(sims.machine_file.parent)[-1]
     assert run.status == "failed"
     assert "DRV-002" in run.reason
@@ -46,11 +96,11 @@ def test_ball_bar_unplugged_in_mid_run(abbe, start_sims):
 
 def test_laser_beam_lost(abbe, start_sims):
     sims = start_sims("--speed", "20")
-    process = abbe("measure", str(sims.machine_file), "--recipe", "verification")
     # The first readings of a line of 42 are stored: the beam goes while it is being read, not while it is zeroed for the next one.
-    wait_for(lambda: 2 <= laser_chunks(sims.machine_file.parent) <= 20, 60, "the first readings of a laser line")
-    sims.ask("beam", blocked=True)
-    one_line(process, "ILK-007", "beam")
+    first = (lambda: 2 <= laser_chunks(sims.machine_file.parent) <= 20, "the first readings of a laser line")
+    with meanwhile(*first, lambda: sims.ask("beam", blocked=True)):
+        ended = abbe("measure", str(sims.machine_file), "--recipe", "verification")
+    one_line(ended, "ILK-007", "beam")
     run = runs_of(sims.machine_file.parent)[-1]
     assert (run.status, run.test) == ("failed", "laser_diagonal")
     assert "ILK-007" in run.reason
@@ -59,11 +109,9 @@ def test_laser_beam_lost(abbe, start_sims):
 @pytest.mark.parametrize(("fault", "word"), [("estop", "e-stop"), ("door", "door")])
 def test_an_interlock_stops_the_run(abbe, start_sims, fault, word):
     sims = start_sims("--speed", "10")
-    process = abbe("measure", str(sims.machine_file), "--helix", "300,250,100,150")
-    wait_for(lambda: bar_chunks(sims.machine_file.parent) > 5, 60, "samples of the helix")
-    sims.ask(fault, on=True)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 2
+    with meanwhile(lambda: bar_chunks(sims.machine_file.parent) > 5, "samples of the helix", lambda: sims.ask(fault, on=True)):
+        code, _, err = abbe("measure", str(sims.machine_file), "--helix", "300,250,100,150")
+    assert code == 2
     last = err.strip().splitlines()[-1]
     assert last.startswith("error ")
     assert word in last
@@ -79,6 +127,5 @@ def test_nan_in_a_run_file_imports_nothing(abbe, shared, tmp_path):
     run["columns"]["deviation_mm"][3] = float("nan")
     (folder / "r02.json").write_text(json.dumps(run))
     one_line(abbe("import", str(folder)), "FMT-001", "r02.json", "deviation_mm")
-    listing = abbe("runs", "--json")
-    out, err = listing.communicate(timeout=30)
-    assert listing.returncode == 2 or json.loads(out) == [], err
+    code, out, err = abbe("runs", "--json")
+    assert code == 2 or json.loads(out) == [], err

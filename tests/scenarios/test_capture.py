@@ -12,6 +12,7 @@ from drivers.ballbar import driver
 from drivers.errors import Backpressure
 from service.capture.file_io import RealFileIO
 from service.capture.recovery import ledger_of
+from service.cli import run
 from service.config import load_machine
 from service.devices.session import open_session
 from service.sequences.recipes import Helix
@@ -53,22 +54,21 @@ def test_a_killed_measurement_is_taken_over_by_the_next_command(abbe, start_sims
     assert not segment.exists()
 
 
-def test_a_whole_measurement_accounts_for_every_sample_of_the_box(abbe, start_sims):
+def test_a_whole_measurement_accounts_for_every_sample_of_the_box(start_sims, capsys):
     sims = start_sims("--speed", "20")
-    process = abbe("measure", str(sims.machine_file), "--helix", "300,250,100,50", "--rate-hz", "1000")
-    _, err = process.communicate(timeout=100)
-    assert process.returncode == 0, err
+    code = run(["measure", str(sims.machine_file), "--helix", "300,250,100,50", "--rate-hz", "1000"])
+    assert code == 0, capsys.readouterr().err
     fates = sims.ask("ledger")["fates"]
     folder = sims.machine_file.parent
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        (run,) = store.runs()
-        ledger = ledger_of(store.chunks(run.id))
+        (record,) = store.runs()
+        ledger = ledger_of(store.chunks(record.id))
     assert {stream for stream, *_ in fates} == {0}
     lost = {seq for _, first, last, fate in fates if fate != "sent" for seq in range(first, last + 1)}
     assert {seq for gap in ledger.gaps for seq in range(gap.first, gap.last + 1)} == lost
     assert ledger.unaccounted() == []
     assert ledger.stored + len(lost) == max(last for _, _, last, _ in fates) + 1 > 1000
-    assert run.end_doc["capture"]["stored_valid"] + run.end_doc["capture"]["stored_flagged"] == ledger.stored
+    assert record.end_doc["capture"]["stored_valid"] + record.end_doc["capture"]["stored_flagged"] == ledger.stored
     assert list((folder / "abbe.sqlite3-capture").iterdir()) == [folder / "abbe.sqlite3-capture" / "reserve"]
 
 

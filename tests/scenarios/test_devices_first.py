@@ -33,9 +33,12 @@ from tests.scenarios.conftest import Sims, simulated
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
 
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 ROLES = ("cnc", "ballbar", "laser", "fixture")
 RECIPES = ("quick-check", "verification", "identification", "own.toml")
 OWN = recipe_text("own", (Linear("line", "L1", "identify", 0, n=5), Helix("helix", "B1", "identify", (300.0, 250.0, 100.0), 100.0)))
+CASES = [(recipe, role) for k, recipe in enumerate(RECIPES) for n, role in enumerate(ROLES) if LONG or recipe == "quick-check" or k == n]
+"""All pairs with ABBE_TEST_LONG=1; every day each device with the quick check, and each recipe with one device."""
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +119,7 @@ def refuses(sims: Sims, tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     return measure
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(("recipe", "role"), CASES)
 def test_a_device_that_is_left_out(recipe: str, role: str, refuses: Refuses) -> None:
     said = refuses(recipe, **{role: None})
     assert f"{role} = ..." in said
@@ -125,16 +127,14 @@ def test_a_device_that_is_left_out(recipe: str, role: str, refuses: Refuses) -> 
     assert dry == said, "the dry run says the same, and asks no device"
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(("recipe", "role"), CASES)
 def test_a_device_that_is_silent(recipe: str, role: str, refuses: Refuses) -> None:
     with silent(role) as url:
         said = refuses(recipe, **{role: url})
     assert url.partition("?")[0] in said
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(("recipe", "role"), CASES)
 def test_a_device_of_the_wrong_identity(recipe: str, role: str, sims: Sims, refuses: Refuses) -> None:
     url = wrong(role, sims.ready)
     said = refuses(recipe, **{role: url})

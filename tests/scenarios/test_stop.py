@@ -53,23 +53,17 @@ def test_sigusr1_pauses_and_lets_go_on(abbe, start_sims):
     assert [(r.label, r.status) for r in runs_of(sims.machine_file.parent)] == [("helix", "aborted"), ("helix-2", "complete")]
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (("--helix", "300,250,100,140"), "error SEQ-007: campaign 'june' was begun with another recipe"),
-        (("--recipe", "quick-check"), "error SEQ-007: campaign 'june' was begun with another recipe"),
-    ],
-)
-def test_another_recipe_is_refused_in_one_line(abbe, start_sims, change, said):
+def test_another_recipe_is_refused_in_one_line(abbe, start_sims):
     sims = start_sims("--speed", "60")
     process = abbe("measure", str(sims.machine_file), *HELIX, "--name", "june")
     wait_for(lambda: bar_chunks(sims.machine_file.parent) > 1, 60, "samples of the helix")
     interrupt(process, signal.SIGINT)
-    again = abbe("measure", str(sims.machine_file), "--resume", "june", *change)
-    _, err = again.communicate(timeout=60)
-    assert again.returncode == 2
-    (line,) = err.splitlines()
-    assert line.startswith(said)
+    for change in (("--helix", "300,250,100,140"), ("--recipe", "quick-check")):
+        again = abbe("measure", str(sims.machine_file), "--resume", "june", *change)
+        _, err = again.communicate(timeout=60)
+        assert again.returncode == 2
+        (line,) = err.splitlines()
+        assert line.startswith("error SEQ-007: campaign 'june' was begun with another recipe")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])

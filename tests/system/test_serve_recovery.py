@@ -19,6 +19,7 @@ from drivers.registry import open_controller
 from service.scheduler.store import ServiceStore
 from service.workflows.tables import table_image
 from tests.push.pushing_child import tables
+from tests.scenarios.world import wait_for
 from tests.system.serve_bench import Machine, abbe, free_port
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
@@ -106,6 +107,7 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
                 assert asyncio.run(table_in_force(cnc))[1] == before[1]
             asyncio.run(put_in_force(cnc))
             back.expect("the table in force is not ours", patience_s=15.0)  # of reliability.md 5: foreign writes are an alarm within 15 s
-            (told,) = httpx.get(f"http://127.0.0.1:{port}/api/v1/status", timeout=30).json()["attention"]
+            status = f"http://127.0.0.1:{port}/api/v1/status"  # of another process: the log may be ahead of it
+            (told,) = wait_for(lambda: httpx.get(status, timeout=30).json()["attention"], 15.0, "the alarm on the page")
             assert told.startswith("CMP-010: somebody else")
             assert back.terminate()[0] == 0

@@ -91,6 +91,8 @@ def run(folder: Path, source: str, **environment: str) -> str:
     options = [
         "-p",
         "no:cacheprovider",
+        "-p",
+        "no:schemathesis",  # takes a second to import
         "-o",
         "asyncio_mode=auto",
         "-o",
@@ -123,7 +125,8 @@ def test_the_innocent_pass(tmp_path: Path) -> None:
     assert "no sun here" in out
 
 
-@pytest.mark.parametrize("demanded", ["sun", "socat, sun"])
+# One alone is the moon of the guilty; ABBE_TEST_LONG=1 plays it here, too.
+@pytest.mark.parametrize("demanded", ["sun", "socat, sun"] if os.environ.get("ABBE_TEST_LONG") == "1" else ["socat, sun"])
 def test_what_is_demanded_must_be_there(tmp_path: Path, demanded: str) -> None:
     out = run(tmp_path, INNOCENT, ABBE_TEST_REQUIRE=demanded)
     assert "sun is required here (ABBE_TEST_REQUIRE): no sun here" in out

@@ -67,7 +67,8 @@ def test_every_slow_file_is_there() -> None:
 @pytest.mark.parametrize("workers", [(), ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")], ids=["one process", "side by side"])
 def test_nothing_else_is_printed(tmp_path: Path, workers: tuple[str, ...]) -> None:
     (tmp_path / "test_it.py").write_text("def test_good(): pass\n\ndef test_bad(): assert False\n")
-    command = [sys.executable, "-m", "pytest", "-c", str(ROOT / "pyproject.toml"), "-p", "tests.progress", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", "-c", str(ROOT / "pyproject.toml"), "-p", "tests.progress"]
+    command += ["-p", "no:cacheprovider", "-p", "no:schemathesis"]  # takes a second to import
     done = subprocess.run([*command, *workers, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=False)
     lines = [line for line in done.stdout.splitlines() if line]
     assert lines[0].startswith("FAILED "), done.stdout

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -281,14 +282,35 @@ PLACES = {
 COMMANDS = ("effects backlash", "effects", "--help", "comp formats", "check-config machine.toml", "import µ→")
 
 
-@pytest.mark.parametrize(("words", "place"), [*((one, "ascii") for one in COMMANDS), *((COMMANDS[0], one) for one in ("POSIX", "latin-1"))])
-def test_a_place_that_has_no_letters_gets_plain_ones(machine: Path, words: str, place: str) -> None:
+def judge_letters(words: str, place: str, out: bytes, err: bytes, code: int | None) -> None:
+    assert code == (2 if words.startswith("import") else 0), err
+    assert b"Traceback" not in err
+    if place != "latin-1":
+        assert (out + err).isascii()
+    if words == "effects backlash":
+        assert ("µm".encode("latin-1") if place == "latin-1" else b"30.0 um") in out
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_place_that_has_no_letters_gets_plain_ones(machine: Path, place: str) -> None:
+    words = COMMANDS[0]
     command = [sys.executable, "-m", "service.cli", *words.split()]
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("LC_", "LANG"))} | PLACES[place]
     done = subprocess.run(command, cwd=machine.parent, env=environment, capture_output=True, check=False, timeout=60)
-    assert done.returncode == (2 if words.startswith("import") else 0), done.stderr
-    assert b"Traceback" not in done.stderr
-    if place != "latin-1":
-        assert (done.stdout + done.stderr).isascii()
-    if words == "effects backlash":
-        assert ("µm".encode("latin-1") if place == "latin-1" else b"30.0 um") in done.stdout
+    judge_letters(words, place, done.stdout, done.stderr, done.returncode)
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_every_command_writes_plain_letters_where_there_are_no_others(machine: Path, monkeypatch: pytest.MonkeyPatch, words: str) -> None:
+    """In this process, on streams as a place without letters has them."""
+    monkeypatch.chdir(machine.parent)
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors=how) for how in ("strict", "backslashreplace"))
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", out)
+        patch.setattr(sys, "stderr", err)
+        with pytest.raises(SystemExit) as ended:
+            cli.main(words.split())
+        out.flush()
+        err.flush()
+    written = [stream.buffer.getvalue() for stream in (out, err) if isinstance(stream.buffer, io.BytesIO)]
+    judge_letters(words, "ascii", *written, int(ended.value.code or 0))

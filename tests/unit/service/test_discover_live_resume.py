@@ -6,12 +6,16 @@ The process is ended in thought after each of its writes, one after the other: w
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
+import pickle
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,6 +30,7 @@ from service.sequences.interlocks import DRIVES, MOVING, REFERENCED, REMOTE
 from service.storage.owner import Owner
 from service.storage.records import NewVersion
 from service.storage.store import Store
+from service.workflows import campaign_checks, next_recipes
 from service.workflows.discover_live import rounds
 from tests.unit.service.discovery_bench import MACHINE, Search, circle, write_case
 
@@ -58,6 +63,38 @@ class Asks(Search):
         return dataclasses.replace(super().__call__(case, effects, progress), next_test=test)
 
 
+@cache
+def june() -> bytes:
+    """A database into which the first campaign was imported."""
+    with TemporaryDirectory() as folder:
+        files = write_case(Path(folder) / "files", "june")
+        doc = json.loads((files / "campaign.json").read_text()) | {"ctrl0_us": 0, "boot_id": BOOT}
+        (files / "campaign.json").write_text(json.dumps(doc))
+        assert cli.run(["import", str(files), "--db", f"sqlite:///{folder}/abbe.sqlite3"]) == 0
+        return (Path(folder) / "abbe.sqlite3").read_bytes()
+
+
+def once(compute: Callable[..., Any]) -> Callable[..., Any]:
+    """The same readings and paths come again in every try: what is computed of them alone is computed once."""
+    found: dict[bytes, Any] = {}
+
+    def call(*given: Any) -> Any:
+        key = hashlib.sha256(pickle.dumps(given)).digest()
+        if key not in found:
+            found[key] = compute(*given)
+        return found[key]
+
+    return call
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _computed_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(campaign_checks, "suspects", once(campaign_checks.suspects))
+        patch.setattr(next_recipes, "dry_run_campaign", once(next_recipes.dry_run_campaign))
+        yield
+
+
 class Bench:
     """The command on a machine that is played here, and what happened to it: ``measured``: labels, in order; ``search``: what was asked."""
 
@@ -86,10 +123,7 @@ class Bench:
         pivots = [f"{a} = {json.dumps(v)}" for a, v in MACHINE["pivots_mm"].items()]
         head = ['name = "VMC-1"', f'chain = "{MACHINE["chain"]}"', "[stroke_mm]", *stroke, "[pivots_mm]", *pivots, "[store]"]
         (self._folder / "machine.toml").write_text("\n".join([*head, f'url = "{self.url}"']) + "\n")
-        june = write_case(self._folder / "files", "june")
-        doc = json.loads((june / "campaign.json").read_text()) | {"ctrl0_us": 0, "boot_id": BOOT}
-        (june / "campaign.json").write_text(json.dumps(doc))
-        assert cli.run(["import", str(june), "--db", self.url]) == 0
+        (self._folder / "abbe.sqlite3").write_bytes(june())
 
     def _counted(self, write: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **more: Any) -> Any:
@@ -200,8 +234,8 @@ def test_a_person_s_word_for_the_table_in_force_is_not_said_again_in_later_round
 
 
 # First discovery opened, searched, ended; added campaign begun; its first run started, read, complete; its last one complete; second
-# discovery opened, searched, ended; second addition begun; end. A try costs 2 s: ABBE_TEST_LONG=1 plays all.
-SOME = (1, 3, 6, 7, 8, 9, 10, 13, 14, 16, 19, 20, COUNT)
+# discovery searched; second addition begun; end. A try costs 1 s: ABBE_TEST_LONG=1 plays all.
+SOME = (1, 3, 6, 7, 8, 9, 10, 13, 16, 20, COUNT)
 
 
 @pytest.mark.parametrize("end_after", range(1, COUNT + 1) if os.environ.get("ABBE_TEST_LONG") == "1" else SOME)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import pytest
 from service import cli
 from tests.unit.service.errors_bench import ERRORS, OBJECT, OWN, TOML, Bench
 
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 pytestmark = pytest.mark.usefixtures("clean_environment")
 
 
@@ -186,16 +188,17 @@ def test_a_folder_is_no_file(bench: Bench, which: str) -> None:
 # --- output that cannot be written ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("option", ["", "--json"])
-@pytest.mark.parametrize(
-    ("end", "code", "message"),
-    [
-        (">&-", 2, "error USE-002: the output cannot be written: it is closed"),
-        (">/dev/full", 2, "error USE-002: the output cannot be written: No space left on device"),
-        (">&- 2>&-", 2, ""),
-        ("| true", 1, ""),
-    ],
-)
+ENDS = [
+    (">&-", 2, "error USE-002: the output cannot be written: it is closed"),
+    (">/dev/full", 2, "error USE-002: the output cannot be written: No space left on device"),
+    (">&- 2>&-", 2, ""),
+    ("| true", 1, ""),
+]
+# Each is a process: every end with table and JSON in turn; ABBE_TEST_LONG=1 plays all pairs.
+TRIED = [(*end, option) for k, end in enumerate(ENDS) for option in (("", "--json") if LONG else (("", "--json")[k % 2],))]
+
+
+@pytest.mark.parametrize(("end", "code", "message", "option"), TRIED)
 def test_output_that_cannot_be_written_is_one_line(bench: Bench, option: str, end: str, code: int, message: str) -> None:
     words = f"errors --machine {bench.machine.name} --errors {bench.errors.name} --points {bench.points.name} {option}"
     program = f"'{sys.executable}' -c 'from service import cli; cli.main()' {words}"

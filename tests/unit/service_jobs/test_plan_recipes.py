@@ -26,6 +26,8 @@ from service.workflows.plan import plan_for, plan_page, recipe_of, words
 from service.workflows.plan_instruments import read_instruments
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
+ONE_BAR = Instruments(bar_lengths_mm=(150.0,))
+"""For what does not depend on the bar: fewer helices to choose from."""
 names = st.text("abcXYZ019-_ äµ", min_size=1, max_size=12).filter(lambda s: s == s.strip())
 millimetres = st.floats(-2000.0, 2000.0, allow_nan=False)
 roles = st.sampled_from(["identify", "holdout"])
@@ -146,7 +148,7 @@ def test_the_bar_is_out_while_the_machine_moves_and_hung_in_where_its_path_start
 
 
 def test_a_bar_is_as_well_known_as_the_instruments_file_says(tmp_path):
-    (tmp_path / "i.toml").write_text("bar_length_u_um = 0.7\nlaser = false\n")
+    (tmp_path / "i.toml").write_text("bar_length_u_um = 0.7\nlaser = false\nbar_lengths_mm = [150.0]\n")
     found = plan_for(site(), minutes=5.0, tools=read_instruments(tmp_path / "i.toml"))
     recipes = parse_recipe(found.text, "f")[1]
     assert {r.plan(MACHINE).setup["u_length_mm"] for r in recipes} == {0.0007}
@@ -156,7 +158,7 @@ def test_a_bar_is_as_well_known_as_the_instruments_file_says(tmp_path):
 
 
 def test_a_slow_machine_gets_a_plan_that_it_may_run():
-    found = plan_for(replace(site(), max_feed_mm_min=1000.0), minutes=12.0)
+    found = plan_for(replace(site(), max_feed_mm_min=1000.0), minutes=12.0, tools=ONE_BAR)
     feeds = {s.feed_mm_min for t in found.campaign.tests for s in t.steps if isinstance(s, MoveTo | RecordPath)}
     assert feeds == {1000.0}
     assert {r.feed_mm_min for r in parse_recipe(found.text, "f")[1]} == {1000.0}
@@ -167,7 +169,7 @@ def test_a_slow_machine_gets_a_plan_that_it_may_run():
     ("named", "kinds", "says"), [("ballbar", {Helix}, "without laser"), ("laser", {Diagonal, Linear}, "without ball-bar")]
 )
 def test_only_what_the_machine_file_names_is_planned(named, kinds, says):
-    found = plan_for(replace(site(), urls=DeviceUrls(**{named: "x"})), minutes=14.0)
+    found = plan_for(replace(site(), urls=DeviceUrls(**{named: "x"})), minutes=14.0, tools=ONE_BAR)
     assert {type(r) for r in found.recipes} <= kinds
     assert says in found.notes[0]
     assert len(found.notes) == 1 + (named == "ballbar")  # helices of a machine without tool_mm: where is the spindle?

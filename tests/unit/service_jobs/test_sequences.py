@@ -1,6 +1,7 @@
 """Sequences: geometry, dry run, and refusal before anything moves."""
 
 import math
+import os
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +15,7 @@ from service.sequences.check import dry_run, dry_run_campaign, positions
 from service.sequences.recipes import Diagonal, Helix, Linear
 from service.sequences.steps import MAX_PATH_POINTS, MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, TestPlan, Unmount, ZeroLaser
 
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 
 
@@ -92,8 +94,13 @@ def test_two_helices_in_one_set_up_mount_once_and_clear_away_once():
     assert kinds == [MoveTo, MountBar, MoveTo, MoveTo, MoveTo, RecordPath, MoveTo, MoveTo, RecordPath, Unmount]
 
 
-@pytest.mark.parametrize("chain", ["w-X-Y-b-Z-t", "w-b-X-Y-Z-t", "w-Z-b-X-Y-t"])
-@pytest.mark.parametrize("stroke", [(600, 500, 450), (812.8, 495, 508), (250, 300, 200), (1500, 1200, 800), (3000, 2000, 1000)])
+CHAINS = ["w-X-Y-b-Z-t", "w-b-X-Y-Z-t", "w-Z-b-X-Y-t"]
+STROKES = [(600, 500, 450), (812.8, 495, 508), (250, 300, 200), (1500, 1200, 800), (3000, 2000, 1000)]
+# Every stroke with one chain in turn; ABBE_TEST_LONG=1 plays all pairs.
+MACHINES = [(chain, stroke) for k, stroke in enumerate(STROKES) for chain in (CHAINS if LONG else [CHAINS[k % 3]])]
+
+
+@pytest.mark.parametrize(("chain", "stroke"), MACHINES)
 def test_shipped_campaigns_fit_into_any_machine(chain, stroke):
     m = Machine(chain, np.array([[-100.0, s - 100.0] for s in stroke]))
     for plan in (identification(m), verification(m), quick_check(m)):

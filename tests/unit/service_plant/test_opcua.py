@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ pytest.importorskip("asyncua", reason="the extra [opcua] is not installed")
 
 from asyncua import Client, Node, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+from asyncua.server.address_space import NodeData, NodeManagementService
+from asyncua.server.standard_address_space import standard_address_space
 from asyncua.ua.uaerrors import UaStatusCodeError
 
 from service.clock import SystemClock
@@ -47,6 +50,35 @@ async def running(setup: OpcUaSetup, source: Source) -> AsyncIterator[OpcUaServe
         async with asyncio.timeout(5):
             await task
         assert part.port == 0
+
+
+def _copied(nodes: dict[ua.NodeId, NodeData]) -> dict[ua.NodeId, NodeData]:
+    """What a server may change of its nodes is its own: values, references, who is told."""
+    found = {}
+    for nodeid, node in nodes.items():
+        own = found[nodeid] = copy(node)
+        own.references = [copy(one) for one in node.references]
+        own.attributes = {which: copy(one) for which, one in node.attributes.items()}
+        for one in own.attributes.values():
+            one.datachange_callbacks = {}
+    return found
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _standard_nodes_built_once() -> Iterator[None]:
+    """The nodes of the standard are built by the first server; those after it get copies of them."""
+    fill, kept = standard_address_space.fill_address_space, dict[ua.NodeId, NodeData]()
+
+    def filled(service: NodeManagementService) -> None:
+        if not kept:
+            fill(service)
+            kept.update(_copied(service._aspace._nodes))
+        else:
+            service._aspace._nodes.update(_copied(kept))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(standard_address_space, "fill_address_space", filled)
+        yield
 
 
 @pytest.fixture

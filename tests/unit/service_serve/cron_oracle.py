@@ -28,35 +28,41 @@ class Minutes:
         first = int(start.timestamp() // 60)
         self.utc = first + np.arange(count)
         self.local = self.utc + np.repeat(np.array(offsets, dtype=np.int64), OFFSETS_EVERY_MIN)[:count]
+        self._shown = _shown(self.local)
 
     def at(self, which: np.ndarray) -> list[datetime]:
         return [datetime.fromtimestamp(int(minute) * 60, UTC) for minute in self.utc[which]]
 
     def of_cron(self, cron: str) -> list[datetime]:
         fields = cron.split()
-        due = _shows(self.local, fields)
+        due = _fit(self._shown, fields)
         if not fields[0].startswith("*") and not fields[1].startswith("*"):
             seen = np.maximum.accumulate(self.local)
             due[1:] &= self.local[1:] > seen[:-1]  # a wall time that was there before
             for k in np.flatnonzero(np.diff(self.local) > 1) + 1:
                 skipped = np.arange(self.local[k - 1] + 1, self.local[k])
-                due[k] |= bool(_shows(skipped, fields).any())
+                due[k] |= bool(_fit(_shown(skipped), fields).any())
         return self.at(due)
 
     def of_interval(self, every_min: int, first: datetime) -> list[datetime]:
         return self.at((self.utc - int(first.timestamp() // 60)) % every_min == 0)
 
 
-def _shows(local: np.ndarray, fields: list[str]) -> np.ndarray:
-    """Whether a wall clock that stands at these minutes (since 1970) fits the five fields."""
+def _shown(local: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Minute, hour, day, month and weekday of a wall clock that stands at these minutes (since 1970)."""
     stamp = local.astype("datetime64[m]")
     days, months = stamp.astype("datetime64[D]"), stamp.astype("datetime64[M]")
     of_month = (days - months.astype("datetime64[D]")).astype(int) + 1
     of_week = (days.astype(int) + 3) % 7 + 1  # 1970-01-01 was a Thursday
-    hour, month = local // 60 % 24, months.astype(int) % 12 + 1
-    dom, dow = _fits(fields[2], of_month), _fits(fields[4], of_week)
+    found = (local % 60, local // 60 % 24, of_month, months.astype(int) % 12 + 1, of_week)
+    return tuple(one.astype(np.int8) for one in found)
+
+
+def _fit(shown: tuple[np.ndarray, ...], fields: list[str]) -> np.ndarray:
+    """Whether what is shown fits the five fields."""
+    minute, hour, dom, month, dow = (_fits(field, values) for field, values in zip(fields, shown, strict=True))
     both = fields[2].startswith("*") or fields[4].startswith("*")
-    return _fits(fields[0], local % 60) & _fits(fields[1], hour) & _fits(fields[3], month) & ((dom & dow) if both else (dom | dow))
+    return minute & hour & month & ((dom & dow) if both else (dom | dow))
 
 
 def _fits(field: str, values: np.ndarray) -> np.ndarray:

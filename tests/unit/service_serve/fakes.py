@@ -55,8 +55,11 @@ class FakeClock:
 
 async def settle() -> None:
     """Run everything that is ready, and what that makes ready. In-memory fakes need no more than a few turns of the loop."""
+    ready = getattr(asyncio.get_running_loop(), "_ready", None)
     for _ in range(8):
         await asyncio.sleep(0)
+        if ready is not None and not ready:  # nobody else has anything to do
+            return
 
 
 class FakeLedger:
