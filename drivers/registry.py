@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture
-from drivers.ballbar.driver import SerialBallBar
-from drivers.cnc.driver import ModbusController
-from drivers.errors import BadUrl, WrongDevice
-from drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
-from drivers.laser.driver import ModbusLaser
-from drivers.links.modbus_line import Canary
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
+from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.errors import BadUrl, WrongDevice
+from abbe.drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
+from abbe.drivers.laser.driver import ModbusLaser
+from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
 
 HEARTBEAT_S = 1.0
 """A controller or laser that nobody asks anything is asked for its canary so often, so that a lost one is known within 3 s."""

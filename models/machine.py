@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2, F3
 
 AXES = ("X", "Y", "Z")
 

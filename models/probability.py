@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 
 def normal_below(z: ArrayLike) -> F1:

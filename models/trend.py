@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
-from models.probability import f_limit, normal_below, normal_limit, t_above
+from abbe.models.arrays import F1
+from abbe.models.probability import f_limit, normal_below, normal_limit, t_above
 
 CUSUM_K = 0.5
 """Half the smallest shift worth finding, in standard deviations of a check."""

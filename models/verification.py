@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
-from models.solvers.observations import RunData, nominal_reading
-from models.solvers.observe import bar_normals
-from models.solvers.priors import U_WAVELENGTH
+from abbe.models.arrays import F1
+from abbe.models.solvers.observations import RunData, nominal_reading
+from abbe.models.solvers.observe import bar_normals
+from abbe.models.solvers.priors import U_WAVELENGTH
 
 U_REPEAT_MM = 1e-4
 """Repeatability of a re-mounted ball-bar's shape reading, an assumption until repeats are measured."""

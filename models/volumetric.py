@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 
 def volume_grid(box_mm: F2, nodes: int) -> F2:

@@ -1,6 +1,6 @@
 """Programs of ours in a Python of their own: how each is started, so that nothing in the working directory is imported in place of ours.
 
-A plain ``python -m`` or ``python -c`` looks for modules in the working directory first: a folder ``service`` that lies there would run.
+A plain ``python -m`` or ``python -c`` looks for modules in the working directory first: a folder ``abbe`` that lies there would run.
 Children are therefore started by this file's absolute path, with ``-P``: ``python -P .../service/children.py MODULE WORD ...``.
 """
 
@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 SAFE = "PYTHONSAFEPATH"
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-"""Where our packages lie."""
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+"""Where the package ``abbe`` lies."""
 
 
 def python_words(module: str, *words: object) -> list[str]:

@@ -17,11 +17,11 @@ from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict
 from pydantic_settings.exceptions import SettingsError
 
-from service.config_schema import MachineFile
-from service.errors import ConfigError
-from service.explain import expected, nearest, where
-from service.secrets import mask_secrets
-from service.storage.engine import resolve_url
+from abbe.service.config_schema import MachineFile
+from abbe.service.errors import ConfigError
+from abbe.service.explain import expected, nearest, where
+from abbe.service.secrets import mask_secrets
+from abbe.service.storage.engine import resolve_url
 
 PREFIX = "ABBE_"
 Origin = Literal["default", "file", "environment"]

@@ -1,4 +1,4 @@
-"""What a machine file can say, with bounds on every number and the unit in every key. ``service.config`` reads it."""
+"""What a machine file can say, with bounds on every number and the unit in every key. ``abbe.service.config`` reads it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from drivers.errors import DriverError
-from drivers.links import urls
-from service.channel.messages import PAGE_MEMORY_MB
-from service.config_timetable import AlarmSection, ScheduleEntry, Section, WindowEntry
-from service.errors import AbbeError
-from service.mqtt.broker import parse as parse_broker
-from service.runs.machine_object import Chain, Interval, Point
-from service.storage.engine import parse_url as parse_database
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links import urls
+from abbe.service.channel.messages import PAGE_MEMORY_MB
+from abbe.service.config_timetable import AlarmSection, ScheduleEntry, Section, WindowEntry
+from abbe.service.errors import AbbeError
+from abbe.service.mqtt.broker import parse as parse_broker
+from abbe.service.runs.machine_object import Chain, Interval, Point
+from abbe.service.storage.engine import parse_url as parse_database
 
 Positive = Annotated[float, Field(gt=0.0)]
 

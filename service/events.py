@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a measurement is: ``state`` (service.sequences.control), why it waits, the run in hand, its step of ``steps``, points read."""
+    """Where a measurement is: ``state`` (of its `Control`), why it waits, the run in hand, its step of ``steps``, points read."""
 
     state: str = "running"
     why: str = ""

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from service.config_schema import MachineFile
-from service.runs.discovery_file import DiscoveryFile
-from service.runs.formats import CampaignFile, ErrorsFile, RunFile
-from service.runs.machine_object import MachineObject
-from service.runs.solution_file import SolutionFile
+from abbe.service.config_schema import MachineFile
+from abbe.service.runs.discovery_file import DiscoveryFile
+from abbe.service.runs.formats import CampaignFile, ErrorsFile, RunFile
+from abbe.service.runs.machine_object import MachineObject
+from abbe.service.runs.solution_file import SolutionFile
 
 MODELS: dict[str, type[BaseModel]] = {
     "machine-file": MachineFile,

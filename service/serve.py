@@ -1,8 +1,8 @@
 """The unattended service: what is wired to what, in which order it starts, and in which order it stops.
 
-This is the core process: devices, timetable, jobs, MQTT. It answers no HTTP; the page is a process of its own (`service.web.process`) that
-it starts, tells and hears over a channel of its own (`service.channel`). Start: store, MQTT, timetable, page. Stop, within five seconds: a
-running check is cancelled (the devices hold the motion), the page closes, the broker is told "offline", the store is closed.
+This is the core process: devices, timetable, jobs, MQTT. It answers no HTTP; the page is a process of its own (`abbe.service.web.process`)
+that it starts, tells and hears over a channel of its own (`abbe.service.channel`). Start: store, MQTT, timetable, page. Stop, within five
+seconds: a running check is cancelled (the devices hold the motion), the page closes, the broker is told "offline", the store is closed.
 """
 
 from __future__ import annotations
@@ -21,46 +21,46 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from service.audit.book import AuditBook, this_account
-from service.audit.chain import Event
-from service.channel.messages import PROTOCOL, Begin, NeedsTold, RulesTold, ScheduleTold
-from service.clock import Clock, SystemClock
-from service.core.campaigns import Campaigns
-from service.core.cut_off import LastWords, cut_off_now, leave_now
-from service.core.jobs import JobBook
-from service.core.moment import Moments
-from service.core.open_ends import OpenEnds
-from service.core.orders import Ground, Hands, Orders
-from service.core.rights import may, may_measure
-from service.core.setup import Setup
-from service.core.systemd import notify
-from service.core.table_watch import TableWatch
-from service.core.watch import BoardWatch, StateTeller, VerifiedWatch
-from service.core.web_process import WebProcess
-from service.errors import ConfigError
-from service.mqtt.outbox import StoreOutbox
-from service.mqtt.publisher import Publisher
-from service.plant.gather import Gatherer
-from service.scheduler.desk import AlarmDesk, Telling
-from service.scheduler.job import CheckJob
-from service.scheduler.keep import StoreLedger, StoreShelf
-from service.scheduler.loop import Scheduler, Terms
-from service.scheduler.ports import JobWatcher
-from service.scheduler.station import Station
-from service.scheduler.store import ServiceStore
-from service.storage.engine import parse_url
-from service.storage.private import database_seen_by_others
-from service.users.roles import Permission
-from service.web.board import Board
-from service.web.listening import bind, check_certificate, check_exposure
-from service.web.view import View
-from service.workflows.at_start import push_is_open
-from service.workflows.push_word import open_push
-from service.workflows.shipped import parted
-from service.workflows.verified_by import verified_by
+from abbe.service.audit.book import AuditBook, this_account
+from abbe.service.audit.chain import Event
+from abbe.service.channel.messages import PROTOCOL, Begin, NeedsTold, RulesTold, ScheduleTold
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.core.campaigns import Campaigns
+from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
+from abbe.service.core.jobs import JobBook
+from abbe.service.core.moment import Moments
+from abbe.service.core.open_ends import OpenEnds
+from abbe.service.core.orders import Ground, Hands, Orders
+from abbe.service.core.rights import may, may_measure
+from abbe.service.core.setup import Setup
+from abbe.service.core.systemd import notify
+from abbe.service.core.table_watch import TableWatch
+from abbe.service.core.watch import BoardWatch, StateTeller, VerifiedWatch
+from abbe.service.core.web_process import WebProcess
+from abbe.service.errors import ConfigError
+from abbe.service.mqtt.outbox import StoreOutbox
+from abbe.service.mqtt.publisher import Publisher
+from abbe.service.plant.gather import Gatherer
+from abbe.service.scheduler.desk import AlarmDesk, Telling
+from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.keep import StoreLedger, StoreShelf
+from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.ports import JobWatcher
+from abbe.service.scheduler.station import Station
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.engine import parse_url
+from abbe.service.storage.private import database_seen_by_others
+from abbe.service.users.roles import Permission
+from abbe.service.web.board import Board
+from abbe.service.web.listening import bind, check_certificate, check_exposure
+from abbe.service.web.view import View
+from abbe.service.workflows.at_start import push_is_open
+from abbe.service.workflows.push_word import open_push
+from abbe.service.workflows.shipped import parted
+from abbe.service.workflows.verified_by import verified_by
 
 if TYPE_CHECKING:
-    from service.plant.opcua.server import OpcUaServer
+    from abbe.service.plant.opcua.server import OpcUaServer
 
 log = structlog.get_logger("abbe.serve")
 
@@ -148,7 +148,7 @@ class Service:
         setup = self._setup
         if setup.opcua is None:
             return None
-        from service.plant.opcua.server import OpcUaServer  # an extra, and slow to import
+        from abbe.service.plant.opcua.server import OpcUaServer  # an extra, and slow to import
 
         broker = "" if setup.broker is None else str(setup.broker)
         view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock, setup.control)

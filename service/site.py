@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from models.machine import AXES, Machine
-from service.capture.settings import MIB, CaptureSettings
-from service.config_schema import Limits, MachineFile
-from service.devices.urls import DeviceUrls, control_of
-from service.push.limits import PushLimits
-from service.sequences.interlocks import Suspending, Watching
-from service.sequences.nc.settings import NcSettings
+from abbe.models.machine import AXES, Machine
+from abbe.service.capture.settings import MIB, CaptureSettings
+from abbe.service.config_schema import Limits, MachineFile
+from abbe.service.devices.urls import DeviceUrls, control_of
+from abbe.service.push.limits import PushLimits
+from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.nc.settings import NcSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""``python -m simulators``: the outside world as a process; ``truth``: its sealed truth as figures; ``hidden-suite``: sealed cases."""
+"""``python -m abbe.simulators``: the outside world as a process; ``truth``: its sealed truth as figures; ``hidden-suite``: sealed cases."""
 
 import argparse
 import asyncio
@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from simulators import scenario as scenarios
-from simulators.scenario import Scenario, ScenarioError
+from abbe.simulators import scenario as scenarios
+from abbe.simulators.scenario import Scenario, ScenarioError
 
 
 class _Parser(argparse.ArgumentParser):
@@ -35,7 +35,7 @@ def _scenario(options: argparse.Namespace) -> Scenario:
     """The scenario that the command line names, or the one that a seed stands for."""
     if options.hidden is None:
         return scenarios.load(options.scenario)
-    from simulators.hidden.picks import picked
+    from abbe.simulators.hidden.picks import picked
 
     scenario = picked(options.hidden)
     scenarios.check(scenario)
@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command line; gives the exit code."""
     try:
         if argv[:1] == ["hidden-suite"]:
-            from simulators.hidden.suite import main as hidden_suite
+            from abbe.simulators.hidden.suite import main as hidden_suite
 
             return hidden_suite(argv[1:])
         return _truth(argv[1:]) if argv[:1] == ["truth"] else _serve(argv)
@@ -83,7 +83,7 @@ def _overridden(scenario: Scenario, options: argparse.Namespace) -> Scenario:
 
 
 async def _run(scenario: Scenario, link_dir: Path | None, *, watch: bool) -> int:
-    from simulators.site import Site
+    from abbe.simulators.site import Site
 
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -109,7 +109,7 @@ def _watch_stdin(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
 
 
 def _truth(argv: Sequence[str]) -> int:
-    from simulators.sealed import truth
+    from abbe.simulators.sealed import truth
 
     parser = _parser("simulators truth", "The sealed truth: volumetric figures of the machine, with or without a correction.")
     parser.add_argument("--bank", type=Path, help="compensation image (docs/protocols/cnc.md), big-endian words; absent: no correction")

@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from simulators.cnc.log import Command, TableAccess
-from simulators.scenario import AXES
-from simulators.world import World
+from abbe.simulators.cnc.log import Command, TableAccess
+from abbe.simulators.scenario import AXES
+from abbe.simulators.world import World
 
 Answer = dict[str, Any]
 MAX_RADIUS_MM = 2000.0

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from simulators.modbus_wire import ModbusRtu, RegisterMap
-from simulators.pseudo_serial import PseudoSerial
+from abbe.simulators.modbus_wire import ModbusRtu, RegisterMap
+from abbe.simulators.pseudo_serial import PseudoSerial
 
 BAUD = 115200
 

@@ -2,12 +2,12 @@
 
 import struct
 
-from simulators.cnc import bank
-from simulators.hidden.live import live_of
-from simulators.scenario import Scenario, ScenarioError
-from simulators.truth.draws import describe, draw_machine
-from simulators.truth.figures import no_correction, report
-from simulators.truth.machine import Geometry, Machine
+from abbe.simulators.cnc import bank
+from abbe.simulators.hidden.live import live_of
+from abbe.simulators.scenario import Scenario, ScenarioError
+from abbe.simulators.truth.draws import describe, draw_machine
+from abbe.simulators.truth.figures import no_correction, report
+from abbe.simulators.truth.machine import Geometry, Machine
 
 
 def truth(scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool = False) -> dict[str, object]:

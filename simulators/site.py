@@ -6,16 +6,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from simulators.ballbar.port import BytePort, PtyPort, TcpPort
-from simulators.ballbar.wire import BallbarWire
-from simulators.cnc.log import Command, TableAccess
-from simulators.cnc.wire import CncRegisters
-from simulators.fixture import Fixture
-from simulators.laser.wire import LaserRegisters
-from simulators.modbus_wire import ModbusTcp
-from simulators.rtu_line import RtuLine
-from simulators.scenario import Scenario
-from simulators.world import LASER_CLOCK_US, World
+from abbe.simulators.ballbar.port import BytePort, PtyPort, TcpPort
+from abbe.simulators.ballbar.wire import BallbarWire
+from abbe.simulators.cnc.log import Command, TableAccess
+from abbe.simulators.cnc.wire import CncRegisters
+from abbe.simulators.fixture import Fixture
+from abbe.simulators.laser.wire import LaserRegisters
+from abbe.simulators.modbus_wire import ModbusTcp
+from abbe.simulators.rtu_line import RtuLine
+from abbe.simulators.scenario import Scenario
+from abbe.simulators.world import LASER_CLOCK_US, World
 
 TICK_S = 0.005
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"

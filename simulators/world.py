@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.ballbar.device import BallbarDevice
-from simulators.cnc.device import Controller
-from simulators.hidden.live import live_of
-from simulators.laser.device import RATE_HZ, LaserDevice
-from simulators.scenario import Magnitudes, Scenario
-from simulators.truth.draws import UM, Draws, draw_machine
-from simulators.truth.machine import Geometry, Machine
-from simulators.truth.play import Play
-from simulators.truth.surroundings import Air, drift
+from abbe.simulators.arrays import F
+from abbe.simulators.ballbar.device import BallbarDevice
+from abbe.simulators.cnc.device import Controller
+from abbe.simulators.hidden.live import live_of
+from abbe.simulators.laser.device import RATE_HZ, LaserDevice
+from abbe.simulators.scenario import Magnitudes, Scenario
+from abbe.simulators.truth.draws import UM, Draws, draw_machine
+from abbe.simulators.truth.machine import Geometry, Machine
+from abbe.simulators.truth.play import Play
+from abbe.simulators.truth.surroundings import Air, drift
 
 # Each box was switched on at its own time: no two clocks agree.
 BALLBAR_CLOCK_US = 12_345_678

@@ -11,8 +11,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from service.runs.exchange import import_folder
-from service.storage.store import Store
+from abbe.service.runs.exchange import import_folder
+from abbe.service.storage.store import Store
 from tests.scenarios.campaign_files import measured, write_folder
 
 

@@ -17,41 +17,41 @@ from typing import Any
 import httpx
 import numpy as np
 
-from drivers.api import CompStatus, TableFormat
-from drivers.cnc.tables import crc32, encode
-from drivers.errors import LinkDown
-from models.compensation.tables import NineTables, nine_tables, predict_residual, quantise
-from service.audit.book import AuditBook
-from service.clock import SystemClock
-from service.events import ignore_progress
-from service.runs.exchange import import_folder
-from service.scheduler import record
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.site import Site
-from service.storage.base import utc_text
-from service.users.passwords import Passwords
-from service.users.people import People
-from service.web.api.sources import Sources
-from service.web.app import create_app
-from service.web.board import Board
-from service.web.door import COOKIE, Door, csrf_token
-from service.web.guard import CSRF_HEADER
-from service.web.listening import bind
-from service.web.logtail import LogTail
-from service.web.server import make_server
-from service.web.view import View
-from service.workflows.base_table import Base
-from service.workflows.campaign_folder import from_folder
-from service.workflows.candidates import Promise, candidate_of
-from service.workflows.discover import discover, prepare
-from service.workflows.discovery_engine import catalogue
-from service.workflows.discovery_store import journal_of
-from service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
-from service.workflows.report_parts import Rules
-from service.workflows.solve import Solved, solve_runs
-from service.workflows.solve_report import solution_doc
-from service.workflows.tables import table_image
+from abbe.drivers.api import CompStatus, TableFormat
+from abbe.drivers.cnc.tables import crc32, encode
+from abbe.drivers.errors import LinkDown
+from abbe.models.compensation.tables import NineTables, nine_tables, predict_residual, quantise
+from abbe.service.audit.book import AuditBook
+from abbe.service.clock import SystemClock
+from abbe.service.events import ignore_progress
+from abbe.service.runs.exchange import import_folder
+from abbe.service.scheduler import record
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.site import Site
+from abbe.service.storage.base import utc_text
+from abbe.service.users.passwords import Passwords
+from abbe.service.users.people import People
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.app import create_app
+from abbe.service.web.board import Board
+from abbe.service.web.door import COOKIE, Door, csrf_token
+from abbe.service.web.guard import CSRF_HEADER
+from abbe.service.web.listening import bind
+from abbe.service.web.logtail import LogTail
+from abbe.service.web.server import make_server
+from abbe.service.web.view import View
+from abbe.service.workflows.base_table import Base
+from abbe.service.workflows.campaign_folder import from_folder
+from abbe.service.workflows.candidates import Promise, candidate_of
+from abbe.service.workflows.discover import discover, prepare
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.discovery_store import journal_of
+from abbe.service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from abbe.service.workflows.report_parts import Rules
+from abbe.service.workflows.solve import Solved, solve_runs
+from abbe.service.workflows.solve_report import solution_doc
+from abbe.service.workflows.tables import table_image
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.scenarios.campaign_files import measured
 from tests.system.serve_check import Result

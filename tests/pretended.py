@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from drivers.api import Controller
-from drivers.registry import open_controller
-from service.push.levels import Capabilities
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.commission import KIND
-from service.workflows.proved_levels import KIND as LEVELS
-from service.workflows.proved_levels import flags_of, identity
+from abbe.drivers.api import Controller
+from abbe.drivers.registry import open_controller
+from abbe.service.push.levels import Capabilities
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.commission import KIND
+from abbe.service.workflows.proved_levels import KIND as LEVELS
+from abbe.service.workflows.proved_levels import flags_of, identity
 
 NAME = f"{KIND} pretended"
 

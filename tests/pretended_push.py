@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from drivers.cnc.tables import crc32
-from service.clock import Clock
-from service.push.book import StoreBook
-from service.push.states import S, State
-from service.storage.store import Store
+from abbe.drivers.cnc.tables import crc32
+from abbe.service.clock import Clock
+from abbe.service.push.book import StoreBook
+from abbe.service.push.states import S, State
+from abbe.service.storage.store import Store
 
 UP_TO_ACTIVE = (S.SNAPSHOT, S.VALIDATED, S.APPROVED, S.LEASED, S.STAGING, S.STAGED, S.ACTIVATING, S.PROBATION)
 KEPT = (*UP_TO_ACTIVE, S.PROBED, S.VERIFIED, S.KEEP)

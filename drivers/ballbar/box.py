@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivers.ballbar import frames
-from drivers.ballbar.conversation import Conversation
-from drivers.ballbar.sequence import OtherPace, OtherSettings, Reads, SegmentEnd
-from drivers.errors import DeviceFault, DriverError, Rebooted, Refused, SettingsChanged, WrongDevice
+from abbe.drivers.ballbar import frames
+from abbe.drivers.ballbar.conversation import Conversation
+from abbe.drivers.ballbar.sequence import OtherPace, OtherSettings, Reads, SegmentEnd
+from abbe.drivers.errors import DeviceFault, DriverError, Rebooted, Refused, SettingsChanged, WrongDevice
 
 _TELLS_SETTINGS = 0x0101  # firmware
 _RESTORE = "somebody changed the box: set it back (restore_settings), then measure this test again"

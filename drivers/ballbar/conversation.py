@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from drivers.ballbar import frames
-from drivers.ballbar.framing import BarCounters
-from drivers.errors import BadFrame, DriverError, LinkDown, Refused, ReplyTimeout
+from abbe.drivers.ballbar import frames
+from abbe.drivers.ballbar.framing import BarCounters
+from abbe.drivers.errors import BadFrame, DriverError, LinkDown, Refused, ReplyTimeout
 
 _DRAIN_S = 10.0
 _OPERATION = {frames.START: "start stream", frames.STOP: "stop stream", frames.CONFIGURE: "set range and zero"}

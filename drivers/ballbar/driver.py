@@ -6,19 +6,29 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from drivers.api import BarBatch, BarTap, DeviceInfo
-from drivers.ballbar import frames
-from drivers.ballbar.box import Box
-from drivers.ballbar.conversation import Conversation
-from drivers.ballbar.framing import BarCounters, Framing
-from drivers.ballbar.sequence import SegmentEnd
-from drivers.ballbar.stream import SLOW, Stream
-from drivers.errors import Backpressure, DriverError, LinkDown, LossyLine, Rebooted, Refused, ReplyTimeout, SettingsChanged, WrongDevice
-from drivers.links.backoff import Backoff
-from drivers.links.incidents import Incidents
-from drivers.links.reading import Ring
-from drivers.links.serial_link import ByteLink
-from drivers.links.shielded import run_to_end
+from abbe.drivers.api import BarBatch, BarTap, DeviceInfo
+from abbe.drivers.ballbar import frames
+from abbe.drivers.ballbar.box import Box
+from abbe.drivers.ballbar.conversation import Conversation
+from abbe.drivers.ballbar.framing import BarCounters, Framing
+from abbe.drivers.ballbar.sequence import SegmentEnd
+from abbe.drivers.ballbar.stream import SLOW, Stream
+from abbe.drivers.errors import (
+    Backpressure,
+    DriverError,
+    LinkDown,
+    LossyLine,
+    Rebooted,
+    Refused,
+    ReplyTimeout,
+    SettingsChanged,
+    WrongDevice,
+)
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.incidents import Incidents
+from abbe.drivers.links.reading import Ring
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.shielded import run_to_end
 
 _ANSWER_S = 1.0
 _SILENCE_S = 1.0

@@ -6,7 +6,7 @@ import struct
 from binascii import crc_hqx
 from dataclasses import dataclass
 
-from drivers.api import BarSample
+from abbe.drivers.api import BarSample
 
 SYNC = b"\xa5\x5a"
 MAX_PAYLOAD = 32

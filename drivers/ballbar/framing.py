@@ -8,11 +8,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers.api import BarSample
-from drivers.ballbar import frames
-from drivers.ballbar.sequence import SegmentEnd
-from drivers.ballbar.stream import Stream
-from drivers.links.reading import Ring
+from abbe.drivers.api import BarSample
+from abbe.drivers.ballbar import frames
+from abbe.drivers.ballbar.sequence import SegmentEnd
+from abbe.drivers.ballbar.stream import Stream
+from abbe.drivers.links.reading import Ring
 
 _TAKE_S = 3600.0
 _STOP_S = 2.0
@@ -22,7 +22,7 @@ _STOP_S = 2.0
 class BarCounters:
     """What came over the wire so far, for diagnostics: whole frames, and what went wrong; none of that reaches the data.
 
-    ``bad_frames``: looked like frames until the check sum. ``strays``: samples that cannot be (see `drivers.ballbar.sequence`).
+    ``bad_frames``: looked like frames until the check sum. ``strays``: samples that cannot be (see `abbe.drivers.ballbar.sequence`).
     ``lost``: samples missing between others. ``overflow``: samples that a slow consumer without a tap let go.
     """
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.api import BarSample
+from abbe.drivers.api import BarSample
 
 _WRAP = 1 << 32
 _HALF = _WRAP // 2

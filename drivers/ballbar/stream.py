@@ -7,9 +7,9 @@ import threading
 from collections import deque
 from contextlib import suppress
 
-from drivers.api import BarBatch, BarSample, BarTap
-from drivers.ballbar.sequence import Reads, Run, SegmentEnd, SequenceTracker
-from drivers.errors import Backpressure, BadFrame, DriverError, LossyLine
+from abbe.drivers.api import BarBatch, BarSample, BarTap
+from abbe.drivers.ballbar.sequence import Reads, Run, SegmentEnd, SequenceTracker
+from abbe.drivers.errors import Backpressure, BadFrame, DriverError, LossyLine
 
 STOP_FILL = 0.8
 

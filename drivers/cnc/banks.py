@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.api import CompStatus
-from drivers.cnc import registers as reg
-from drivers.cnc.session import ControllerSession
-from drivers.errors import BadFrame, DeviceFault, Refused
-from drivers.links.modbus_policy import Op
-from drivers.links.numbered import next_number, run_numbered
-from drivers.links.words import bytes_of, words_of
+from abbe.drivers.api import CompStatus
+from abbe.drivers.cnc import registers as reg
+from abbe.drivers.cnc.session import ControllerSession
+from abbe.drivers.errors import BadFrame, DeviceFault, Refused
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.numbered import next_number, run_numbered
+from abbe.drivers.links.words import bytes_of, words_of
 
 _WINDOW = 100  # even, and all 32-bit values of an image stand at even words: none is ever split
 _SEQLOCK_TRIES = 4

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.api import CompStatus, ControllerStatus, DeviceInfo, Point, TableFormat
-from drivers.cnc import registers as reg
-from drivers.cnc.banks import Banks
-from drivers.cnc.motion import Motion
-from drivers.cnc.session import ControllerSession
-from drivers.links.modbus_link import ModbusLink
+from abbe.drivers.api import CompStatus, ControllerStatus, DeviceInfo, Point, TableFormat
+from abbe.drivers.cnc import registers as reg
+from abbe.drivers.cnc.banks import Banks
+from abbe.drivers.cnc.motion import Motion
+from abbe.drivers.cnc.session import ControllerSession
+from abbe.drivers.links.modbus_link import ModbusLink
 
 
 class ModbusController:

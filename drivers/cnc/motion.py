@@ -6,14 +6,14 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
-from drivers.api import ControllerStatus, Point
-from drivers.cnc import registers as reg
-from drivers.cnc.registers import Bit
-from drivers.cnc.session import ControllerSession
-from drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
-from drivers.links.modbus_policy import Op
-from drivers.links.numbered import next_number, run_numbered
-from drivers.links.shielded import run_to_end
+from abbe.drivers.api import ControllerStatus, Point
+from abbe.drivers.cnc import registers as reg
+from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.cnc.session import ControllerSession
+from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.numbered import next_number, run_numbered
+from abbe.drivers.links.shielded import run_to_end
 
 _POLL_S = 0.003
 _HOLD_S = 3.0

@@ -7,8 +7,8 @@ import struct
 from collections.abc import Mapping, Sequence
 from enum import IntFlag
 
-from drivers.api import CompStatus, ControllerStatus, Point
-from drivers.links.words import Block, Register, words_of
+from abbe.drivers.api import CompStatus, ControllerStatus, Point
+from abbe.drivers.links.words import Block, Register, words_of
 
 MAP_VERSION = 1
 COUNTS_PER_MM = 100_000  # 10 nm

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 
-from drivers.api import ControllerStatus, DeviceInfo, TableFormat
-from drivers.cnc import registers as reg
-from drivers.errors import Rebooted, WrongDevice
-from drivers.links.identity import check_clock, check_identity
-from drivers.links.modbus_link import ModbusLink
+from abbe.drivers.api import ControllerStatus, DeviceInfo, TableFormat
+from abbe.drivers.cnc import registers as reg
+from abbe.drivers.errors import Rebooted, WrongDevice
+from abbe.drivers.links.identity import check_clock, check_identity
+from abbe.drivers.links.modbus_link import ModbusLink
 
 
 class ControllerSession:

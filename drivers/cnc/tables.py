@@ -7,7 +7,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 
-from drivers.api import Point
+from abbe.drivers.api import Point
 
 MAGIC = 0xABBE
 FORMAT = 1

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import time
 
-from drivers.api import DeviceInfo, LaserReading
-from drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
-from drivers.laser import registers as reg
-from drivers.links.identity import check_clock, check_identity
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.modbus_policy import Op
-from drivers.links.numbered import next_number, run_numbered
+from abbe.drivers.api import DeviceInfo, LaserReading
+from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
+from abbe.drivers.laser import registers as reg
+from abbe.drivers.links.identity import check_clock, check_identity
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.numbered import next_number, run_numbered
 
 _POLL_S = 0.005
 _READ_S = 5.0

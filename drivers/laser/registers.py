@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.api import LaserReading
-from drivers.links.words import Block, Register
+from abbe.drivers.api import LaserReading
+from abbe.drivers.links.words import Block, Register
 
 MAP_VERSION = 1
 

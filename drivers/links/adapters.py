@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.errors import LinkDown, WrongDevice
+from abbe.drivers.errors import LinkDown, WrongDevice
 
 
 @dataclass(frozen=True, slots=True)

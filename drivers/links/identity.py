@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.errors import WrongDevice
-from drivers.links.words import CANARY_F32_BITS, CANARY_I32
+from abbe.drivers.errors import WrongDevice
+from abbe.drivers.links.words import CANARY_F32_BITS, CANARY_I32
 
 _ORDERS = {"CDAB": (2, 3, 0, 1), "BADC": (1, 0, 3, 2), "DCBA": (3, 2, 1, 0)}
 _WORDS = {

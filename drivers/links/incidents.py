@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.errors import NO_RUN, DriverError
+from abbe.drivers.errors import NO_RUN, DriverError
 
 _KEPT = 256
 

@@ -18,9 +18,9 @@ from pymodbus import FramerType
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
-from drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
-from drivers.links.modbus_reply import rtu_mismatch, tcp_mismatch
-from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
+from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
+from abbe.drivers.links.modbus_reply import rtu_mismatch, tcp_mismatch
+from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 
 # Everything that goes wrong leaves here as a typed error: the library's own lines would only repeat it on stderr.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())

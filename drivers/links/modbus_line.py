@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from drivers.errors import BadFrame, LinkDown, ReplyTimeout
-from drivers.links.modbus import READ_HOLDING, READ_INPUT, WRITE, Answer, Request, Wire
-from drivers.links.words import CANARY_WORDS
+from abbe.drivers.errors import BadFrame, LinkDown, ReplyTimeout
+from abbe.drivers.links.modbus import READ_HOLDING, READ_INPUT, WRITE, Answer, Request, Wire
+from abbe.drivers.links.words import CANARY_WORDS
 
 _BABBLE_LIMIT = 5
 _PROOFS = 5

@@ -6,14 +6,14 @@ import asyncio
 import contextlib
 from collections.abc import Sequence
 
-from drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
-from drivers.links.backoff import Backoff
-from drivers.links.incidents import Incidents
-from drivers.links.modbus import READ_HOLDING, WRITE, Answer, Request, Wire
-from drivers.links.modbus_line import Canary, Line
-from drivers.links.modbus_policy import BUSY_POLL_S, BUSY_S, POLICY, Op, meaning, waits
-from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
-from drivers.links.words import Block
+from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.incidents import Incidents
+from abbe.drivers.links.modbus import READ_HOLDING, WRITE, Answer, Request, Wire
+from abbe.drivers.links.modbus_line import Canary, Line
+from abbe.drivers.links.modbus_policy import BUSY_POLL_S, BUSY_S, POLICY, Op, meaning, waits
+from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
+from abbe.drivers.links.words import Block
 
 MAX_READ = 125
 MAX_WRITE = 123

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from drivers.errors import DeviceFault, DriverError, LinkDown, Refused, ReplyTimeout
+from abbe.drivers.errors import DeviceFault, DriverError, LinkDown, Refused, ReplyTimeout
 
 
 class Op(Enum):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
+from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
 
 _POLL_S = 0.005
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import socket
 
-from drivers.errors import LinkDown
-from drivers.links.urls import SocketUrl
+from abbe.drivers.errors import LinkDown
+from abbe.drivers.links.urls import SocketUrl
 
 _CONNECT_S = 5.0
 

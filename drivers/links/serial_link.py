@@ -18,11 +18,11 @@ from contextlib import suppress
 import serial
 from serial.tools import list_ports
 
-from drivers.errors import LinkDown, ReplyTimeout
-from drivers.links.adapters import Adapter, adapter_at, path_to_open
-from drivers.links.raw_tcp import connected
-from drivers.links.reading import ReadingThread, Ring
-from drivers.links.urls import SerialUrl, SocketUrl
+from abbe.drivers.errors import LinkDown, ReplyTimeout
+from abbe.drivers.links.adapters import Adapter, adapter_at, path_to_open
+from abbe.drivers.links.raw_tcp import connected
+from abbe.drivers.links.reading import ReadingThread, Ring
+from abbe.drivers.links.urls import SerialUrl, SocketUrl
 
 _DRAIN_S = 0.5
 _POLL_S = 0.01

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
 
-from drivers.errors import BadUrl
+from abbe.drivers.errors import BadUrl
 
 SERIAL_BAUD = 460_800
 RTU_BAUD = 115_200

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 BLOCKS = 40
 LEAST_IN_BLOCK = 10

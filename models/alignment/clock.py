@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.alignment.envelope import LOWEST, lower_envelope
-from models.arrays import F1
+from abbe.models.alignment.envelope import LOWEST, lower_envelope
+from abbe.models.arrays import F1
 
 LEAST_PAIRS = 2 * LOWEST + 2
 EARLY = 3.0
@@ -68,7 +68,7 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
     ----------
     device_s, arrived_s : array, shape (n,)
         Device time of a sample (of one that arrived together with others, the newest says most), and monotonic host time of its arrival.
-        50 pairs or more, of one segment: no reboot, no step in between (`models.alignment.breaks`).
+        50 pairs or more, of one segment: no reboot, no step in between (`abbe.models.alignment.breaks`).
     least_delay_s, u_delay_s : float
         Shortest delay that the link has by itself, and its standard uncertainty: no arrival tells it.
     grid_s : float

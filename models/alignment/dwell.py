@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from models.alignment.matching import LARGEST_MM, SURE, Match, match, places_reach
-from models.alignment.stands import CLEAR, LEAST_SAMPLES, Stand, noise_of, sides, stands
-from models.arrays import F1
+from abbe.models.alignment.matching import LARGEST_MM, SURE, Match, match, places_reach
+from abbe.models.alignment.stands import CLEAR, LEAST_SAMPLES, Stand, noise_of, sides, stands
+from abbe.models.arrays import F1
 
 TOLERANCE = 0.3
 """Where nothing moves, a reading that changes by less than this share of the smallest planned move is no move."""

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 BLOCKS = 200
 LOWEST = 24

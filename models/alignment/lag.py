@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import savgol_filter
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 COARSE = 201
 ROUNDS = 12

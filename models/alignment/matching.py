@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 GAP = 7.0
 """What it costs to leave a place or a standstill without a partner: minus the logarithm of how often that happens (one in a thousand)."""

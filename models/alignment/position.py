@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 
 def position_in_stream(t_s: F1, stream_s: F1, stream_mm: F2, *, longest_gap_s: float = np.inf) -> F2:

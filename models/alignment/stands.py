@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 CLEAR = 6.0
 """A difference of two samples beyond this many of its standard deviations is motion."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.compensation.correction import Correction
-from models.compensation.distances import (
+from abbe.models.compensation.correction import Correction
+from abbe.models.compensation.distances import (
     Pairs,
     PredictedDistances,
     correction_error_mm,
@@ -19,12 +19,12 @@ from models.compensation.distances import (
     predict_distances,
     random_pairs,
 )
-from models.compensation.grid import Mask, grid_table, quantise_grid
-from models.compensation.one_axis import positioning_only, squareness_tables
-from models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
-from models.compensation.tables import NineTables, nine_tables, quantise
-from models.solvers.joint import JointSolution
-from models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.compensation.grid import Mask, grid_table, quantise_grid
+from abbe.models.compensation.one_axis import positioning_only, squareness_tables
+from abbe.models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
+from abbe.models.compensation.tables import NineTables, nine_tables, quantise
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 ONE_AXIS_COUNTS = (25, 25, 25)
 GRID_NODES = (5, 9, 13, 17)

@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.geometry.bases import Term, legendre_values
-from models.geometry.chain import design
-from models.machine import Machine
-from models.paths.lines import DIAGONALS, diagonal_ends
-from models.solvers.joint import JointSolution
-from models.volumetric import volume_grid
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.bases import Term, legendre_values
+from abbe.models.geometry.chain import design
+from abbe.models.machine import Machine
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.volumetric import volume_grid
 
 DIAGONAL_WEIGHT = 1.0
 """Weight of the four body diagonals together against that of the volume."""
@@ -32,7 +32,7 @@ def additive_design(
 ) -> tuple[F3, F3, F3]:
     """Design of the best additive field of a solution: per axis shape (len(grid), 3, terms), mm per unit of every coefficient.
 
-    ``terms``: the solution's own, or with orders above them (`models.uncertainty.sources`); the fit is the same.
+    ``terms``: the solution's own, or with orders above them (`abbe.models.uncertainty.sources`); the fit is the same.
     """
     order = max(t.order for t in solution.terms) + 1  # an angle times a travel is of one order more along a diagonal than the angle
     field = _design_of(solution.machine, terms or solution.terms)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from models.arrays import F2
+from abbe.models.arrays import F2
 
 Correction = Callable[[F2], F2]
 """Commanded positions, shape (n, 3), to corrections added to the command, shape (n, 3), mm."""

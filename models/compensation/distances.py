@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.compensation.correction import Correction
-from models.geometry.bases import Term
-from models.geometry.chain import design
-from models.machine import Machine
-from models.solvers.joint import JointSolution
-from models.uncertainty.combined import approach_variance_mm2, joint_factor
-from models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.arrays import F1, F2
+from abbe.models.compensation.correction import Correction
+from abbe.models.geometry.bases import Term
+from abbe.models.geometry.chain import design
+from abbe.models.machine import Machine
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.uncertainty.combined import approach_variance_mm2, joint_factor
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 INNER_SHARE = 0.8
 """Share of each stroke, about its middle, over which distances are judged."""
@@ -79,7 +79,7 @@ class PredictedDistances:
     """Distance errors to be expected of the machine, over the inner volume, each with its standard uncertainty, mm.
 
     Means over draws of the field from all sources of its uncertainty (noise, set-ups, typical sizes, orders above the chosen one,
-    wavelength, temperatures; `models.uncertainty.sources`), corrected as stated; the uncertainty is the scatter of the draws.
+    wavelength, temperatures; `abbe.models.uncertainty.sources`), corrected as stated; the uncertainty is the scatter of the draws.
     ``known_mm``: rms of the part that is known and that the table leaves; ``unknown_mm``: of the part that no table can take out, because
     nobody knows it.
     """

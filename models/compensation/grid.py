@@ -11,19 +11,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2, F3, F4
-from models.compensation.interpolation import fit_operator, fit_positions, trilinear
-from models.compensation.masking import blend
-from models.compensation.tables import check_unit, grid_positions
-from models.geometry.chain import design
-from models.machine import AXES
-from models.solvers.joint import JointSolution
-from models.uncertainty.frame import RigidFree
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.mask import compensable_mask
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import ErrorSources, error_sources
-from models.uncertainty.unseen import unseen_mm
+from abbe.models.arrays import F1, F2, F3, F4
+from abbe.models.compensation.interpolation import fit_operator, fit_positions, trilinear
+from abbe.models.compensation.masking import blend
+from abbe.models.compensation.tables import check_unit, grid_positions
+from abbe.models.geometry.chain import design
+from abbe.models.machine import AXES
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.uncertainty.frame import RigidFree
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.mask import compensable_mask
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.uncertainty.unseen import unseen_mm
 
 Mask = NDArray[np.bool_]
 
@@ -39,11 +39,11 @@ class GridTable:
     correction_mm : array, shape (nx, ny, nz, 3)
         Zero at the reference node.
     u_mm : array, shape (nx, ny, nz, 3)
-        Standard uncertainty of the deviation at each node from all sources (`models.uncertainty.prediction`), in the frame in which the
-        deviation has no rigid motion over the grid: the same figures that `compensable_nodes` judges by.
+        Standard uncertainty of the deviation at each node from all sources (`abbe.models.uncertainty.prediction`), in the frame in which
+        the deviation has no rigid motion over the grid: the same figures that `compensable_nodes` judges by.
     compensated : array of bool, shape (nx, ny, nz)
         False: the deviation there is not known well enough; all these nodes hold one and the same correction, so that no distance between
-        two of them is changed (`models.compensation.masking`).
+        two of them is changed (`abbe.models.compensation.masking`).
     reference : (int, int, int)
         The node that is not moved.
     """
@@ -136,10 +136,10 @@ def grid_table(
 def compensable_nodes(
     solution: JointSolution, counts: tuple[int, int, int], *, inputs: Inputs | None = None, k: float | None = None
 ) -> Mask:
-    """Nodes at which the deviation is larger than its expanded uncertainty (`models.uncertainty.mask`), shape ``counts``.
+    """Nodes at which the deviation is larger than its expanded uncertainty (`abbe.models.uncertainty.mask`), shape ``counts``.
 
     All sources of uncertainty count; the deviation is that without rigid motion over the grid. ``k``: coverage factor, default 95 %.
-    Nor is a node compensated where what leaves no trace in any reading may be larger than the deviation (`models.uncertainty.unseen`).
+    Nor is a node compensated where what leaves no trace in any reading may be larger than the deviation (`abbe.models.uncertainty.unseen`).
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2, F4
+from abbe.models.arrays import F1, F2, F4
 
 FIT_SAMPLES = 5
 """Sampled positions per cell when a function is fitted: the fit of a parabola is then within 2 % of the continuous one."""

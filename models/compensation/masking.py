@@ -14,10 +14,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2, F3, F4
-from models.compensation.distances import Pairs, random_pairs
-from models.compensation.interpolation import trilinear
-from models.volumetric import rigid_design
+from abbe.models.arrays import F1, F2, F3, F4
+from abbe.models.compensation.distances import Pairs, random_pairs
+from abbe.models.compensation.interpolation import trilinear
+from abbe.models.volumetric import rigid_design
 
 SMALL_CORRECTIONS = 1e-2
 """Weight of "corrections are small" against "distances are right": it decides only the frame of a mask of a few nodes."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.compensation.summary import SQUARENESS, MeanParameter, mean_parameter
-from models.compensation.tables import NineTables, entry_u, grid_positions, nine_tables, table_design
-from models.solvers.joint import JointSolution
-from models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.compensation.summary import SQUARENESS, MeanParameter, mean_parameter
+from abbe.models.compensation.tables import NineTables, entry_u, grid_positions, nine_tables, table_design
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 
 def positioning_only(tables: NineTables) -> NineTables:
@@ -33,7 +33,7 @@ class SquarenessTables:
     """Squareness as three parameters (C0Y, B0Z, A0Z, rad, with u), and tables that hold none of it.
 
     The parameters are the squareness of these tables, which count the body diagonals as much as the volume: not the mean squareness over
-    the volume (`models.compensation.summary.mean_linear`), from which it can differ by more than its uncertainty.
+    the volume (`abbe.models.compensation.summary.mean_linear`), from which it can differ by more than its uncertainty.
 
     ``tables``: own-axis tables as before; cross tables without slope, so straightness alone. What their slopes held beyond squareness was a
     rotation of the frame: it is left out. ``start_mm``: position of each axis at which the parameters correct nothing.

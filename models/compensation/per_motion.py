@@ -17,19 +17,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.compensation.tables import grid_positions
-from models.functions.motions import PLACES, SQUARENESS
-from models.geometry.bases import term_values
-from models.geometry.chain import design, deviation_mm
-from models.geometry.jacobian import squareness_motions
-from models.machine import Machine
-from models.solvers.joint import JointSolution
-from models.solvers.observability import motions_of
-from models.solvers.observability_parameters import observable_motions
-from models.uncertainty.combined import variances
-from models.uncertainty.sources import ErrorSources, error_sources
-from models.volumetric import rigid_design, volume_grid
+from abbe.models.arrays import F1, F2
+from abbe.models.compensation.tables import grid_positions
+from abbe.models.functions.motions import PLACES, SQUARENESS
+from abbe.models.geometry.bases import term_values
+from abbe.models.geometry.chain import design, deviation_mm
+from abbe.models.geometry.jacobian import squareness_motions
+from abbe.models.machine import Machine
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability import motions_of
+from abbe.models.solvers.observability_parameters import observable_motions
+from abbe.models.uncertainty.combined import variances
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.volumetric import rigid_design, volume_grid
 
 NODES = 7
 RANK_TOLERANCE = 1e-7

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.compensation.sign_proof import FLOOR_MM, SHARE
-from models.compensation.tables import NineTables
-from models.machine import AXES
+from abbe.models.arrays import F1, F2
+from abbe.models.compensation.sign_proof import FLOOR_MM, SHARE
+from abbe.models.compensation.tables import NineTables
+from abbe.models.machine import AXES
 
 TOLD = 3
 SEEN_MM = 0.003

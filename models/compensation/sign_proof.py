@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.compensation.tables import NineTables
-from models.machine import AXES
+from abbe.models.arrays import F1, F2
+from abbe.models.compensation.tables import NineTables
+from abbe.models.machine import AXES
 
 FLOOR_MM, SHARE = 0.002, 0.2
 """A response may be off by the larger of these two: absolutely, and as a share of the step (reliability.md 3.2, PROBE)."""

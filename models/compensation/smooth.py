@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.polynomial import Legendre
 
-from models.arrays import F1, F2
-from models.compensation.tables import NineTables
+from abbe.models.arrays import F1, F2
+from abbe.models.compensation.tables import NineTables
 
 WITHIN_MM = 5e-4
 """A table that no polynomial of these orders meets within this at every position is of another kind: pitch errors, or made by hand."""

@@ -14,9 +14,9 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F2
-from models.compensation.correction import Correction
-from models.compensation.tables import NineTables
+from abbe.models.arrays import F2
+from abbe.models.compensation.correction import Correction
+from abbe.models.compensation.tables import NineTables
 
 Lookup = Literal["command", "corrected"]
 ITERATIONS = 6

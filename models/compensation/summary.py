@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1
-from models.compensation.additive import main_effect
-from models.machine import AXES
-from models.solvers.joint import JointSolution
-from models.solvers.priors import U_WAVELENGTH
-from models.uncertainty.combined import variances
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.arrays import F1
+from abbe.models.compensation.additive import main_effect
+from abbe.models.machine import AXES
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.priors import U_WAVELENGTH
+from abbe.models.uncertainty.combined import variances
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 SCALE_NOTE = "at the machine's temperature while it was measured"
 """What every printed scale has to say: no material temperature correction is made."""
@@ -39,9 +39,10 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
     """Mean scale error of X, Y, Z (slope of EXX, EYY, EZZ) and mean squareness C0Y, B0Z, A0Z over the volume.
 
     Scales hold at the temperature the machine had while it was measured: nothing is reduced to 20 degree C, and 1 K of a steel machine is
-    about 11 um/m; so the uncertainty of the scales' temperature is not in. All other sources are (`models.uncertainty.sources`), orders
-    above the chosen one included. Least-squares slopes over equidistant positions. The laser's wavelength is an unknown of every solution
-    with a laser (`laser_scale`) and so within its sources; without one, scales carry its uncertainty all the same: none is known better.
+    about 11 um/m; so the uncertainty of the scales' temperature is not in. All other sources are (`abbe.models.uncertainty.sources`),
+    orders above the chosen one included. Least-squares slopes over equidistant positions. The laser's wavelength is an unknown of every
+    solution with a laser (`laser_scale`) and so within its sources; without one, scales carry its uncertainty all the same: none is known
+    better.
     """
     sources = error_sources(solution, replace(Inputs().as_measured(), u_wavelength=0.0))  # the wavelength is in ``common``
     slopes = {}

@@ -1,7 +1,7 @@
 """Nine one-axis tables: correction of each axis as a function of each axis, on the controller's grid.
 
-The best nine tables for a deviation field are its best sum of functions of one axis (`models.compensation.additive`). What angles do at a
-distance that depends on two axes at once is left over; a 3-D grid (`models.compensation.grid`) takes it.
+The best nine tables for a deviation field are its best sum of functions of one axis (`abbe.models.compensation.additive`). What angles do
+at a distance that depends on two axes at once is left over; a 3-D grid (`abbe.models.compensation.grid`) takes it.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.compensation.additive import additive_design
-from models.geometry.bases import Term
-from models.geometry.chain import design
-from models.machine import AXES, Machine
-from models.solvers.joint import JointSolution
-from models.uncertainty.budget import budget_over
-from models.uncertainty.combined import variances
-from models.uncertainty.frame import RigidFree
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import ErrorSources, error_sources
-from models.volumetric import remove_rigid, rigid_design, volume_grid
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.compensation.additive import additive_design
+from abbe.models.geometry.bases import Term
+from abbe.models.geometry.chain import design
+from abbe.models.machine import AXES, Machine
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.uncertainty.budget import budget_over
+from abbe.models.uncertainty.combined import variances
+from abbe.models.uncertainty.frame import RigidFree
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class NineTables:
     """Correction added to the command: ``correction_mm[a][:, i]`` for output i at ``position_mm[a]`` of input axis a.
 
     ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the first position, from all sources (noise,
-    priors, orders above the chosen one, stated inputs; `models.uncertainty.sources`), in the frame in which the deviation field has no
+    priors, orders above the chosen one, stated inputs; `abbe.models.uncertainty.sources`), in the frame in which the deviation field has no
     rigid motion over the volume (docs/conventions.md, "Frame"). The slope of a cross table (Y and Z over X, ...) is partly a rotation of
     the whole frame, which no measurement of this kind sees, which moves no distance between two points of a part, and which the
     corrections leave as the model happens to place it: compare tables only after taking the best-fit rotation out.

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.discovery.answer import Agreement, Unjudged
-from models.discovery.case import CaseRun
-from models.discovery.noise import lone, unscaled
-from models.discovery.prediction import Solved, free_columns, left_over
-from models.discovery.scene import Scene
-from models.probability import f_above
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.answer import Agreement, Unjudged
+from abbe.models.discovery.case import CaseRun
+from abbe.models.discovery.noise import lone, unscaled
+from abbe.models.discovery.prediction import Solved, free_columns, left_over
+from abbe.models.discovery.scene import Scene
+from abbe.models.probability import f_above
 
 LAGS = 10
 """Memory that is left in whitened noise is looked for over so many readings: the memory usual for instruments (`noise.MEMORY`) has faded to

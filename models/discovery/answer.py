@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 Verdict = Literal["none", "named", "unknown"]
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.case import Case
-from models.effects.path import Path
-from models.geometry.bases import Term, smooth_terms, term_values
-from models.machine import Machine
-from models.solvers.observations import RunData
-from models.solvers.observe import Setup, linearise, predict
-from models.solvers.observe_kinematics import LOST, Places, with_tool
-from models.solvers.observe_setup import bar_length_name
-from models.solvers.priors import Priors, smooth_shapes, term_prior_sd
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.case import Case
+from abbe.models.effects.path import Path
+from abbe.models.geometry.bases import Term, smooth_terms, term_values
+from abbe.models.machine import Machine
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import Setup, linearise, predict
+from abbe.models.solvers.observe_kinematics import LOST, Places, with_tool
+from abbe.models.solvers.observe_setup import bar_length_name
+from abbe.models.solvers.priors import Priors, smooth_shapes, term_prior_sd
 
 ORDER = 14
 """Highest Legendre order of each error motion. With 7 coefficients nulls look like discoveries, with 10 to 18 not (discovery.md 5)."""
@@ -32,7 +32,7 @@ class Baseline:
 
     Attributes
     ----------
-    setup : set-up unknowns as `models.solvers.observe` takes them. parts : array, shape (theirs, ours): theirs from ours.
+    setup : set-up unknowns as `abbe.models.solvers.observe` takes them. parts : array, shape (theirs, ours): theirs from ours.
     names, prior_sd : of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves all radii, so that it is too long by
         the same ``bar_length`` with all of them.
     root : array, shape (p, p)
@@ -57,7 +57,7 @@ class Baseline:
         return np.concatenate([theta[:n], np.zeros(LOST), self.parts @ theta[n:]])
 
     def read(self, run: RunData, theta: F1) -> F1:
-        """Reading of a run, mm, shape (n,): exact (`models.solvers.observe`), with a mirror that turns with the tool."""
+        """Reading of a run, mm, shape (n,): exact (`abbe.models.solvers.observe`), with a mirror that turns with the tool."""
         value = predict(self.machine, self.terms, run, self.setup, self._full(theta))
         return value + self._turning(run) @ theta[: len(self.terms)]
 

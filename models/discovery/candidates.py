@@ -9,10 +9,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
-from models.discovery.scene import Scene
-from models.discovery.space import rows_of
-from models.effects.effect import Effect, Form, Values
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.scene import Scene
+from abbe.models.discovery.space import rows_of
+from abbe.models.effects.effect import Effect, Form, Values
 
 UNNAMED = "unnamed_"
 """Names that begin so mean: something is missing, but it is nothing that the catalogue knows."""

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1
-from models.effects.path import Path
-from models.machine import Machine
-from models.solvers.observations import RunData
+from abbe.models.arrays import F1
+from abbe.models.effects.path import Path
+from abbe.models.machine import Machine
+from abbe.models.solvers.observations import RunData
 
 Role = Literal["identify", "holdout", "sealed"]
 

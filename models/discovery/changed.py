@@ -1,9 +1,9 @@
 """What has changed in a machine since a solution: which of its error motions, by how much, judged by runs that did not choose it.
 
 A known machine that drifts lacks no physical effect: its model is whole and its numbers are old. So the solution from before is held
-against new runs, with its own covariance, and error motions compete for what is left: six linear ones (scales, squareness) and the shape
-of each of the 21. One that makes the readings more likely by more than its price is taken in, and the others are asked again; one that
-those taken in later make needless goes (marginal likelihood of a linear normal model, as `models.solvers.components`; price: logarithm of
+against new runs, with its own covariance, and error motions compete for what is left: six linear ones (scales, squareness) and the shape of
+each of the 21. One that makes the readings more likely by more than its price is taken in, and the others are asked again; one that those
+taken in later make needless goes (marginal likelihood of a linear normal model, as `abbe.models.solvers.components`; price: logarithm of
 the number of candidates). To prove it, one half of the set-ups chooses and the other judges, both ways round. Set-ups and lost motion are
 refitted throughout: a new cup is no change of the machine.
 """
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.discovery.changed_bench import Bench, Chosen
-from models.solvers.engine import Problem, build, expected_noise, settle
-from models.solvers.information import Sums, total
-from models.solvers.observations import RunData
-from models.solvers.priors import Priors
-from models.uncertainty.known_field import KnownField
+from abbe.models.discovery.changed_bench import Bench, Chosen
+from abbe.models.solvers.engine import Problem, build, expected_noise, settle
+from abbe.models.solvers.information import Sums, total
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import Priors
+from abbe.models.uncertainty.known_field import KnownField
 
 FEWEST_SETUPS = 2
 """Set-ups of each half below which nothing can be judged."""

@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.discovery.changed_evidence import Asked, evidence_of, log_evidence
-from models.geometry.bases import Term, term_values
-from models.machine import AXES
-from models.solvers.engine import Fit, Problem
-from models.solvers.information import Sums
-from models.uncertainty.known_field import KnownField
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.changed_evidence import Asked, evidence_of, log_evidence
+from abbe.models.geometry.bases import Term, term_values
+from abbe.models.machine import AXES
+from abbe.models.solvers.engine import Fit, Problem
+from abbe.models.solvers.information import Sums
+from abbe.models.uncertainty.known_field import KnownField
 
 LINEAR = ("EXX", "EYY", "EZZ", "C0Y", "B0Z", "A0Z")
 LINEAR_SIZES = (3e-6, 10e-6, 30e-6, 100e-6, 300e-6)
 """Sizes of a change of scale or squareness that are tried, rad."""
 SHAPE_SIZES = (0.1, 0.3, 1.0, 3.0)
-"""Sizes of a change of a motion's shape that are tried, in documented sizes of the motion itself (`models.solvers.priors`)."""
+"""Sizes of a change of a motion's shape that are tried, in documented sizes of the motion itself (`abbe.models.solvers.priors`)."""
 ENOUGH = 3.0
 """Evidence (natural logarithm) after its price from which on a change is told: twenty times as likely with it."""
 NEAR = 3.0
@@ -167,7 +167,7 @@ class Bench:
         return self._beside([t if t.asked.several else replace(t, size=max(LINEAR_SIZES)) for t in (*others, *linear)])
 
     def size(self, chosen: Chosen, asked: Asked) -> tuple[float, float]:
-        """Value of a change and its standard uncertainty (`models.discovery.changed.Change`), all that is linear free beside it."""
+        """Value of a change and its standard uncertainty (`abbe.models.discovery.changed.Change`), all that is linear free beside it."""
         coefficients, covariance = self._coefficients(chosen, asked)
         if not asked.several:
             direction = self.known.linear({asked.name: 1.0})

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 
 @dataclass(frozen=True)

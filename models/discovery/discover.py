@@ -6,18 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.discovery.answer import Discovery
-from models.discovery.baseline import baseline_of
-from models.discovery.candidates import Pick
-from models.discovery.case import Case
-from models.discovery.finding import finding
-from models.discovery.prediction import predictions, solve
-from models.discovery.rivals import Rival, rivals_of
-from models.discovery.scatter import scattered, without
-from models.discovery.scene import Scene, linearised, quieted, scene_of
-from models.discovery.selection import Contest, Found, dropped, selected, weighed
-from models.discovery.variance import VarianceFinding
-from models.effects.effect import Effect
+from abbe.models.discovery.answer import Discovery
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.candidates import Pick
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.finding import finding
+from abbe.models.discovery.prediction import predictions, solve
+from abbe.models.discovery.rivals import Rival, rivals_of
+from abbe.models.discovery.scatter import scattered, without
+from abbe.models.discovery.scene import Scene, linearised, quieted, scene_of
+from abbe.models.discovery.selection import Contest, Found, dropped, selected, weighed
+from abbe.models.discovery.variance import VarianceFinding
+from abbe.models.effects.effect import Effect
 
 Progress = Callable[[str, float], None]
 Search = tuple[Scene, Contest, list[Found], tuple[VarianceFinding, ...]]

@@ -8,25 +8,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.agreement import agreements
-from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict, Where
-from models.discovery.generic import is_unnamed
-from models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
-from models.discovery.next_test import Suspect, propose
-from models.discovery.next_unnamed import propose_unnamed
-from models.discovery.prediction import Solved, left_over, predictions
-from models.discovery.residue import residues
-from models.discovery.rivals import EXCLUDED, Rival
-from models.discovery.scene import Scene
-from models.discovery.selection import Found
-from models.discovery.strength import as_plain, shape_of, strength_of, true_to_form
-from models.discovery.unnamed import Structure, lacking, structures, told_of
-from models.discovery.unseen import unseen
-from models.discovery.variance import VarianceFinding
-from models.discovery.where import locate
-from models.discovery.where_signal import where_of_signal
-from models.probability import chi2_above
+from abbe.models.arrays import F1
+from abbe.models.discovery.agreement import agreements
+from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict, Where
+from abbe.models.discovery.generic import is_unnamed
+from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
+from abbe.models.discovery.next_test import Suspect, propose
+from abbe.models.discovery.next_unnamed import propose_unnamed
+from abbe.models.discovery.prediction import Solved, left_over, predictions
+from abbe.models.discovery.residue import residues
+from abbe.models.discovery.rivals import EXCLUDED, Rival
+from abbe.models.discovery.scene import Scene
+from abbe.models.discovery.selection import Found
+from abbe.models.discovery.strength import as_plain, shape_of, strength_of, true_to_form
+from abbe.models.discovery.unnamed import Structure, lacking, structures, told_of
+from abbe.models.discovery.unseen import unseen
+from abbe.models.discovery.variance import VarianceFinding
+from abbe.models.discovery.where import locate
+from abbe.models.discovery.where_signal import where_of_signal
+from abbe.models.probability import chi2_above
 
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
 """A name with less evidence than this share of another's, at the same readings, is what the other's formula leaves of its true form."""

@@ -9,15 +9,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.answer import Where
-from models.discovery.case import Case
-from models.discovery.generic_scan import PERIODS_S, PITCHES_MM, Seen, bumps, bursts, periods, pitches, step_moments
-from models.discovery.generic_shapes import SIGNALS, lobe_latitude, place_at
-from models.discovery.where_signal import where_of_signal
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path
-from models.machine import AXES
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Where
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.generic_scan import PERIODS_S, PITCHES_MM, Seen, bumps, bursts, periods, pitches, step_moments
+from abbe.models.discovery.generic_shapes import SIGNALS, lobe_latitude, place_at
+from abbe.models.discovery.where_signal import where_of_signal
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path
+from abbe.models.machine import AXES
 
 PREFIX = "unnamed_"
 COMPONENTS = tuple(f"E{d}{a}" for a in AXES for d in AXES)

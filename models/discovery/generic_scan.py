@@ -14,8 +14,8 @@ from scipy import fft
 from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 
-from models.arrays import F1, F2
-from models.effects.path import Path
+from abbe.models.arrays import F1, F2
+from abbe.models.effects.path import Path
 
 PERIODS_S = (18.0, 110.0)
 PITCHES_MM = (6.0, 60.0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.effects.effect import Signal, Values
-from models.effects.path import Path, Places
-from models.functions.legendre import legendre_values
-from models.machine import AXES
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.effects.effect import Signal, Values
+from abbe.models.effects.path import Path, Places
+from abbe.models.functions.legendre import legendre_values
+from abbe.models.machine import AXES
 
 UM = 1e-3
 """Columns are mm per micrometre."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.case import Case, CaseRun
-from models.effects.path import Path, Places, driven, standing
-from models.machine import AXES, Machine
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.effects.path import Path, Places, driven, standing
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 
 BAR_MIN, LASER_MIN, LINE_MIN, TOOL_MIN, WAIT_MIN, LENGTH_MIN = 10.0, 25.0, 20.0, 15.0, 120.0, 10.0
 """Minutes to set up: ball-bar; laser on one diagonal; laser or angular interferometer on one axis; another tool; a late repeat's wait; a

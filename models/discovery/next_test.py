@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.discovery.answer import NextTest
-from models.discovery.baseline import Baseline, baseline_of
-from models.discovery.case import Case, CaseRun
-from models.discovery.next_offers import Offer, offers
-from models.effects.effect import Effect, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.answer import NextTest
+from abbe.models.discovery.baseline import Baseline, baseline_of
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.discovery.next_offers import Offer, offers
+from abbe.models.effects.effect import Effect, Values
+from abbe.models.effects.path import Path, Places
 
 THIN = 100
 """Old runs count with so many readings each; a thinned reading stands for those left out."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.discovery.answer import NextTest
-from models.discovery.case import Case
-from models.discovery.generic import PREFIX
-from models.discovery.next_offers import BAR_MIN, LASER_MIN, RUN_MIN, WAIT_MIN, offers
-from models.discovery.unnamed import Structure
-from models.effects.path import Path
+from abbe.models.discovery.answer import NextTest
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.generic import PREFIX
+from abbe.models.discovery.next_offers import BAR_MIN, LASER_MIN, RUN_MIN, WAIT_MIN, offers
+from abbe.models.discovery.unnamed import Structure
+from abbe.models.effects.path import Path
 
 REPEATS = 3
 """Runs of a repeat in one set-up."""
@@ -77,7 +77,7 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
 
     Parameters
     ----------
-    structures : by evidence (`models.discovery.unnamed.structures`).
+    structures : by evidence (`abbe.models.discovery.unnamed.structures`).
 
     Returns
     -------

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, signal
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 SHARE, MEMORY = 0.1, 0.75
 """Share of the variance that is remembered from reading to reading, and how much of it; what is assumed before the readings say (typical of

@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.discovery.candidates import Pick, with_values
-from models.discovery.case import CaseRun
-from models.discovery.scene import Scene, ordered
-from models.effects.effect import Signal
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.candidates import Pick, with_values
+from abbe.models.discovery.case import CaseRun
+from abbe.models.discovery.scene import Scene, ordered
+from abbe.models.effects.effect import Signal
 
 STEPS = 2
 LONGEST_STEP = 0.3

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy import optimize
 
-from models.arrays import F2
-from models.discovery.candidates import Pick, gain_of, with_values
-from models.discovery.scene import Scene
-from models.effects.effect import Parameter
+from abbe.models.arrays import F2
+from abbe.models.discovery.candidates import Pick, gain_of, with_values
+from abbe.models.discovery.scene import Scene
+from abbe.models.effects.effect import Parameter
 
 SWEEPS = 2
 EVALUATIONS = 9

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 P_LIMIT = 0.005
 """A drift is claimed where noise gives as much in fewer than so many tests."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from models.discovery.answer import NamedEffect
+from abbe.models.discovery.answer import NamedEffect
 
 RESIDUE_SHARE = 0.001
 """A name with less evidence than this share of the largest is nothing that can be told from what the largest one's formula leaves."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from models.arrays import F2
-from models.discovery.candidates import Pick, gain_of
-from models.discovery.refine import refined
-from models.discovery.selection import FORM_LEAST, Contest, Found, others
+from abbe.models.arrays import F2
+from abbe.models.discovery.candidates import Pick, gain_of
+from abbe.models.discovery.refine import refined
+from abbe.models.discovery.selection import FORM_LEAST, Contest, Found, others
 
 EXCLUDED = 12.0
 """A rival that explains less by this much chi-square, after its price, is excluded."""

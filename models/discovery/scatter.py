@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.candidates import Pick
-from models.discovery.noise import unscaled
-from models.discovery.prediction import solve
-from models.discovery.scene import Scene, Tangent, taken_out
-from models.discovery.variance import VarianceFinding, extra_variance
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.candidates import Pick
+from abbe.models.discovery.noise import unscaled
+from abbe.models.discovery.prediction import solve
+from abbe.models.discovery.scene import Scene, Tangent, taken_out
+from abbe.models.discovery.variance import VarianceFinding, extra_variance
 
 GATE = 1.3
 """Readings at less than this times the speed at which an axis sticks do not count for the mean."""

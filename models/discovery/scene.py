@@ -9,13 +9,13 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
-from models.discovery.baseline import Baseline
-from models.discovery.case import Case, CaseRun
-from models.discovery.noise import Colour, level, lone, unscaled
-from models.discovery.space import ROWS, Space
-from models.effects.effect import Signal, Values
-from models.effects.path import Path
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.baseline import Baseline
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.discovery.noise import Colour, level, lone, unscaled
+from abbe.models.discovery.space import ROWS, Space
+from abbe.models.effects.effect import Signal, Values
+from abbe.models.effects.path import Path
 
 FIRST_NOISE = {"bar": Colour(4e-4), "laser": Colour(2.5e-4)}
 STEPS = 2

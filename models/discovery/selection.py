@@ -8,12 +8,12 @@ from itertools import combinations
 
 import numpy as np
 
-from models.arrays import F2
-from models.discovery.candidates import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of
-from models.discovery.generic import generic_rivals
-from models.discovery.refine import refined
-from models.discovery.scene import Scene
-from models.effects.effect import Effect
+from abbe.models.arrays import F2
+from abbe.models.discovery.candidates import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of
+from abbe.models.discovery.generic import generic_rivals
+from abbe.models.discovery.refine import refined
+from abbe.models.discovery.scene import Scene
+from abbe.models.effects.effect import Effect
 
 MOST_EFFECTS = 5
 SHORTLIST = 6
@@ -21,8 +21,8 @@ THRESHOLD = 4.0
 """Paid by every new name on top of its parameters and of how many names were tried."""
 UNNAMED_PRICE = 6.0
 VARIANT_PRICE = 4.0
-"""Paid by a name that holds a simpler one beside its own freedom (`models.effects.effect.Effect.variant_of`): as much as for being new, for
-it says something new of what the simpler one says already."""
+"""Paid by a name that holds a simpler one beside its own freedom (`abbe.models.effects.effect.Effect.variant_of`): as much as for being
+new, for it says something new of what the simpler one says already."""
 FORM_LEAST = 0.0002
 """... and explains at least this share of what the effect itself does; less would change its strength more than it is worth."""
 NEARLY = 0.93
@@ -30,7 +30,7 @@ NEARLY = 0.93
 HOPELESS = 0.5
 """A start that gains less than this share of the best name so far is not refined."""
 UNNAMED_LABELS = 40
-"""So many kinds of structure without a name are tried (`models.discovery.generic`)."""
+"""So many kinds of structure without a name are tried (`abbe.models.discovery.generic`)."""
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
 """A freedom of form of an effect already there pays this share of the price of its parameters, and this on top."""
 

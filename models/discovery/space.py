@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 ROWS = 2048
 """Readings that are looked at together: a second matrix of all unknowns at all readings is never made."""

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.candidates import Pick
-from models.discovery.scene import Scene
-from models.effects.effect import Effect, Family
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.candidates import Pick
+from abbe.models.discovery.scene import Scene
+from abbe.models.effects.effect import Effect, Family
 
 TRUE_TO_FORM: dict[Family, float] = {"drive": 0.03, "structure": 0.03, "thermal": 0.12, "instrument": 0.05, "geometry": 0.1}
 """No machine is true to a formula: standard uncertainty of a strength from its form, relative, by family. A step is a step; what warms up

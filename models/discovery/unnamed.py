@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from models.discovery.answer import Where
-from models.discovery.case import Case
-from models.discovery.generic import PREFIX, is_unnamed, where_of
-from models.discovery.selection import Found
-from models.discovery.variance import VarianceFinding
+from abbe.models.discovery.answer import Where
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.generic import PREFIX, is_unnamed, where_of
+from abbe.models.discovery.selection import Found
+from abbe.models.discovery.variance import VarianceFinding
 
 TITLES = {"unnamed_burst": "short disturbance of the reading", "unnamed_place": "readings of the laser off near one place"}
 """Of the structures of the scatter."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.answer import Unseen
-from models.discovery.case import Case
-from models.discovery.next_offers import one_feed, one_radius, one_way
-from models.effects.path import Path
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Unseen
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.next_offers import one_feed, one_radius, one_way
+from abbe.models.effects.path import Path
 
 LATE_S = 3600.0
 """A repeat this long after the first time is a late one: axes and spindle warm up within 20 minutes to two hours (effects.md, thermal)."""

@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.answer import Where
-from models.discovery.noise import Colour
-from models.discovery.variance_mixture import contaminated
-from models.discovery.variance_places import NEAR_MM, bound_to_places
-from models.discovery.variance_rough import gated_roughness, loud_windows
-from models.discovery.variance_spectrum import fast, line_of_axis
-from models.discovery.where_signal import where_of_signal
-from models.effects.path import Path
-from models.machine import AXES
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Where
+from abbe.models.discovery.noise import Colour
+from abbe.models.discovery.variance_mixture import contaminated
+from abbe.models.discovery.variance_places import NEAR_MM, bound_to_places
+from abbe.models.discovery.variance_rough import gated_roughness, loud_windows
+from abbe.models.discovery.variance_spectrum import fast, line_of_axis
+from abbe.models.discovery.where_signal import where_of_signal
+from abbe.models.effects.path import Path
+from abbe.models.machine import AXES
 
 UM = 1e3
 NAME_PRICE = 7.0

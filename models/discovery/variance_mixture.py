@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 RATES = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.065])
 SIZES = np.geomspace(1.5, 60.0, 24)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 NEAR_MM, LOUD = 30.0, 3.0
 """A reading so near tells of the same place; one counts up to so many standard deviations."""

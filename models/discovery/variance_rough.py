@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
-from models.arrays import F1, F2
-from models.effects.path import Path
+from abbe.models.arrays import F1, F2
+from abbe.models.effects.path import Path
 
 GATES_MM_S = (0.7, 0.9, 1.15, 1.45, 1.8, 2.25, 2.8, 3.5, 4.4)
 REFINED = 2

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from models.arrays import F1
-from models.discovery.noise import Colour
-from models.effects.path import Path
-from models.probability import chi2_above
+from abbe.models.arrays import F1
+from abbe.models.discovery.noise import Colour
+from abbe.models.effects.path import Path
+from abbe.models.probability import chi2_above
 
 HERTZ = (2.0, 75.0)
 PADDING = 4

@@ -12,12 +12,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.answer import Significance, Where
-from models.discovery.where_signal import where_of_signal
-from models.effects.path import Path
-from models.machine import AXES
-from models.probability import chi2_above, normal_above
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Significance, Where
+from abbe.models.discovery.where_signal import where_of_signal
+from abbe.models.effects.path import Path
+from abbe.models.machine import AXES
+from abbe.models.probability import chi2_above, normal_above
 
 BLOCKS = 12
 """Readings of a run are summed in so many blocks, of one size."""

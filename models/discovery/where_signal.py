@@ -8,10 +8,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.answer import Where
-from models.effects.path import Path
-from models.machine import AXES
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.answer import Where
+from abbe.models.effects.path import Path
+from abbe.models.machine import AXES
 
 SHARE = 0.9
 """Runs and times that hold this share of a signal are where it lives."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F2
-from models.effects.columns import AIR_PER_K, NO_KEY, amplitude, of_kind, rise_of, spread
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path
+from abbe.models.arrays import F2
+from abbe.models.effects.columns import AIR_PER_K, NO_KEY, amplitude, of_kind, rise_of, spread
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path
 
 
 def _waves(path: Path, period_s: float) -> F2:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F3
-from models.effects.columns import PPM, of_body, rms
-from models.effects.effect import Effect, Form, Signal
-from models.effects.path import Path, Places
-from models.effects.smooth import WITH_CONSTANT, smooth
-from models.machine import AXES, levers_mm
+from abbe.models.arrays import F3
+from abbe.models.effects.columns import PPM, of_body, rms
+from abbe.models.effects.effect import Effect, Form, Signal
+from abbe.models.effects.path import Path, Places
+from abbe.models.effects.smooth import WITH_CONSTANT, smooth
+from abbe.models.machine import AXES, levers_mm
 
 KEYS = tuple(f"E{turn}{axis}" for axis in AXES for turn in "ABC")
 

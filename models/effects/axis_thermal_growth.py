@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from models.arrays import F1, F3
-from models.effects.columns import AXIS_KEYS, CAMPAIGN_S, STEEL_PER_K, along, axis_of, first, of_path, warmth, with_sensor
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F1, F3
+from abbe.models.effects.columns import AXIS_KEYS, CAMPAIGN_S, STEEL_PER_K, along, axis_of, first, of_path, warmth, with_sensor
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path, Places
 
 SHAPE = (
     Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "effects.md 3: 20-120 min", (900.0, 2500.0, 7000.0)),

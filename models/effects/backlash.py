@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F3
-from models.effects.columns import AXIS_KEYS, UM, along, axis_of, before_first_turn, first, of_machine, play, turn_between, wind_up
-from models.effects.effect import Effect, Form, Values
-from models.effects.path import Places
+from abbe.models.arrays import F3
+from abbe.models.effects.columns import AXIS_KEYS, UM, along, axis_of, before_first_turn, first, of_machine, play, turn_between, wind_up
+from abbe.models.effects.effect import Effect, Form, Values
+from abbe.models.effects.path import Places
 
 WIND_UP_MM = (0.05, 0.15, 0.5, 2.0)
 """Travel over which screw, coupling and guide wind up before the carriage follows; far below 0.05 mm the step is a step."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F3
-from models.effects.columns import AXIS_KEYS, UM, VISITED, along, axis_of, first, of_path, play, share_of_stroke, turn_between, wind_up
-from models.effects.effect import Effect, Form, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F3
+from abbe.models.effects.columns import AXIS_KEYS, UM, VISITED, along, axis_of, first, of_path, play, share_of_stroke, turn_between, wind_up
+from abbe.models.effects.effect import Effect, Form, Values
+from abbe.models.effects.path import Path, Places
 
 WIND_UP_MM = (0.05, 0.3)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F2
-from models.effects.columns import NO_KEY, STEEL_PER_K, first, of_kind
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path
+from abbe.models.arrays import F2
+from abbe.models.effects.columns import NO_KEY, STEEL_PER_K, first, of_kind
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path
 
 
 def _cooling(path: Path, tau_s: float) -> F2:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from models.effects import (
+from abbe.models.effects import (
     air_refraction,
     angular_error,
     axis_thermal_growth,
@@ -29,7 +29,7 @@ from models.effects import (
     straightness,
     vibration,
 )
-from models.effects.effect import Effect
+from abbe.models.effects.effect import Effect
 
 CATALOGUE: tuple[Effect, ...] = (
     backlash.EFFECT,

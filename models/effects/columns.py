@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.effects.effect import Signal, Values
-from models.effects.path import FAR_MM, Path, Places, run_in, since_reversal
-from models.geometry.chain import travel_sign
-from models.machine import AXES
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.effects.effect import Signal, Values
+from abbe.models.effects.path import FAR_MM, Path, Places, run_in, since_reversal
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import AXES
 
 UM, PPM = 1e-3, 1e-6
 """mm per micrometre; one part per million. Columns are mm per UNIT of the strength, so a coefficient is a strength as people read it."""

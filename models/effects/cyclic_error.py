@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F3
-from models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_machine, of_path, share_of_stroke
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F1, F3
+from abbe.models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_machine, of_path, share_of_stroke
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path, Places
 
 LOW_MM, HIGH_MM, PER_MM = 4.0, 30.0, 0.0024
 """Pitches of screws, and how far apart the starts' wave numbers (1/mm) are: over 300 mm two neighbours differ by less than a turn, so a

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from models.arrays import F1, F2
-from models.effects.path import Path
+from abbe.models.arrays import F1, F2
+from abbe.models.effects.path import Path
 
 Values = Mapping[str, float]
 """Non-linear parameters of an effect by name."""

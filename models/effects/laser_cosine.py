@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.effects.columns import NO_KEY, PPM, per_setup
-from models.effects.effect import Effect, Values
-from models.effects.path import Path
+from abbe.models.arrays import F1, F2
+from abbe.models.effects.columns import NO_KEY, PPM, per_setup
+from abbe.models.effects.effect import Effect, Values
+from abbe.models.effects.path import Path
 
 
 def scaled(path: Path) -> F2:

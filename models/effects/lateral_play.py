@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F3
-from models.effects.columns import LATERAL_KEYS, UM, VISITED, along, axis_of, direction_of, first, of_machine, of_path, share_of_stroke
-from models.effects.effect import Effect, Form, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F3
+from abbe.models.effects.columns import LATERAL_KEYS, UM, VISITED, along, axis_of, direction_of, first, of_machine, of_path, share_of_stroke
+from abbe.models.effects.effect import Effect, Form, Values
+from abbe.models.effects.path import Path, Places
 
 SETTLING_MM = (0.1, 0.5, 3.0)
 

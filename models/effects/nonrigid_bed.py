@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F3
-from models.effects.columns import LATERAL_KEYS, UM, along, axis_of, direction_of, first, of_path, share_of_stroke, third_axis
-from models.effects.effect import Effect, Form, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F1, F3
+from abbe.models.effects.columns import LATERAL_KEYS, UM, along, axis_of, direction_of, first, of_path, share_of_stroke, third_axis
+from abbe.models.effects.effect import Effect, Form, Values
+from abbe.models.effects.path import Path, Places
 
 
 def _shares(path: Path, at: Places, key: str) -> tuple[F1, F1]:

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from models.arrays import F1, F2, F3
-from models.geometry.chain import REST_MM, travel_sign
-from models.machine import Machine
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.chain import REST_MM, travel_sign
+from abbe.models.machine import Machine
 
 Kind = Literal["bar", "laser"]
 FAR_MM = 1e9

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from models.effects.columns import AXIS_KEYS, axis_of, rms
-from models.effects.effect import Effect
-from models.effects.smooth import WITH_LINE, finer_shifts, shifts
+from abbe.models.effects.columns import AXIS_KEYS, axis_of, rms
+from abbe.models.effects.effect import Effect
+from abbe.models.effects.smooth import WITH_LINE, finer_shifts, shifts
 
 EFFECT = Effect(
     name="positioning_nonlinear",

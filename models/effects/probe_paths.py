@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.effects.path import Kind, Path, driven, standing
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import diagonal_ends, step_diagonal
+from abbe.models.arrays import F1, F2
+from abbe.models.effects.path import Kind, Path, driven, standing
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import diagonal_ends, step_diagonal
 
 MACHINE = Machine(
     "w-X-b-Y-Z-t",

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.arrays import F1, F3
-from models.effects.columns import NO_KEY, UM, first, of_body, share_of_stroke
-from models.effects.effect import Effect, Form, Parameter, Signal, Values
-from models.effects.path import Path, Places
-from models.machine import levers_mm, split_chain
+from abbe.models.arrays import F1, F3
+from abbe.models.effects.columns import NO_KEY, UM, first, of_body, share_of_stroke
+from abbe.models.effects.effect import Effect, Form, Parameter, Signal, Values
+from abbe.models.effects.path import Path, Places
+from abbe.models.machine import levers_mm, split_chain
 
 SHAPE = (Parameter("beta", "1", 0.3, 1.0, 0.7, "growth from mid height to the top; above 1 it would hang upwards below", (0.5, 0.8)),)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.effects.columns import AXIS_KEYS, UM, along, axis_of, before_first_turn, first, of_kind
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path
+from abbe.models.arrays import F1, F2
+from abbe.models.effects.columns import AXIS_KEYS, UM, along, axis_of, before_first_turn, first, of_kind
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path
 
 SHAPE = (
     Parameter("d0_mm", "mm", 0.08, 2.0, 0.4, "effects.md 1: 0.15-1 mm", (0.12, 0.3, 0.7, 1.5)),

@@ -9,9 +9,9 @@ from typing import get_args
 
 import numpy as np
 
-from models.arrays import F2
-from models.effects.effect import Effect, Family, Remedy, Signal, Values
-from models.effects.path import Path
+from abbe.models.arrays import F2
+from abbe.models.effects.effect import Effect, Family, Remedy, Signal, Values
+from abbe.models.effects.path import Path
 
 TESTS = ("ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear")
 UNITS = ("um", "urad", "ms", "K", "K/h", "mrad")
@@ -49,7 +49,7 @@ def declaration_faults(effect: Effect) -> tuple[str, ...]:
 
 
 def signal_faults(effect: Effect, paths: tuple[Path, ...]) -> tuple[str, ...]:
-    """What is wrong with an effect's columns, and with those of its forms, on some paths (`models.effects.probe_paths`)."""
+    """What is wrong with an effect's columns, and with those of its forms, on some paths (`abbe.models.effects.probe_paths`)."""
     out: list[str] = []
     for name, signal in (("signal", effect.signal), *((f"form {f.name}", f.signal) for f in effect.forms)):
         for key, values in itertools.product(effect.keys, corners(effect)):

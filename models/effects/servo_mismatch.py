@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from models.arrays import F3
-from models.effects.columns import AXIS_KEYS, along, axis_of, first, of_machine
-from models.effects.effect import Effect, Form, Values
-from models.effects.path import Places
+from abbe.models.arrays import F3
+from abbe.models.effects.columns import AXIS_KEYS, along, axis_of, first, of_machine
+from abbe.models.effects.effect import Effect, Form, Values
+from abbe.models.effects.path import Places
 
 MS = 1e-3
 USUAL_MM_S = 25.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F2
-from models.effects.columns import NO_KEY, UM, per_setup, setup_length
-from models.effects.effect import Effect
-from models.effects.path import Path
+from abbe.models.arrays import F2
+from abbe.models.effects.columns import NO_KEY, UM, per_setup, setup_length
+from abbe.models.effects.effect import Effect
+from abbe.models.effects.path import Path
 
 
 def offset(path: Path) -> F2:

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.effects.columns import UM, along, axis_of, of_path
-from models.effects.effect import Form, Signal, Values
-from models.effects.path import Path, Places
-from models.functions.legendre import legendre_values
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.effects.columns import UM, along, axis_of, of_path
+from abbe.models.effects.effect import Form, Signal, Values
+from abbe.models.effects.path import Path, Places
+from abbe.models.functions.legendre import legendre_values
 
 WITH_LINE = (2.5, 1.5)
 """Rms of a smooth curve over that of its bent part (its line, which scale and squareness swallow, taken away), and its standard

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from models.arrays import F1, F3
-from models.effects.columns import AXIS_KEYS, CAMPAIGN_S, UM, along, axis_of, first, of_machine, warmth, with_sensor
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F1, F3
+from abbe.models.effects.columns import AXIS_KEYS, CAMPAIGN_S, UM, along, axis_of, first, of_machine, warmth, with_sensor
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path, Places
 
 
 def drift(at: Places, key: str, values: Values) -> F3:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from models.arrays import F1, F3
-from models.effects.columns import CAMPAIGN_S, PPM, VISITED, along, first, of_path, share_of_stroke, warmth
-from models.effects.effect import Effect, Form, Parameter, Values
-from models.effects.path import Path, Places
+from abbe.models.arrays import F1, F3
+from abbe.models.effects.columns import CAMPAIGN_S, PPM, VISITED, along, first, of_path, share_of_stroke, warmth
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path, Places
 
 CARRIED = {"XY": (1, 0, -1.0), "ZX": (2, 0, 1.0), "YZ": (2, 1, -1.0)}
 """Axis that travels, direction that deviates, sign of the right-hand rotation C0Y, B0Z, A0Z (docs/conventions.md)."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linprog
 
-from models.arrays import F1, F2
-from models.solvers.observations import reading_noise_mm
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.observations import reading_noise_mm
 
 BINS = 360
 """Angles at which the two paths are compared: the mean of each degree."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from models.evaluation.iso230_2 import Approaches, Positioning, ScaleBudget, Value, positioning
+from abbe.models.evaluation.iso230_2 import Approaches, Positioning, ScaleBudget, Value, positioning
 
 BODY = frozenset({"ppp", "npp", "pnp", "ppn"})
 FACE = frozenset({"pp", "np"})

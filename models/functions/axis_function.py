@@ -7,7 +7,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 
 class AxisFunction(Protocol):

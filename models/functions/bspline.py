@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import interpolate
 
-from models.arrays import F1, F2
-from models.functions.axis_function import frozen_vector, interval, positions, same_size
+from abbe.models.arrays import F1, F2
+from abbe.models.functions.axis_function import frozen_vector, interval, positions, same_size
 
 
 @dataclass(frozen=True, eq=False)

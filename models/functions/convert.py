@@ -10,13 +10,13 @@ from numpy.polynomial import Legendre as NumpyLegendre
 from numpy.polynomial import Polynomial as NumpyPolynomial
 from numpy.typing import ArrayLike
 
-from models.arrays import F1
-from models.functions.axis_function import AxisFunction, interval, positions
-from models.functions.bspline import BSpline, clamped_knots
-from models.functions.legendre import Legendre
-from models.functions.polynomial import Polynomial
-from models.functions.quadrature import nodes
-from models.functions.table import Table
+from abbe.models.arrays import F1
+from abbe.models.functions.axis_function import AxisFunction, interval, positions
+from abbe.models.functions.bspline import BSpline, clamped_knots
+from abbe.models.functions.legendre import Legendre
+from abbe.models.functions.polynomial import Polynomial
+from abbe.models.functions.quadrature import nodes
+from abbe.models.functions.table import Table
 
 Kind = Literal["polynomial", "legendre", "bspline", "table"]
 GRID = 2001

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 
 def straight_line(x: F1, y: F1) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """The 21 error functions as powers of u = position / travel, the form in which the papers' vectors state a machine (math.md 4.6).
 
 Positioning and angles have powers 1..d, straightness 2..d, squareness one value: 18 d - 3 coefficients. Both papers' letters fit: delta_ij
-and eps_ij (Yang), delta_i(J) and alpha_i(J) (Wang); their signs are the affair of `models.notation`.
+and eps_ij (Yang), delta_i(J) and alpha_i(J) (Wang); their signs are the affair of `abbe.models.notation`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2, F3
 
 Kind = Literal["d", "e", "S"]
 SQUARENESS = ((0, 1), (0, 2), (1, 2))

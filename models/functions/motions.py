@@ -9,10 +9,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from models.arrays import F1, F2, F3
-from models.functions.axis_function import AxisFunction, axes_positions
-from models.functions.rules import as_straightness
-from models.machine import AXES
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.functions.axis_function import AxisFunction, axes_positions
+from abbe.models.functions.rules import as_straightness
+from abbe.models.machine import AXES
 
 ROTATIONS = ("A", "B", "C")
 REVERSE = "@reverse"
@@ -59,7 +59,7 @@ class ErrorMotions:
     """Error motions as functions of the axes' positions (``abbe-errors/1``, run-format.md 2).
 
     Squareness acts on the commanded position, counted from AXIS ZERO (as `travel` does in rule G's levers); a count from the stroke's
-    start, as `models.geometry.bases` has it, differs by a constant offset of the whole machine.
+    start, as `abbe.models.geometry.bases` has it, differs by a constant offset of the whole machine.
 
     Parameters
     ----------
@@ -90,14 +90,14 @@ class ErrorMotions:
         object.__setattr__(self, "squareness_rad", MappingProxyType({k: float(v) for k, v in self.squareness_rad.items()}))
 
     def motions(self, axes_mm: ArrayLike, direction: ArrayLike | None = None) -> F3:
-        """Values for `models.geometry.chain.deviation_mm`, squareness times position included.
+        """Values for `abbe.models.geometry.chain.deviation_mm`, squareness times position included.
 
         Parameters
         ----------
         axes_mm : array, shape (n, 3)
             Commanded positions.
         direction : array, shape (n, 3), optional
-            Sign of each axis' last move, as `models.geometry.chain.travel_sign` gives it. Below zero the ``@reverse`` functions hold,
+            Sign of each axis' last move, as `abbe.models.geometry.chain.travel_sign` gives it. Below zero the ``@reverse`` functions hold,
             otherwise, and when left out, the plain ones.
 
         Returns
@@ -172,7 +172,7 @@ class ErrorMotions:
     def straightened(self, stroke_mm: ArrayLike) -> Straightened:
         """Write all slopes of straightness as squareness, nothing lost: the deviation changes by a rigid motion that is handed back.
 
-        The lines are those of `models.functions.rules.as_straightness`.
+        The lines are those of `abbe.models.functions.rules.as_straightness`.
 
         Parameters
         ----------

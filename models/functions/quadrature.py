@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial import legendre
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 
 def nodes(stroke_mm: tuple[float, float], breaks_mm: F1, count: int) -> tuple[F1, F1]:

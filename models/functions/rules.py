@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from models.functions.axis_function import AxisFunction, interval
-from models.functions.line_fit import straight_line
-from models.functions.quadrature import nodes
-from models.functions.table import Table
+from abbe.models.functions.axis_function import AxisFunction, interval
+from abbe.models.functions.line_fit import straight_line
+from abbe.models.functions.quadrature import nodes
+from abbe.models.functions.table import Table
 
 PASSES = 2
 """The first takes the line away, the second what rounding left of it."""
@@ -31,7 +31,7 @@ class Straightness:
     offset_mm : float
         Value of the removed line at axis coordinate zero.
     slope : float
-        Slope of the removed line, mm/mm = rad: it belongs to squareness (`models.functions.motions.ErrorMotions.straightened`).
+        Slope of the removed line, mm/mm = rad: it belongs to squareness (`abbe.models.functions.motions.ErrorMotions.straightened`).
     """
 
     function: AxisFunction

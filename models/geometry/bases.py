@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F2
-from models.functions.legendre import legendre_values
-from models.functions.motions import ROTATIONS, motion_names
-from models.machine import AXES as DIRECTIONS
+from abbe.models.arrays import F2
+from abbe.models.functions.legendre import legendre_values
+from abbe.models.functions.motions import ROTATIONS, motion_names
+from abbe.models.machine import AXES as DIRECTIONS
 
 __all__ = ["DIRECTIONS", "ROTATIONS", "Term", "legendre_values", "motion_names", "smooth_terms", "term_values"]
 

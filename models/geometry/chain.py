@@ -7,10 +7,10 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from models.arrays import F1, F2, F3
-from models.geometry.bases import Term, term_values
-from models.geometry.rotation import RotationForm, cross, turned_by
-from models.machine import AXES, Machine, levers_mm, split_chain
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.bases import Term, term_values
+from abbe.models.geometry.rotation import RotationForm, cross, turned_by
+from abbe.models.machine import AXES, Machine, levers_mm, split_chain
 
 
 def all_chains() -> tuple[str, ...]:

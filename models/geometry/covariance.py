@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from models.arrays import F2
+from abbe.models.arrays import F2
 
 TOLERANCE = 1e-6
 """Of a correlation: covariances come out of files, where six or seven digits are usual."""

@@ -14,9 +14,9 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from models.arrays import F1, F2
-from models.geometry.rotation import turn_vector
-from models.machine import AXES
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.rotation import turn_vector
+from abbe.models.machine import AXES
 
 _ISO_SIGN = np.array([1.0, -1.0, 1.0])
 """θ_XY = +C0Y, θ_XZ = −B0Z, θ_YZ = +A0Z, all obtuse positive (docs/conventions.md)."""

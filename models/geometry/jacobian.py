@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2, F3, F4
-from models.geometry.bases import smooth_terms, term_values
-from models.geometry.chain import checked, checked_axes
-from models.geometry.rotation import cross_matrix, rotation_matrix, turn_vector, turn_vector_slope
-from models.machine import Machine, levers_mm, split_chain
+from abbe.models.arrays import F1, F2, F3, F4
+from abbe.models.geometry.bases import smooth_terms, term_values
+from abbe.models.geometry.chain import checked, checked_axes
+from abbe.models.geometry.rotation import cross_matrix, rotation_matrix, turn_vector, turn_vector_slope
+from abbe.models.machine import Machine, levers_mm, split_chain
 
 SQUARENESS = tuple(t for t in smooth_terms(1) if t.order == 0)
 """C0Y, B0Z, A0Z: which translation of which axis each of them is (docs/conventions.md)."""
@@ -32,7 +32,7 @@ def motion_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = Non
     -------
     array, shape (n, 3 components of the deviation, 3 carriages X Y Z, 6)
         Last index EX EY EZ (mm per mm) and EA EB EC (mm per rad) of that carriage. Rule G is linear: summed over the last two with the
-        motions it is `models.geometry.chain.deviation_mm`, exactly.
+        motions it is `abbe.models.geometry.chain.deviation_mm`, exactly.
 
     Raises
     ------
@@ -99,8 +99,8 @@ def squareness_motions(axes_mm: F2, start_mm: F1 | None = None) -> F4:
     axes_mm : array, shape (n, 3)
     start_mm : array, shape (3,), optional
         Position at which the travel of X, Y, Z is zero. Default: the axis zero, as the papers' matrices write it (−αX). Solutions of this
-        program (`models.geometry.bases.term_values`) count from the start of the stroke, ``machine.stroke_mm[:, 0]``, where positioning
-        and angles are zero too. To first order the choice shifts the whole map by a constant and changes no shape.
+        program (`abbe.models.geometry.bases.term_values`) count from the start of the stroke, ``machine.stroke_mm[:, 0]``, where
+        positioning and angles are zero too. To first order the choice shifts the whole map by a constant and changes no shape.
 
     Returns
     -------

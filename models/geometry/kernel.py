@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.arrays import F1, F2
-from models.geometry.table_machine import Segments, TableMachine
-from models.machine import lever_masks
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.table_machine import Segments, TableMachine
+from abbe.models.machine import lever_masks
 
 BLOCK = 16384
 """Points worked on at a time: ten rows of 128 kB; smaller costs calls, larger falls out of the cache (measured)."""

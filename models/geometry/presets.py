@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from models.notation import pahk, wang, yang
+from abbe.models.notation import pahk, wang, yang
 
 
 @dataclass(frozen=True, slots=True)

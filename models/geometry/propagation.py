@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F2, F3, F4
-from models.functions.motions import ErrorMotions
-from models.geometry.covariance import checked_covariance
-from models.geometry.jacobian import exact_jacobian, motion_jacobian
-from models.machine import Machine
+from abbe.models.arrays import F2, F3, F4
+from abbe.models.functions.motions import ErrorMotions
+from abbe.models.geometry.covariance import checked_covariance
+from abbe.models.geometry.jacobian import exact_jacobian, motion_jacobian
+from abbe.models.machine import Machine
 
 CHUNK = 8192
 """Most points at a time."""
@@ -92,7 +92,7 @@ def deviation_covariance(
     Raises
     ------
     ValueError
-        The matrix does not fit the names or is no covariance (`models.geometry.covariance`), or as in `sensitivity`.
+        The matrix does not fit the names or is no covariance (`abbe.models.geometry.covariance`), or as in `sensitivity`.
     """
     names, matrix = covariance
     matrix = checked_covariance(matrix, len(names))

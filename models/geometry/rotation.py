@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2, F3
 
 RotationForm = Literal["vector", "zyx", "small"]
 

@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from models.arrays import F1, F2, F3
-from models.functions.motions import PLACES, SQUARENESS
-from models.machine import Machine, levers_mm, split_chain
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.functions.motions import PLACES, SQUARENESS
+from abbe.models.machine import Machine, levers_mm, split_chain
 
 Positions = Callable[[F1], ArrayLike]
 
@@ -64,8 +64,8 @@ class TableMachine:
     tables : 3 arrays, shape (nodes, 6), nodes >= 2
         EX EY EZ (mm) and EA EB EC (rad) of the X, Y, Z carriage at the nodes, ISO signs; as many nodes per axis as one likes.
     squareness_rad : array, shape (3,)
-        C0Y, B0Z, A0Z. They act on the commanded position counted from axis zero, as in `models.functions.motions.ErrorMotions`, and go on
-        outside the tables.
+        C0Y, B0Z, A0Z. They act on the commanded position counted from axis zero, as in `abbe.models.functions.motions.ErrorMotions`, and go
+        on outside the tables.
 
     Raises
     ------
@@ -125,7 +125,7 @@ class TableMachine:
     def motions(self, axes_mm: ArrayLike) -> F3:
         """Error motions at commanded positions, the plain way, squareness included.
 
-        For `models.geometry.chain.deviation_mm`, whose result the fast kernels repeat, and for the exact chain.
+        For `abbe.models.geometry.chain.deviation_mm`, whose result the fast kernels repeat, and for the exact chain.
 
         Parameters
         ----------

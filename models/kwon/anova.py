@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from models.arrays import F1
-from models.kwon.errors import SurfaceNotDetermined
+from abbe.models.arrays import F1
+from abbe.models.kwon.errors import SurfaceNotDetermined
 
 ROUNDING = 1000.0 * float(np.finfo(np.float64).eps)
 """Scatter below this share of the root mean square of the values is what the computation itself leaves (2e-13; 3e-11 mm of 150 mm)."""

@@ -1,9 +1,9 @@
 """Kinematic calibration: geometric parameters of every leg from commands and CMM points, the step that Kwon's paper leaves open.
 
 The paper supposes that errors of the kinematic parameters cause the position errors (4.2), and fits a surface to them. Here the 18
-parameters themselves are estimated (R, r, l, thb, thp, dz of three legs, `models.kwon.sensitivity`) together with the unknown placement on
-the CMM, with a stated prior for each: what the points do not carry stays at its prior and is named. Points worse than stated and a prior
-that the points contradict are noticed, widened and said (`models.kwon.weighing`).
+parameters themselves are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.kwon.sensitivity`) together with the unknown
+placement on the CMM, with a stated prior for each: what the points do not carry stays at its prior and is named. Points worse than stated
+and a prior that the points contradict are noticed, widened and said (`abbe.models.kwon.weighing`).
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.kwon.errors import NotSettled
-from models.kwon.frames import best_fit_errors, best_fit_frame, checked_frame, from_frame, rms
-from models.kwon.geometry import LEGS, PER_LEG, Geometry, poses
-from models.kwon.kinematics import forward, inverse
-from models.kwon.readings import FRAME_NAMES, Readings, moved_frame, point_design, whitened
-from models.kwon.sensitivity import parameter_names
-from models.kwon.weighing import PriorTest, Weights, outlying_points, weigh
-from models.solvers.identifiability import Combination, Identifiability, analyse, project_out
-from models.solvers.least_squares import Estimate, solve_map
+from abbe.models.arrays import F1, F2
+from abbe.models.kwon.errors import NotSettled
+from abbe.models.kwon.frames import best_fit_errors, best_fit_frame, checked_frame, from_frame, rms
+from abbe.models.kwon.geometry import LEGS, PER_LEG, Geometry, poses
+from abbe.models.kwon.kinematics import forward, inverse
+from abbe.models.kwon.readings import FRAME_NAMES, Readings, moved_frame, point_design, whitened
+from abbe.models.kwon.sensitivity import parameter_names
+from abbe.models.kwon.weighing import PriorTest, Weights, outlying_points, weigh
+from abbe.models.solvers.identifiability import Combination, Identifiability, analyse, project_out
+from abbe.models.solvers.least_squares import Estimate, solve_map
 
 PARAMETERS = parameter_names()
 TOLERANCE_MM, TOLERANCE_RAD = 0.05, 0.5e-3
@@ -143,9 +143,9 @@ def default_prior() -> F1:
 def calibrate(nominal: Geometry, readings: Readings, prior_sd: F1 | None = None, frame: F2 | None = None) -> Calibration:
     """Most probable parameters, given normal priors about nominal; Gauss-Newton on the exact forward solution.
 
-    Noise and prior are widened where the points demand it (`models.kwon.weighing.weigh`): the noise by what no parameter can follow, all
-    prior standard deviations by one common factor, until the deviations in the carried directions are as large as the prior lets expect.
-    A contradiction (p < 0.01) is in ``prior_test`` and in the statement.
+    Noise and prior are widened where the points demand it (`abbe.models.kwon.weighing.weigh`): the noise by what no parameter can follow,
+    all prior standard deviations by one common factor, until the deviations in the carried directions are as large as the prior lets
+    expect. A contradiction (p < 0.01) is in ``prior_test`` and in the statement.
 
     Parameters
     ----------

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.kwon.errors import CollinearPoints
-from models.kwon.geometry import poses
+from abbe.models.arrays import F1, F2
+from abbe.models.kwon.errors import CollinearPoints
+from abbe.models.kwon.geometry import poses
 
 FLAT = 1e-6
 """sin(theta) below which three points count as lying on a line."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2, F3
 
 LEGS = 3
 THIRDS = np.array([0.0, 2.0 * np.pi / 3.0, 4.0 * np.pi / 3.0])

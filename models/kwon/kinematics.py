@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2, F3
-from models.kwon.errors import (
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.kwon.errors import (
     CollinearSphereCentres,
     Fault,
     LinksHorizontal,
@@ -20,7 +20,7 @@ from models.kwon.errors import (
     refuse,
     refuse_first,
 )
-from models.kwon.geometry import Geometry, poses
+from abbe.models.kwon.geometry import Geometry, poses
 
 Branch = Literal["outside", "folded"]
 """Base joint outside the platform joint (C + root, the machine as built) or inside it (C - root, the folded assembly)."""

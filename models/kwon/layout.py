@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.kwon.geometry import poses
-from models.kwon.planes import Planes, parallel_planes
-from models.kwon.terms import CUBIC, Exponents, regressors
+from abbe.models.arrays import F1, F2
+from abbe.models.kwon.geometry import poses
+from abbe.models.kwon.planes import Planes, parallel_planes
+from abbe.models.kwon.terms import CUBIC, Exponents, regressors
 
 RANK_TOLERANCE = 1e-3
 """Singular values below this share of the largest do not count: a coefficient would be a thousand times worse than a reading."""

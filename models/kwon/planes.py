@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.kwon.terms import CUBIC, Exponents, regressors
+from abbe.models.arrays import F1, F2
+from abbe.models.kwon.terms import CUBIC, Exponents, regressors
 
 MOST_PLANES = 3
 """Four planes carry a full cubic, fewer do not (math.md 6)."""

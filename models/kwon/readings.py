@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.geometry.rotation import rotation_matrix
-from models.kwon.frames import into_frame
-from models.kwon.geometry import Geometry, poses
-from models.kwon.kinematics import forward, jacobian
-from models.kwon.sensitivity import parameter_design
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.rotation import rotation_matrix
+from abbe.models.kwon.frames import into_frame
+from abbe.models.kwon.geometry import Geometry, poses
+from abbe.models.kwon.kinematics import forward, jacobian
+from abbe.models.kwon.sensitivity import parameter_design
 
 FRAME_NAMES = ("shift x", "shift y", "shift z", "turn a", "turn b", "turn c")
 

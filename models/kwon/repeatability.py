@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2, F3
 
 COVERAGE = 2.0
 """The paper states repeatability as 2 standard deviations."""

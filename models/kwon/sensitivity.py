@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F2, F3
-from models.kwon.geometry import PER_LEG, Geometry
-from models.kwon.kinematics import forward, links, solve_links
+from abbe.models.arrays import F2, F3
+from abbe.models.kwon.geometry import PER_LEG, Geometry
+from abbe.models.kwon.kinematics import forward, links, solve_links
 
 
 def parameter_jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> dict[str, F3]:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
-from models.kwon.anova import Anova, anova
-from models.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
-from models.kwon.geometry import poses
-from models.kwon.layout import RANK_TOLERANCE, Layout, centring, layout
-from models.kwon.terms import Exponents, regressors, term_matrix, term_name
-from models.solvers.identifiability import analyse
+from abbe.models.arrays import F1, F2
+from abbe.models.kwon.anova import Anova, anova
+from abbe.models.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
+from abbe.models.kwon.geometry import poses
+from abbe.models.kwon.layout import RANK_TOLERANCE, Layout, centring, layout
+from abbe.models.kwon.terms import Exponents, regressors, term_matrix, term_name
+from abbe.models.solvers.identifiability import analyse
 
 MARGIN = 0.1
 """How far outside the measured range a surface may be asked for by default, as a share of the half width (of +-1 mm: 0.1 mm)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial import polynomial
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 Exponents = tuple[int, int, int]
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special
 
-from models.arrays import F1, F2
-from models.solvers.identifiability import project_out
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.identifiability import project_out
 
 CONFLICT = 0.01
 """Probability below which the deviations contradict the stated prior."""
 UNSEEN = 1e-9
-"""Singular values below this share of the largest leave no trace (as models.solvers.identifiability)."""
+"""Singular values below this share of the largest leave no trace (as abbe.models.solvers.identifiability)."""
 SPATIAL = 3
 """Coordinates of a point."""
 STRAY = 0.01

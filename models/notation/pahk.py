@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.machine import Machine, split_chain
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.machine import Machine, split_chain
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def squareness_slopes(kind: PahkType) -> F3:
 
 
 def motions_from_pahk(kind: PahkType, axes_mm: F2, d_mm: F3, e_rad: F3, squareness_rad: F1) -> F3:
-    """Pahk's functions and squareness at commanded positions as ISO motions for `models.geometry.chain`.
+    """Pahk's functions and squareness at commanded positions as ISO motions for `abbe.models.geometry.chain`.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F2, F3
-from models.machine import Machine
+from abbe.models.arrays import F2, F3
+from abbe.models.machine import Machine
 
 CHAIN = "w-b-X-Y-Z-t"
 """FXYZ: foundation with the workpiece, then X, Y, Z towards the tool."""

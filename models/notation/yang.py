@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.machine import Machine
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.machine import Machine
 
 CHAIN = "w-Z-b-X-Y-t"
 """Carriages from workpiece to tool: workpiece - Z cross slide - foundation - X saddle - Y spindle carrier - tool."""
@@ -112,6 +112,6 @@ def iso_motions(errors: YangErrors, slide_mm: F2) -> F3:
 def iso_squareness(sxy: float, sxz: float, syz: float) -> dict[str, float]:
     """Squareness of the paper under ISO names, rad: C0Y = +Sxy, B0Z = -Sxz, A0Z = +Syz (math.md 1).
 
-    The paper's datum is the Z line, ours the X line: maps agree after a rigid rotation only (`models.volumetric.remove_rigid`).
+    The paper's datum is the Z line, ours the X line: maps agree after a rigid rotation only (`abbe.models.volumetric.remove_rigid`).
     """
     return {"C0Y": sxy, "B0Z": -sxz, "A0Z": syz}

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.notation.pahk import PahkType, pahk_machine
-from models.pahk.random_errors import RandomErrors, parameter_jacobian
-from models.pahk.tables import ParameterTables
-from models.pahk.volume_map import Form, chain_deviation_mm
-from models.paths.lines import DIAGONALS, diagonal_ends
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.notation.pahk import PahkType, pahk_machine
+from abbe.models.pahk.random_errors import RandomErrors, parameter_jacobian
+from abbe.models.pahk.tables import ParameterTables
+from abbe.models.pahk.volume_map import Form, chain_deviation_mm
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends
 
 
 @dataclass(frozen=True)

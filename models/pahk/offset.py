@@ -12,12 +12,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.functions.line_fit import straight_line
-from models.geometry.chain import deviation_mm
-from models.machine import lever_masks
-from models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, parameter_signs
-from models.pahk.tables import ParameterTables, Triple
+from abbe.models.arrays import F1, F2
+from abbe.models.functions.line_fit import straight_line
+from abbe.models.geometry.chain import deviation_mm
+from abbe.models.machine import lever_masks
+from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, parameter_signs
+from abbe.models.pahk.tables import ParameterTables, Triple
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Axes whose lines alpha, beta1, beta2 compare."""

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.geometry.covariance import checked_covariance
-from models.geometry.jacobian import motion_jacobian, squareness_jacobian
-from models.machine import Machine
-from models.notation.pahk import PahkType, pahk_machine, parameter_signs, squareness_slopes
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.covariance import checked_covariance
+from abbe.models.geometry.jacobian import motion_jacobian, squareness_jacobian
+from abbe.models.machine import Machine
+from abbe.models.notation.pahk import PahkType, pahk_machine, parameter_signs, squareness_slopes
 
 PARAMETERS = (*(f"{f}{i}({j})" for f in "dE" for j in "XYZ" for i in "xyz"), "alpha", "beta1", "beta2")
 """Order of the 21 parameters everywhere here: dx(X) dy(X) dz(X) dx(Y) ... Ez(Z), alpha, beta1, beta2."""
@@ -136,7 +136,7 @@ def propagate(jacobian: F3, covariance: F2) -> F3:
     Raises
     ------
     ValueError
-        It is no covariance (`models.geometry.covariance.checked_covariance`).
+        It is no covariance (`abbe.models.geometry.covariance.checked_covariance`).
     """
     c = checked_covariance(covariance, jacobian.shape[-1])
     return np.asarray(jacobian @ c @ np.swapaxes(jacobian, 1, 2))

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models.arrays import F1
-from models.notation.pahk import iso_squareness, motions_from_pahk, pahk_type
-from models.pahk.diagonals import motions_length
-from models.paths.lines import DIAGONALS, diagonal_ends
-from models.solvers.step_diagonal import squareness_contrast
+from abbe.models.arrays import F1
+from abbe.models.notation.pahk import iso_squareness, motions_from_pahk, pahk_type
+from abbe.models.pahk.diagonals import motions_length
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends
+from abbe.models.solvers.step_diagonal import squareness_contrast
 
 
 def squareness_diagonals_mm(type_name: str, volume_mm: F1, squareness_rad: F1) -> dict[str, float]:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.notation.pahk import PahkType, motions_from_pahk
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.notation.pahk import PahkType, motions_from_pahk
 
 Triple = tuple[F2, F2, F2]
 """One table per axis X, Y, Z, each of shape (n_j, 3 directions): the numbers of positions may differ."""
@@ -22,7 +22,7 @@ class ParameterTables:
     positions_mm : three arrays, shape (n_j,)
         Increasing commanded positions of X, Y, Z; at least two of each.
     d_mm : three arrays, shape (n_j, 3)
-        d_x, d_y, d_z of the axis: positioning along it, straightness across, Pahk's signs (`models.notation.pahk.parameter_signs`).
+        d_x, d_y, d_z of the axis: positioning along it, straightness across, Pahk's signs (`abbe.models.notation.pahk.parameter_signs`).
     e_rad : three arrays, shape (n_j, 3)
         E_x, E_y, E_z of the axis, Pahk's signs.
     squareness_rad : array, shape (3,)
@@ -90,6 +90,6 @@ class ParameterTables:
         return out[0], out[1]
 
     def motions(self, kind: PahkType, axes_mm: F2) -> F3:
-        """ISO motions at commanded positions, shape (n, 3 axes, 6), squareness included (`models.notation.pahk.motions_from_pahk`)."""
+        """ISO motions at commanded positions, shape (n, 3 axes, 6), squareness included (`abbe.models.notation.pahk.motions_from_pahk`)."""
         d, e = self.at(axes_mm)
         return motions_from_pahk(kind, np.asarray(axes_mm, dtype=np.float64), d, e, self.squareness_rad)

@@ -7,15 +7,15 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.geometry.chain import deviation_mm, exact_deviation_mm
-from models.machine import Machine
-from models.notation.pahk import PahkType, pahk_machine
-from models.pahk.tables import ParameterTables
-from models.volumetric import volume_grid
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.machine import Machine
+from abbe.models.notation.pahk import PahkType, pahk_machine
+from abbe.models.pahk.tables import ParameterTables
+from abbe.models.volumetric import volume_grid
 
 Form = Literal["first", "vector", "zyx", "small"]
-"""First order (rule G), or the exact chain with one of the rotations of `models.geometry.chain.exact_deviation_mm`."""
+"""First order (rule G), or the exact chain with one of the rotations of `abbe.models.geometry.chain.exact_deviation_mm`."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class VolumetricMap:
 
 
 def chain_deviation_mm(machine: Machine, axes_mm: F2, motions: F3, form: Form = "first") -> F2:
-    """Deviation in one of the four forms; shapes and errors as in `models.geometry.chain.deviation_mm`."""
+    """Deviation in one of the four forms; shapes and errors as in `abbe.models.geometry.chain.deviation_mm`."""
     if form == "first":
         return deviation_mm(machine, axes_mm, motions)
     return exact_deviation_mm(machine, axes_mm, motions, rotation=form)

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 Plane = Literal["XY", "YZ", "ZX"]
 PLANES: tuple[Plane, ...] = ("XY", "YZ", "ZX")

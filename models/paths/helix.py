@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 Law = Literal["angle", "area"]
 FINER, GROWS = 8, 0.2

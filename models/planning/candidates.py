@@ -11,11 +11,11 @@ from itertools import permutations, product
 
 import numpy as np
 
-from models.arrays import F1
-from models.machine import AXES, Machine
-from models.paths.lines import DIAGONALS
-from models.planning.instruments import Instruments
-from models.planning.measurements import CLEARANCE_MM, DiagonalTest, HelixTest, LineTest, Measurement, Point
+from abbe.models.arrays import F1
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.lines import DIAGONALS
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import CLEARANCE_MM, DiagonalTest, HelixTest, LineTest, Measurement, Point
 
 BAR_CLEARANCE_MM = 5.0
 """Hemispheres keep this distance from the ends of the strokes: approach, lost motion and cup offset need some."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F2
-from models.planning.information import BAR_SCALE, LASER_SCALE, scale_temperature_mm2, uncertainty_mm
-from models.planning.search import Chosen, Search
+from abbe.models.arrays import F2
+from abbe.models.planning.information import BAR_SCALE, LASER_SCALE, scale_temperature_mm2, uncertainty_mm
+from abbe.models.planning.search import Chosen, Search
 
 COVERAGE = 2.0
 """U = 2 u."""

@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import DIRECTIONS, Term, smooth_terms
-from models.geometry.chain import design
-from models.machine import AXES, Machine
-from models.planning.instruments import Instruments
-from models.planning.measurements import BAR_VALUES, HelixTest, Measurement, expected_run
-from models.solvers.observations import RunData
-from models.solvers.observe import run_design, setup_unknowns
-from models.solvers.observe_setup import bar_length_name
-from models.solvers.priors import Priors, term_prior_sd
-from models.volumetric import rigid_design, volume_grid
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from abbe.models.geometry.chain import design
+from abbe.models.machine import AXES, Machine
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import BAR_VALUES, HelixTest, Measurement, expected_run
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import run_design, setup_unknowns
+from abbe.models.solvers.observe_setup import bar_length_name
+from abbe.models.solvers.priors import Priors, term_prior_sd
+from abbe.models.volumetric import rigid_design, volume_grid
 
 LASER_SCALE = "laser_scale"
 BAR_SCALE = "bar_temperature"
@@ -126,8 +126,8 @@ def field_rows(what: Problem, share: float, nodes: int) -> F2:
 def scale_temperature_mm2(what: Problem, rows: F2) -> F1:
     """Variance that scales of unknown temperature leave at each node of ``rows`` (`field_rows`), rigid motion free, shape (nodes,), mm^2.
 
-    As in the budget of a solution (`models.uncertainty.sources`): each axis by itself too long by expansion times temperature. No reading
-    tells, because it is about the days after the campaign.
+    As in the budget of a solution (`abbe.models.uncertainty.sources`): each axis by itself too long by expansion times temperature. No
+    reading tells, because it is about the days after the campaign.
     """
     slope = what.tools.inputs.u_scale_temperature_k * what.tools.inputs.scale_expansion_per_k
     out = np.zeros(rows.shape[0])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from models.solvers.priors import U_WAVELENGTH
-from models.uncertainty.inputs import Inputs
+from abbe.models.solvers.priors import U_WAVELENGTH
+from abbe.models.uncertainty.inputs import Inputs
 
 BAR_LENGTHS_MM = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 """Bars that exist as a bar with extensions."""

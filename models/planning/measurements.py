@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.chain import travel_sign
-from models.machine import AXES, Machine
-from models.paths.helix import helix_points
-from models.paths.lines import diagonal_ends, step_diagonal, straight_line
-from models.planning.instruments import Instruments
-from models.solvers.observations import RunData, Test
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
+from abbe.models.planning.instruments import Instruments
+from abbe.models.solvers.observations import RunData, Test
 
 Point = tuple[float, float, float]
 RAPID_MM_MIN = 6000.0

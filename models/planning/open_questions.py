@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from models.planning.information import Problem
-from models.solvers.observability import observability
-from models.solvers.observations import RunData
+from abbe.models.planning.information import Problem
+from abbe.models.solvers.observability import observability
+from abbe.models.solvers.observations import RunData
 
 
 def not_observable(what: Problem, runs: Iterable[RunData]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Plan a campaign: which set-ups, in which order, what each of them buys in micrometres, and what the whole leaves open.
 
 The uncertainties stated here are the posterior (Bayesian Cramer-Rao) bound of the planned readings, the bars' temperature included, and on
-top of it the temperature of the scales, both as in the solution's own budget (`models.uncertainty.inputs`). Not in them: error motions
+top of it the temperature of the scales, both as in the solution's own budget (`abbe.models.uncertainty.inputs`). Not in them: error motions
 above the planner's order, and that noise and typical sizes will be estimated from the readings.
 """
 
@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.machine import AXES, Machine
-from models.planning.candidates import candidates, opening
-from models.planning.goal import COVERAGE, Goal, limit, minutes_needed, shortest
-from models.planning.information import field_rows, problem, scale_temperature_mm2, uncertainty_mm
-from models.planning.instruments import Instruments
-from models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
-from models.planning.open_questions import not_observable
-from models.planning.search import Chosen, Search
-from models.solvers.observations import RunData
-from models.solvers.priors import Priors
+from abbe.models.machine import AXES, Machine
+from abbe.models.planning.candidates import candidates, opening
+from abbe.models.planning.goal import COVERAGE, Goal, limit, minutes_needed, shortest
+from abbe.models.planning.information import field_rows, problem, scale_temperature_mm2, uncertainty_mm
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
+from abbe.models.planning.open_questions import not_observable
+from abbe.models.planning.search import Chosen, Search
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import Priors
 
 __all__ = ["Plan", "Step", "laid_out", "plan_campaign", "uncertainty_mm"]
 

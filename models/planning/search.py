@@ -14,11 +14,11 @@ from itertools import product
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.planning.candidates import bars_that_fit
-from models.planning.information import Problem, factor, field_rows, mounting_information
-from models.planning.instruments import SetupMinutes
-from models.planning.measurements import HelixTest, LineTest, Measurement, machine_seconds
+from abbe.models.arrays import F1, F2
+from abbe.models.planning.candidates import bars_that_fit
+from abbe.models.planning.information import Problem, factor, field_rows, mounting_information
+from abbe.models.planning.instruments import SetupMinutes
+from abbe.models.planning.measurements import HelixTest, LineTest, Measurement, machine_seconds
 
 POWER = 4.0
 """Of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""

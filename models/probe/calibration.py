@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.probe.frame import direction, finite_vectors
-from models.probe.lobing import LobingMap
-from models.probe.pattern import ROUNDING_RAD, map_of_pattern
+from abbe.models.arrays import F1, F2
+from abbe.models.probe.frame import direction, finite_vectors
+from abbe.models.probe.lobing import LobingMap
+from abbe.models.probe.pattern import ROUNDING_RAD, map_of_pattern
 
 ABSORBED = ("nx", "ny", "nz", "1")
 """Functions of the touching direction that the fit takes for centre and radius: a map is known only without its share of them."""

@@ -6,9 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.probe.frame import finite_vectors, to_probe
-from models.probe.lobing import LobingMap
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.probe.frame import finite_vectors, to_probe
+from abbe.models.probe.lobing import LobingMap
 
 Reading17 = Literal["approach", "outward"]
 """What M in P (17) may mean: the direction in which the probe approaches the part, or the part's outward normal."""
@@ -21,7 +21,7 @@ def probe_error_mm(lobing: LobingMap, frame: F3, outward: F2) -> F1:
     Parameters
     ----------
     frame : array, shape (3, 3) or (n, 3, 3)
-        Tp of `models.probe.frame.probe_frame`.
+        Tp of `abbe.models.probe.frame.probe_frame`.
     outward : array, shape (n, 3)
 
     Raises

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2, F3
 
 
 def probe_frame(tilt_rad: F1, roll_rad: F1) -> F3:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.probe.frame import direction_angles
+from abbe.models.arrays import F1, F2
+from abbe.models.probe.frame import direction_angles
 
 PERIOD = 2.0 * np.pi
 EDGE_RAD = 1e-9

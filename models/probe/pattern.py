@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
-from models.probe.lobing import LobingMap
+from abbe.models.arrays import F1, F2
+from abbe.models.probe.lobing import LobingMap
 
 Indices = NDArray[np.intp]
 ROUNDING_RAD = 1e-9

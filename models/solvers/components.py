@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.solvers.information import Sums
-from models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.information import Sums
+from abbe.models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
 
 NOISE_SD = 2.0
 """Hyperprior of an instrument's log noise variance about what its repeats say: a factor of e in the standard deviation, weak."""

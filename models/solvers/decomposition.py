@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 
 def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2, F3
-from models.solvers.decomposition import singular_values, svd
-from models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.solvers.decomposition import singular_values, svd
+from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
 
 Field = Callable[[F2], F3]
 """Commanded workpiece coordinates (n, 3), mm, to the deviation per unit of each parameter (n, 3, p)."""

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import DIRECTIONS, Term
-from models.machine import Machine
-from models.solvers import robust
-from models.solvers.components import Components, Posterior, blend, cautious, estimate, fit_length, posterior
-from models.solvers.information import I1, KINDS, Grams, Readings, Sums, grams, sums, total
-from models.solvers.noise import DEFAULT_SIGMA_MM, RESOLUTION_MM, repeat_noise_mm
-from models.solvers.observations import RunData
-from models.solvers.observe import Setup, predict, run_design, setup_unknowns
-from models.solvers.order import folds
-from models.solvers.priors import Priors, SizeModel, size_model
-from models.solvers.residual_tests import inflation
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import DIRECTIONS, Term
+from abbe.models.machine import Machine
+from abbe.models.solvers import robust
+from abbe.models.solvers.components import Components, Posterior, blend, cautious, estimate, fit_length, posterior
+from abbe.models.solvers.information import I1, KINDS, Grams, Readings, Sums, grams, sums, total
+from abbe.models.solvers.noise import DEFAULT_SIGMA_MM, RESOLUTION_MM, repeat_noise_mm
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import Setup, predict, run_design, setup_unknowns
+from abbe.models.solvers.order import folds
+from abbe.models.solvers.priors import Priors, SizeModel, size_model
+from abbe.models.solvers.residual_tests import inflation
 
 ROUNDS = 8
 SETTLED = 0.01

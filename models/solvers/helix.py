@@ -13,11 +13,11 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.solvers.identifiability import Identifiability, analyse
-from models.solvers.least_squares import Estimate, solve_map
-from models.solvers.observations import RunData
-from models.solvers.priors import Priors, bar_length_sd
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.identifiability import Identifiability, analyse
+from abbe.models.solvers.least_squares import Estimate, solve_map
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import Priors, bar_length_sd
 
 Unknowns = Literal["six", "nine", "ten"]
 LINEAR = ("EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z")

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.chain import travel_sign
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.chain import travel_sign
 
 LEAD_IN_MM = 1.0
 """A run is approached in the direction of its first motion, farther than any lost motion."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2, F3
 
 I1 = NDArray[np.int64]
 KINDS = ("bar", "laser")

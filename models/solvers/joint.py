@@ -1,8 +1,8 @@
 """One joint solution of ball-bar and laser runs: 21 error motions, lost motion, and every set-up error as an unknown.
 
 Published methods solve the data sets one by one and take the set-ups as perfect (math.md 4.5, 5.4). Here cup offsets, bar lengths, mirror
-tilts, laser zeros and drifts are unknowns with documented priors (`models.solvers.priors`); what the data cannot separate is listed. How
-noisy the instruments are and how large errors of each class are is estimated with them (docs/decisions/0011-sizes-from-the-data.md).
+tilts, laser zeros and drifts are unknowns with documented priors (`abbe.models.solvers.priors`); what the data cannot separate is listed.
+How noisy the instruments are and how large errors of each class are is estimated with them (docs/decisions/0011-sizes-from-the-data.md).
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.bases import DIRECTIONS, Term, smooth_terms
-from models.geometry.chain import design
-from models.machine import Machine
-from models.solvers.engine import Fit, Problem, Progress, build, expected_noise, settle
-from models.solvers.identifiability import Identifiability, combinations_of, taking_part
-from models.solvers.information import KINDS, total
-from models.solvers.least_squares import Estimate
-from models.solvers.observability_free import hidden_free
-from models.solvers.observability_rank import campaign_columns, compressed, stated_knowledge, what_is_seen
-from models.solvers.observations import RunData
-from models.solvers.observe import Setup, with_tool
-from models.solvers.order import RIGID6, OrderChoice, choose, term_levels
-from models.solvers.priors import Priors
-from models.solvers.residual_tests import ResidualTest, residual_tests
-from models.solvers.robust import Outlier
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from abbe.models.geometry.chain import design
+from abbe.models.machine import Machine
+from abbe.models.solvers.engine import Fit, Problem, Progress, build, expected_noise, settle
+from abbe.models.solvers.identifiability import Identifiability, combinations_of, taking_part
+from abbe.models.solvers.information import KINDS, total
+from abbe.models.solvers.least_squares import Estimate
+from abbe.models.solvers.observability_free import hidden_free
+from abbe.models.solvers.observability_rank import campaign_columns, compressed, stated_knowledge, what_is_seen
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import Setup, with_tool
+from abbe.models.solvers.order import RIGID6, OrderChoice, choose, term_levels
+from abbe.models.solvers.priors import Priors
+from abbe.models.solvers.residual_tests import ResidualTest, residual_tests
+from abbe.models.solvers.robust import Outlier
 
 HIGHEST_ORDER = 12
 """Error motions of this order are still solved for, whatever order the runs support: the ones above as nuisance, held by their prior."""
@@ -62,7 +62,7 @@ class JointSolution:
     information : array, shape (p, p)
         What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
-        Of the terms up to ``order`` only, by the rule of the whole report (`models.solvers.observability_rank.stated_knowledge`); its
+        Of the terms up to ``order`` only, by the rule of the whole report (`abbe.models.solvers.observability_rank.stated_knowledge`); its
         ``involved`` also names lost motion and free set-up unknowns that the readings leave open.
     prior_root : array, shape (p, p)
         Factor of the prior covariance of the unknowns, root root^T: orders of one motion are alike, so ``prior_sd`` alone is not all of it.

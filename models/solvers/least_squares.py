@@ -1,7 +1,7 @@
 """Weighted linear least squares with an explicit prior, full covariance, and what the data alone can tell.
 
 The prior is part of the statement, never hidden: `Estimate.data_share` says for every parameter how much of its information came from the
-data. Parameters that live on the prior alone are named by `models.solvers.identifiability`.
+data. Parameters that live on the prior alone are named by `abbe.models.solvers.identifiability`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.solvers.observations import RunData, nominal_reading
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.observations import RunData, nominal_reading
 
 DEFAULT_SIGMA_MM = {"bar": 4e-4, "laser": 3e-4}
 """Standard uncertainty of one reading where nothing was repeated: the makers' figures for good instruments."""

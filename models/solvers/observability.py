@@ -2,7 +2,7 @@
 
 `observability` needs the runs' set-ups only (a planner's question), `observability_of` takes a solution. Both give rank and null space in
 words with a cause and a cure, what is known of every parameter and motion, and how well the deviation is known in the volume. Rank is of
-the readings and stated calibrations alone; uncertainties include the documented priors (`models.solvers.priors`).
+the readings and stated calibrations alone; uncertainties include the documented priors (`abbe.models.solvers.priors`).
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import DIRECTIONS, Term, smooth_terms
-from models.machine import Machine
-from models.solvers.joint import JointSolution
-from models.solvers.observability_cures import Campaign
-from models.solvers.observability_free import hidden_free
-from models.solvers.observability_hidden import Advice, HiddenGroup, picture
-from models.solvers.observability_parameters import Correlation, Motion, Parameter, correlations, hidden_terms, motions, parameters
-from models.solvers.observability_rank import (
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from abbe.models.machine import Machine
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability_cures import Campaign
+from abbe.models.solvers.observability_free import hidden_free
+from abbe.models.solvers.observability_hidden import Advice, HiddenGroup, picture
+from abbe.models.solvers.observability_parameters import Correlation, Motion, Parameter, correlations, hidden_terms, motions, parameters
+from abbe.models.solvers.observability_rank import (
     Columns,
     Knowledge,
     Seen,
@@ -29,10 +29,10 @@ from models.solvers.observability_rank import (
     stated_knowledge,
     what_is_seen,
 )
-from models.solvers.observability_volume import Knowing, Number, Plane, Volume, observability_number, plane_at, volume_at, whole_volume
-from models.solvers.observations import RunData
-from models.solvers.observe import setup_unknowns
-from models.solvers.priors import Priors, size_model
+from abbe.models.solvers.observability_volume import Knowing, Number, Plane, Volume, observability_number, plane_at, volume_at, whole_volume
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import setup_unknowns
+from abbe.models.solvers.priors import Priors, size_model
 
 __all__ = ["Observability", "motions_of", "observability", "observability_of"]
 
@@ -127,7 +127,7 @@ def observability(
     terms : int or tuple of Term
         The model: highest Legendre order of the 21 error motions, or its coefficients.
     priors
-        As in `models.solvers.joint.solve_joint`.
+        As in `abbe.models.solvers.joint.solve_joint`.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
         Standard uncertainty of one raw reading, and the least one of an averaged value, mm (the larger of the two counts).
     known : Knowledge, optional

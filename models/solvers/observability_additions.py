@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.machine import AXES, Machine
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.observability_present import Present, free_corner, on_opposite_edges, place_words, present
-from models.solvers.observability_rank import Knowledge
-from models.solvers.observations import RunData
-from models.solvers.observe import with_tool
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.observability_present import Present, free_corner, on_opposite_edges, place_words, present
+from abbe.models.solvers.observability_rank import Knowledge
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import with_tool
 
 LONGER_MM = 100.0
 ASIDE_MM = (100.0, 50.0)
@@ -45,7 +45,7 @@ class Addition:
 
 
 def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, names: tuple[str, ...], order: int) -> tuple[Addition, ...]:
-    """What could be added to these runs, cheapest first; every cause is a fact about them (`models.solvers.observability_present`).
+    """What could be added to these runs, cheapest first; every cause is a fact about them (`abbe.models.solvers.observability_present`).
 
     Parameters
     ----------

@@ -1,4 +1,5 @@
-"""What would make hidden combinations visible: every usual addition to a campaign is tried out (`models.solvers.observability_additions`).
+"""What would make hidden combinations visible: every usual addition to a campaign is tried out
+(`abbe.models.solvers.observability_additions`).
 
 Nothing is looked up: the rank with each addition is computed on the campaign at hand, so the advice fits this machine and these runs.
 """
@@ -10,17 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F2
-from models.geometry.bases import Term
-from models.machine import Machine
-from models.solvers.decomposition import singular_values
-from models.solvers.identifiability import project_out
-from models.solvers.observability_additions import Addition, additions
-from models.solvers.observability_free import Play, play
-from models.solvers.observability_rank import Columns, Knowledge, Seen, campaign_columns, stated_knowledge, with_knowledge
-from models.solvers.observations import RunData
-from models.solvers.observe import Setup, setup_unknowns
-from models.solvers.priors import Priors
+from abbe.models.arrays import F2
+from abbe.models.geometry.bases import Term
+from abbe.models.machine import Machine
+from abbe.models.solvers.decomposition import singular_values
+from abbe.models.solvers.identifiability import project_out
+from abbe.models.solvers.observability_additions import Addition, additions
+from abbe.models.solvers.observability_free import Play, play
+from abbe.models.solvers.observability_rank import Columns, Knowledge, Seen, campaign_columns, stated_knowledge, with_knowledge
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import Setup, setup_unknowns
+from abbe.models.solvers.priors import Priors
 
 SHOWN = 1e-7
 """Trace (unit columns) from which a hidden combination counts as shown by an addition; hidden means below 1e-9."""

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F2
-from models.solvers.decomposition import svd
-from models.solvers.designs import unit_columns
-from models.solvers.identifiability import HIDDEN, RANK_TOLERANCE
-from models.solvers.observability_rank import Columns, Knowledge, Seen, with_knowledge
+from abbe.models.arrays import F2
+from abbe.models.solvers.decomposition import svd
+from abbe.models.solvers.designs import unit_columns
+from abbe.models.solvers.identifiability import HIDDEN, RANK_TOLERANCE
+from abbe.models.solvers.observability_rank import Columns, Knowledge, Seen, with_knowledge
 
 NOTHING = 1e-7
 """Entries of unit vectors below this are rounding."""

@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term
-from models.machine import Machine
-from models.solvers.decomposition import singular_values, svd
-from models.solvers.identifiability import RANK_TOLERANCE
-from models.solvers.observability_additions import Addition
-from models.solvers.observability_cures import Campaign, Trial, best_sequence, trials
-from models.solvers.observability_rank import Seen
-from models.solvers.observability_volume import frame_free_design, inner_box
-from models.solvers.observability_words import Family, families, sentence
-from models.solvers.observe import with_tool
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term
+from abbe.models.machine import Machine
+from abbe.models.solvers.decomposition import singular_values, svd
+from abbe.models.solvers.identifiability import RANK_TOLERANCE
+from abbe.models.solvers.observability_additions import Addition
+from abbe.models.solvers.observability_cures import Campaign, Trial, best_sequence, trials
+from abbe.models.solvers.observability_rank import Seen
+from abbe.models.solvers.observability_volume import frame_free_design, inner_box
+from abbe.models.solvers.observability_words import Family, families, sentence
+from abbe.models.solvers.observe import with_tool
 
 HARMLESS = 1e-7
 """Deviation (unit columns, relative to the largest) below which a combination moves the tool nowhere."""

@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term, term_values
-from models.machine import Machine
-from models.solvers.identifiability import taking_part
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term, term_values
+from abbe.models.machine import Machine
+from abbe.models.solvers.identifiability import taking_part
 
 Status = Literal["observed", "weak", "not observable"]
 OBSERVED, SEEN = 0.9, 0.1

@@ -7,10 +7,10 @@ from itertools import permutations, product
 
 import numpy as np
 
-from models.arrays import F1
-from models.machine import AXES, Machine
-from models.solvers.observations import RunData
-from models.solvers.observe_setup import SAME_PLACE_MM, straight_line_of
+from abbe.models.arrays import F1
+from abbe.models.machine import AXES, Machine
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe_setup import SAME_PLACE_MM, straight_line_of
 
 ALONG = 1e-3
 """A line is along an axis, a diagonal across all of them, if no component (all components) of its direction is larger than this."""

@@ -6,7 +6,7 @@ what somebody measured or certified about the set-up (`Knowledge`): a calibrated
 
 The rank does not depend on the functions in which error motions are written, the effective rank does: Legendre polynomials are nearly
 independent of each other on the readings and keep more of it than powers of the position, of which math.md states its figures
-(`models.solvers.designs.ranks` of the papers' problems has those).
+(`abbe.models.solvers.designs.ranks` of the papers' problems has those).
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import DIRECTIONS, Term
-from models.machine import Machine
-from models.solvers.decomposition import svd
-from models.solvers.designs import unit_columns
-from models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
-from models.solvers.observations import RunData
-from models.solvers.observe import Setup, run_design
-from models.solvers.observe_setup import bar_length_name
-from models.solvers.rounding import as_meant
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import DIRECTIONS, Term
+from abbe.models.machine import Machine
+from abbe.models.solvers.decomposition import svd
+from abbe.models.solvers.designs import unit_columns
+from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import Setup, run_design
+from abbe.models.solvers.observe_setup import bar_length_name
+from abbe.models.solvers.rounding import as_meant
 
 HAND_SET = ("cup", "tilt", "zero")
 """Set-up unknowns that hands make and nobody states; with uncalibrated bar lengths they are free, in the solver's rank as in the report's.
-All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`models.solvers.priors`). They are known for the
+All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`abbe.models.solvers.priors`). They are known for the
 rank, and count in every uncertainty: else a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time, as
 the height is in a helix) a squareness."""
 
@@ -120,8 +120,8 @@ def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup_n
     """What is stated about the set-up: lengths of calibrated bars, and whatever no hand sets (`HAND_SET`).
 
     A bar counts as calibrated if every run with it says so or states its uncertainty, and none says the opposite
-    (`models.solvers.priors.bar_length_sd`); how well it was calibrated enters the uncertainties, not the rank. Cup offsets, mirror tilts,
-    laser zeros and uncalibrated lengths are free, however narrow their priors.
+    (`abbe.models.solvers.priors.bar_length_sd`); how well it was calibrated enters the uncertainties, not the rank. Cup offsets, mirror
+    tilts, laser zeros and uncalibrated lengths are free, however narrow their priors.
     """
     vague = {bar_length_name(r.radius_mm) for r in runs if r.radius_mm is not None and not _calibrated(r)}
     return Knowledge({n: np.zeros(len(terms)) for n in setup_names if n.partition("_")[0] not in HAND_SET and n not in vague})

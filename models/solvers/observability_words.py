@@ -12,10 +12,10 @@ from itertools import combinations
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term
-from models.machine import AXES
-from models.solvers.identifiability import sparse_rows
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term
+from abbe.models.machine import AXES
+from abbe.models.solvers.identifiability import sparse_rows
 
 LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
 """Combinations of up to so many motions are looked for by trying all sets, first among orders up to LOW (a slope of an angle times the

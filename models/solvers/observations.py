@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 Kind = Literal["bar", "laser"]
 Test = Literal["", "helix", "circle", "diagonal", "linear"]
@@ -35,7 +35,7 @@ class RunData:
     deviation_mm : array, shape (n,)
         Bar length minus radius, or displacement since the first record minus nominal.
     sign : array, shape (n, 3)
-        Direction in which each axis last moved (`models.geometry.chain.travel_sign`).
+        Direction in which each axis last moved (`abbe.models.geometry.chain.travel_sign`).
     t_s : array, shape (n,)
         Campaign clock.
     weight_n : array, shape (n,)
@@ -44,7 +44,7 @@ class RunData:
     u_length_mm : float, optional
         Stated standard uncertainty of the bar's calibrated length.
     length_calibrated : bool, optional
-        Whether the bar's length was calibrated at all; None: the run does not say (`models.solvers.priors.bar_length_sd`).
+        Whether the bar's length was calibrated at all; None: the run does not say (`abbe.models.solvers.priors.bar_length_sd`).
     tool_mm : array, shape (3,), optional
         Spindle reference to functional point in this run; None: the machine's own.
     test : "helix" | "circle" | "diagonal" | "linear" | ""

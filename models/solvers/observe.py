@@ -1,9 +1,9 @@
 """What a run reads of a machine and its set-up, exactly, and how each unknown changes it (docs/conventions.md, "Readings").
 
-Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns (`models.solvers.observe_setup`). The
-readings are those of math.md 4.2 and 5.4 without any linearisation: finite rotations in the chain, the length of the bar as a length, the
-mirror as a tilted plane that a misaligned beam meets. A helix, a circle in any plane and a partial arc are one and the same reading of a
-ball-bar; step diagonal, plain diagonal and single-axis line one of a laser: only the commanded positions differ.
+Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns (`abbe.models.solvers.observe_setup`).
+The readings are those of math.md 4.2 and 5.4 without any linearisation: finite rotations in the chain, the length of the bar as a length,
+the mirror as a tilted plane that a misaligned beam meets. A helix, a circle in any plane and a partial arc are one and the same reading of
+a ball-bar; step diagonal, plain diagonal and single-axis line one of a laser: only the commanded positions differ.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.geometry.bases import Term
-from models.machine import Machine
-from models.solvers.observations import RunData
-from models.solvers.observe_kinematics import LOST, Places, with_tool
-from models.solvers.observe_setup import Setup, bar_length_name, perpendicular, setup_unknowns
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.bases import Term
+from abbe.models.machine import Machine
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe_kinematics import LOST, Places, with_tool
+from abbe.models.solvers.observe_setup import Setup, bar_length_name, perpendicular, setup_unknowns
 
 __all__ = [
     "Setup",

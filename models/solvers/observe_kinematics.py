@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1, F2, F3, F4
-from models.geometry.bases import Term, term_values
-from models.geometry.chain import exact_deviation_mm
-from models.geometry.jacobian import exact_jacobian
-from models.machine import Machine
+from abbe.models.arrays import F1, F2, F3, F4
+from abbe.models.geometry.bases import Term, term_values
+from abbe.models.geometry.chain import exact_deviation_mm
+from abbe.models.geometry.jacobian import exact_jacobian
+from abbe.models.machine import Machine
 
 LOST = 3
 """Lost motion of X, Y, Z follows the smooth terms in the vector of unknowns."""
@@ -33,7 +33,7 @@ class Places:
     sign : array, shape (n, 3)
         Direction in which each axis last moved; zeros: lost motion left out.
     values : array, shape (n, terms)
-        Value of each term's own function (`models.geometry.bases.term_values`).
+        Value of each term's own function (`abbe.models.geometry.bases.term_values`).
     column : array of int, shape (terms,)
         Which of the 18 motions (axis x 6 + component) each term belongs to.
     """

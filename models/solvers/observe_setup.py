@@ -1,6 +1,7 @@
 """Set-up unknowns of a campaign: cups, bars, mirrors, beams, zeros and drifts, with their priors.
 
-Published methods take the set-ups as perfect (math.md 4.5, 5.4). Here each is an unknown with a documented prior (`models.solvers.priors`).
+Published methods take the set-ups as perfect (math.md 4.5, 5.4). Here each is an unknown with a documented prior
+(`abbe.models.solvers.priors`).
 
 - ``cup_<setup>_x/y/z``, mm: where the cup stands less where the machine really was when the spindle put it down: the mounting alone.
 - ``bar_length_<radius>``, mm: what the reading is too long by (docs/conventions.md), so what the bar is SHORTER than it says; one per
@@ -20,10 +21,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.machine import Machine
-from models.solvers.observations import RunData
-from models.solvers.priors import Priors, bar_length_sd
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import Machine
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import Priors, bar_length_sd
 
 LEAST_DRIFT_MM = 2e-5
 """A drift that cannot reach this (0.02 um) while a set-up stands is not worth three unknowns."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term
-from models.solvers.components import Components
-from models.solvers.information import I1, Sums, total
-from models.solvers.observations import RunData
-from models.solvers.priors import SizeModel
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term
+from abbe.models.solvers.components import Components
+from abbe.models.solvers.information import I1, Sums, total
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import SizeModel
 
 FOLDS = 8
 RIGID6 = 0

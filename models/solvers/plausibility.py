@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import DIRECTIONS, Term, smooth_terms
-from models.machine import Machine
-from models.solvers.evidence import OUTLIER_SHARE, Part, Posterior, conditional, scatter, together
-from models.solvers.observations import RunData, block_average, nominal_reading
-from models.solvers.observe import Setup, run_design, setup_unknowns
-from models.solvers.priors import Priors, term_prior_sd
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from abbe.models.machine import Machine
+from abbe.models.solvers.evidence import OUTLIER_SHARE, Part, Posterior, conditional, scatter, together
+from abbe.models.solvers.observations import RunData, block_average, nominal_reading
+from abbe.models.solvers.observe import Setup, run_design, setup_unknowns
+from abbe.models.solvers.priors import Priors, term_prior_sd
 
 WIDE = Priors(
     scale_rad=200e-6,

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term
-from models.machine import Machine
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term
+from abbe.models.machine import Machine
 
 U_WAVELENGTH = 0.3e-6
 """Relative standard uncertainty of the laser's wavelength after air compensation (about 0.3 K or 1 hPa): no scale is known better."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from models.arrays import F1
-from models.solvers.observations import RunData
+from abbe.models.arrays import F1
+from abbe.models.solvers.observations import RunData
 
 LEVEL = 0.01
 """A test is flagged when chance explains it with less than this, after correction for the number of tests (Holm)."""

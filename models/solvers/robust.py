@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 FALSE_ALARM = 0.05
 """Chance that a campaign without any outlier has a reading that counts less."""

@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrays import F2
-from models.solvers.observations import RunData
-from models.solvers.observe_setup import NEAR_BEAM, STRAIGHT_MM, straight_line_of
+from abbe.models.arrays import F2
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe_setup import NEAR_BEAM, STRAIGHT_MM, straight_line_of
 
 BAR_TRAVEL_MM = 1.0
 """Measuring range of a usual ball-bar to either side: farther from its nominal length no position was meant to be."""

@@ -1,7 +1,7 @@
 """Sequential step diagonals in the paper's form (Wang eq (6)-(13); math.md 5.1 to 5.4).
 
 `wang_eq7` is the published three-of-four formula, `wang_four` the least-squares form that uses all four diagonals. Both take the mirrors
-as perfectly square to the beams; `models.solvers.joint` treats the tilts as unknowns.
+as perfectly square to the beams; `abbe.models.solvers.joint` treats the tilts as unknowns.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.paths.lines import DIAGONALS
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.paths.lines import DIAGONALS
 
 ORDER = ("ppp", "npp", "pnp", "ppn")
 
@@ -99,7 +99,7 @@ def wang_eq7(q: dict[str, F2], inc_mm: F1) -> F3:
     """Displacement errors by the printed formulas (7) and (8), three of four diagonals (Wang; math.md 5.1).
 
     The coefficients of (4) to (8) are lost in the print and rebuilt in math.md 5.1. Angular errors and mirror tilt enter as false errors
-    (`models.wang.angular`, `models.wang.mirror.tilt_bias_eq7`).
+    (`abbe.models.wang.angular`, `abbe.models.wang.mirror.tilt_bias_eq7`).
 
     Parameters
     ----------

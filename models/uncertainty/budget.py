@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
-from models.uncertainty.prediction import Prediction
-from models.uncertainty.sources import WORDS
+from abbe.models.arrays import F1
+from abbe.models.uncertainty.prediction import Prediction
+from abbe.models.uncertainty.sources import WORDS
 
 
 @dataclass(frozen=True, slots=True)

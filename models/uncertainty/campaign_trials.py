@@ -16,14 +16,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2, F3
-from models.solvers.joint import JointSolution
-from models.solvers.observe import predict
-from models.uncertainty.distributions import NORMAL, Distribution
-from models.uncertainty.frame import RigidFree, field
-from models.uncertainty.monte_carlo import Draw
-from models.uncertainty.response import Response, response
-from models.uncertainty.sources import ErrorSources
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observe import predict
+from abbe.models.uncertainty.distributions import NORMAL, Distribution
+from abbe.models.uncertainty.frame import RigidFree, field
+from abbe.models.uncertainty.monte_carlo import Draw
+from abbe.models.uncertainty.response import Response, response
+from abbe.models.uncertainty.sources import ErrorSources
 
 READINGS = ("bar_noise", "laser_noise")
 LIMITS: Mapping[str, Distribution] = MappingProxyType(

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.uncertainty.sources import ErrorSources
+from abbe.models.arrays import F1, F2
+from abbe.models.uncertainty.sources import ErrorSources
 
 
 def variances(sources: ErrorSources, per_unit: F2) -> F1:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2, F3
-from models.probability import chi2_quantile, t_quantile
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.probability import chi2_quantile, t_quantile
 
 PROBABILITY = 0.95
 _FLAT, _NOTHING = 1e-12, 1e-24

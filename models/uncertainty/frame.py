@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.geometry.bases import Term
-from models.geometry.chain import design
-from models.machine import Machine
-from models.solvers.observe import with_tool
-from models.volumetric import rigid_design, volume_grid
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.bases import Term
+from abbe.models.geometry.chain import design
+from abbe.models.machine import Machine
+from abbe.models.solvers.observe import with_tool
+from abbe.models.volumetric import rigid_design, volume_grid
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def field(machine: Machine, terms: tuple[Term, ...], points_mm: F2, tool_mm: F1 
 
 
 def rigid_at(points_mm: F2, reference_mm: F2) -> F3:
-    """`models.volumetric.rigid_design` of the reference points, evaluated at other points, shape (m, 3, 6)."""
+    """`abbe.models.volumetric.rigid_design` of the reference points, evaluated at other points, shape (m, 3, 6)."""
     centre = reference_mm.mean(axis=0)
     balanced = np.concatenate([points_mm, 2.0 * centre - points_mm])  # their centroid is the reference's
     return rigid_design(balanced)[: len(points_mm)]

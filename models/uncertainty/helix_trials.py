@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.solvers.helix import LINEAR, SETUP, linear_field
-from models.uncertainty.distributions import NORMAL, Distribution
-from models.uncertainty.linear_trials import CHUNK_VALUES, TrialStatistics
-from models.uncertainty.moments import Moments
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.solvers.helix import LINEAR, SETUP, linear_field
+from abbe.models.uncertainty.distributions import NORMAL, Distribution
+from abbe.models.uncertainty.linear_trials import CHUNK_VALUES, TrialStatistics
+from abbe.models.uncertainty.moments import Moments
 
 SETTLED = 1e-7
 """A trial has converged when its last step is below this many standard uncertainties in every parameter."""
@@ -37,7 +37,7 @@ class HelixFits:
 
 @dataclass(frozen=True)
 class HelixTask:
-    """One ball-bar run to be solved again and again, six (perfect mounting) or ten unknowns (`models.solvers.helix`).
+    """One ball-bar run to be solved again and again, six (perfect mounting) or ten unknowns (`abbe.models.solvers.helix`).
 
     Attributes
     ----------

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.solvers.priors import U_WAVELENGTH
+from abbe.models.solvers.priors import U_WAVELENGTH
 
 STEEL_PER_K = 11.5e-6
 """Linear expansion of steel scales and bars, 1/K; glass has about 8e-6, carbon fibre and Invar about 1e-6."""
@@ -23,14 +23,15 @@ class Inputs:
     Attributes
     ----------
     u_wavelength : float
-        Of the laser's wavelength after air compensation, relative; one laser in all runs. Default: `models.solvers.priors.U_WAVELENGTH`.
+        Of the laser's wavelength after air compensation, relative; one laser in all runs. Default:
+        `abbe.models.solvers.priors.U_WAVELENGTH`.
     u_scale_temperature_k, scale_expansion_per_k : float
         How well the temperature of each axis' scale is known, K, for which the prediction holds; 0.2 K is a Pt100 on the scale and a drift
         of ±0.3 K in the campaign. The three axes are independent. Expansion coefficient of the scales.
     u_bar_temperature_k, bar_expansion_per_k : float
         The same of the ball-bar against the temperature of its calibration; one thermometer for all bar runs.
     repeatability_mm : float
-        Standard deviation of the machine from one approach of a point to the next, per component (`models.uncertainty.repeatability`
+        Standard deviation of the machine from one approach of a point to the next, per component (`abbe.models.uncertainty.repeatability`
         estimates it). It is part of the scatter of the readings: the budget takes its share out of theirs, at most all of it. Default 0:
         not told apart.
     repeatability_dof : float

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.geometry.bases import Term
-from models.machine import Machine
-from models.uncertainty.frame import field, volume_frame
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.bases import Term
+from abbe.models.machine import Machine
+from abbe.models.uncertainty.frame import field, volume_frame
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class KnownField:
         for name, value in values.items():
             scale = name[0] == "E"
             [at] = self.index([f"{name}.1" if scale else name])
-            # The function of Legendre order 1 is twice the share of the stroke (`models.geometry.bases.term_values`).
+            # The function of Legendre order 1 is twice the share of the stroke (`abbe.models.geometry.bases.term_values`).
             out[at] = value * self.machine.length_mm["XYZ".index(name[2])] / 2.0 if scale else value
         return out
 
@@ -104,7 +104,7 @@ class FieldMap:
 
 
 def field_map(known: KnownField, points_mm: F2, motions: Iterable[str] | None = None) -> FieldMap:
-    """Deviation at commanded positions, mean of both directions of motion, as `models.uncertainty.prediction` has it.
+    """Deviation at commanded positions, mean of both directions of motion, as `abbe.models.uncertainty.prediction` has it.
 
     Parameters
     ----------

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.uncertainty.distributions import NORMAL, Distribution
-from models.uncertainty.moments import Moments
+from abbe.models.arrays import F1, F2
+from abbe.models.uncertainty.distributions import NORMAL, Distribution
+from abbe.models.uncertainty.moments import Moments
 
 CHUNK_VALUES = 500_000
 """Simulated readings held at once: 4 MB, so that they stay in the processor's cache between drawing and solving."""

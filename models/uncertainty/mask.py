@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1
-from models.uncertainty.coverage import PROBABILITY, coverage_factor
-from models.uncertainty.prediction import Prediction
+from abbe.models.arrays import F1
+from abbe.models.uncertainty.coverage import PROBABILITY, coverage_factor
+from abbe.models.uncertainty.prediction import Prediction
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest
     Parameters
     ----------
     prediction : Prediction
-        In the frame that the correction is made in; rigid-free for a map (`models.uncertainty.frame`), or a displacement of the whole
+        In the frame that the correction is made in; rigid-free for a map (`abbe.models.uncertainty.frame`), or a displacement of the whole
         workpiece, which is no error, decides.
     k : float, optional
         Coverage factor; default: that of the prediction's own probability and degrees of freedom.

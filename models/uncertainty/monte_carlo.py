@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.uncertainty.coverage import PROBABILITY, Interval, shortest_interval, symmetric_interval
-from models.uncertainty.moments import Moments
+from abbe.models.arrays import F1, F2
+from abbe.models.uncertainty.coverage import PROBABILITY, Interval, shortest_interval, symmetric_interval
+from abbe.models.uncertainty.moments import Moments
 
 Draw = Callable[[np.random.Generator, int], F2]
 """Results of so many trials, shape (trials, m): inputs drawn from their distributions, sent through the whole measurement."""

@@ -11,12 +11,12 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term, smooth_terms
-from models.solvers.joint import JointSolution
-from models.solvers.observe import run_design
-from models.solvers.priors import Priors, term_prior_sd
-from models.uncertainty.response import Response
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term, smooth_terms
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observe import run_design
+from abbe.models.solvers.priors import Priors, term_prior_sd
+from abbe.models.uncertainty.response import Response
 
 
 def order_source(solution: JointSolution, r: Response, orders_above: int) -> tuple[tuple[Term, ...], F2]:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.uncertainty.coverage import PROBABILITY, coverage_factor, effective_dof, vector_factor
-from models.uncertainty.frame import RigidFree, field
-from models.uncertainty.sources import ErrorSources
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.uncertainty.coverage import PROBABILITY, coverage_factor, effective_dof, vector_factor
+from abbe.models.uncertainty.frame import RigidFree, field
+from abbe.models.uncertainty.sources import ErrorSources
 
 CHUNK_POINTS = 2000
 """Points worked at once: 3 x 300 coefficients of each are then below 15 MB."""
@@ -24,7 +24,7 @@ class Prediction:
     points_mm, deviation_mm : array, shape (m, 3)
     covariance_mm2 : array, shape (m, 3, 3)
     names : tuple of str
-        The sources (`models.uncertainty.sources.WORDS`).
+        The sources (`abbe.models.uncertainty.sources.WORDS`).
     variance_mm2 : array, shape (sources, m, 3)
         What each source adds to the variance of each component: they sum up to the diagonal of ``covariance_mm2``.
     dof : array, shape (m, 3)
@@ -90,7 +90,7 @@ def predict_deviation(
     Parameters
     ----------
     sources : ErrorSources
-        Of the campaign's solution (`models.uncertainty.sources.error_sources`).
+        Of the campaign's solution (`abbe.models.uncertainty.sources.error_sources`).
     points_mm : array, shape (m, 3)
     tool_mm : array, shape (3,), optional
         Spindle reference to functional point; None: the machine's own tool.

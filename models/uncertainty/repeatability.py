@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.solvers.observations import RunData
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.observations import RunData
 
 FEWEST = 8
 """Degrees of freedom below which no figure is given: it would be known to worse than 25 %."""

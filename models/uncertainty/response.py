@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.solvers.joint import JointSolution
-from models.solvers.observe import run_design
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observe import run_design
 
 
 @dataclass(frozen=True)

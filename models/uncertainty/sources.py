@@ -14,14 +14,14 @@ from typing import Literal
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term
-from models.machine import AXES
-from models.solvers.joint import JointSolution
-from models.solvers.observations import RunData
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.order import chosen_order, order_source
-from models.uncertainty.response import Response, response
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term
+from abbe.models.machine import AXES
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observations import RunData
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.order import chosen_order, order_source
+from abbe.models.uncertainty.response import Response, response
 
 WORDS = {
     "bar_noise": "sensor noise of the ball-bar (and what a smooth model cannot follow)",
@@ -63,7 +63,7 @@ class Source:
         Standard deviation that comes on top at each point, per component.
     less : array, shape (P, r), optional
         Factor of what is to be taken off: only for `estimated_sizes`, which may never make a prediction better
-        (`models.uncertainty.prediction`).
+        (`abbe.models.uncertainty.prediction`).
     """
 
     name: str
@@ -227,7 +227,7 @@ def _travel(run: RunData) -> F1:
 def _temperature(solution: JointSolution, inputs: Inputs) -> list[Source]:
     """Scales warmer than thought: a linear positioning error of each axis, alpha u_T times the travel from the start of its stroke.
 
-    Written as the term of Legendre order 1, whose function is twice the share of the stroke (`models.geometry.bases.term_values`).
+    Written as the term of Legendre order 1, whose function is twice the share of the stroke (`abbe.models.geometry.bases.term_values`).
     """
     slope = inputs.u_scale_temperature_k * inputs.scale_expansion_per_k
     if slope == 0.0:

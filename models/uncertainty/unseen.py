@@ -1,7 +1,7 @@
 """How large the part of the deviation may be of which no reading tells anything: typical sizes stand in for knowledge there.
 
 The stated uncertainty of a solution holds sizes that were learned from what the readings do show. That guideways are straight where they
-were seen says little of a twist that nothing shows; for what leaves no trace the documented size counts (`models.solvers.priors`).
+were seen says little of a twist that nothing shows; for what leaves no trace the documented size counts (`abbe.models.solvers.priors`).
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.solvers.joint import JointSolution
-from models.solvers.priors import Priors, term_prior_sd
-from models.uncertainty.frame import RigidFree, field
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.priors import Priors, term_prior_sd
+from abbe.models.uncertainty.frame import RigidFree, field
 
 NO_TRACE_SIGMA = 0.3
 """A direction of typical size that changes all readings together by less than this many standard deviations leaves no trace."""

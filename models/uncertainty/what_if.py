@@ -15,11 +15,11 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, straight_line
-from models.uncertainty.known_field import KnownField
-from models.volumetric import volume_grid
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
+from abbe.models.uncertainty.known_field import KnownField
+from abbe.models.volumetric import volume_grid
 
 DRAWS = 600
 """So many draws know a standard uncertainty to 3 %."""

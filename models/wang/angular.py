@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F3
-from models.solvers.step_diagonal import checked_increments
+from abbe.models.arrays import F1, F3
+from abbe.models.solvers.step_diagonal import checked_increments
 
 
 def abbe_and_spurious_eq7(n: int, inc_mm: F1, x_step_rad: F1, y_step_rad: F1) -> F3:
@@ -95,7 +95,7 @@ def closure_of_angles_mm(inc_mm: F1, x_step_rad: F1) -> float:
 
     Returns
     -------
-    float, mm: ppp - npp - pnp - ppn as `models.solvers.step_diagonal.closure_mm`, with its sign.
+    float, mm: ppp - npp - pnp - ppn as `abbe.models.solvers.step_diagonal.closure_mm`, with its sign.
 
     Raises
     ------

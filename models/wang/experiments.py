@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.functions.monomials import monomials
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.designs import Field, laser_rows, stacked
-from models.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm, tilt_axes
-from models.wang.model import monomial_field
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.functions.monomials import monomials
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.designs import Field, laser_rows, stacked
+from abbe.models.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm, tilt_axes
+from abbe.models.wang.model import monomial_field
 
 Deviation = Callable[[F2], F2]
 """Commanded positions (n, 3), mm, to the machine's deviation (n, 3), mm."""
@@ -141,7 +141,7 @@ def interpolated_mm(points_mm: F2, inc_mm: F1, e_mm: F3) -> F2:
     inc_mm : array, shape (3,)
         Increments X, Y, Z.
     e_mm : array, shape (3, 3, m + 1)
-        E[i, a, k] in direction i after k steps of axis a (`models.solvers.step_diagonal.wang_eq7`).
+        E[i, a, k] in direction i after k steps of axis a (`abbe.models.solvers.step_diagonal.wang_eq7`).
 
     Returns
     -------

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.paths.lines import DIAGONALS
-from models.solvers.step_diagonal import ORDER, checked_increments
+from abbe.models.arrays import F1, F2
+from abbe.models.paths.lines import DIAGONALS
+from abbe.models.solvers.step_diagonal import ORDER, checked_increments
 
 
 def diagonal_beam(inc_mm: F1, diagonal: str) -> F1:

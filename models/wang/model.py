@@ -1,17 +1,17 @@
 """Wang's volumetric error of the machine FXYZ, eq (9) to (11), corrected and as printed (math.md 3 rows W, 5).
 
 Two slips of the paper: (9) has -y alpha_x(X) in Pz, +y is right (its own (11) has it); (11) has -z theta_xy in Ex(Z), -z theta_xz is right.
-Squareness is obtuse positive here (`models.notation.wang`).
+Squareness is obtuse positive here (`abbe.models.notation.wang`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.functions.monomials import ErrorArrays, Monomial, each_alone, error_arrays
-from models.geometry.chain import deviation_mm, exact_deviation_mm
-from models.notation.wang import iso_motions, machine
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.functions.monomials import ErrorArrays, Monomial, each_alone, error_arrays
+from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.notation.wang import iso_motions, machine
 
 
 def position_error_eq9(errors: ErrorArrays, axes_mm: F2) -> F2:

@@ -1,7 +1,7 @@
 """Squareness from the four body diagonals' end values, eq (12) and (13), and what the printed solution is worth (math.md 5.3).
 
 X, Y, Z are total travels, R the diagonal. Signs of (12), (13) are acute positive: the negative of (9) and (11). The bias-free solution is
-`models.solvers.step_diagonal.squareness_contrast`.
+`abbe.models.solvers.step_diagonal.squareness_contrast`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
-from models.paths.lines import DIAGONALS
-from models.solvers.step_diagonal import ORDER
+from abbe.models.arrays import F1
+from abbe.models.paths.lines import DIAGONALS
+from abbe.models.solvers.step_diagonal import ORDER
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 
 def reading_eq6(d_mm: F2, error_mm: F2) -> F1:

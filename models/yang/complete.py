@@ -1,16 +1,16 @@
 """Yang and Kim's complete volumetric error model with all 21 errors, eq (1), as printed (math.md 4.1).
 
-Same as rule G for the chain `models.notation.yang.CHAIN`; written out here term by term so that the paper can be read next to it.
+Same as rule G for the chain `abbe.models.notation.yang.CHAIN`; written out here term by term so that the paper can be read next to it.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.functions.monomials import ErrorArrays, Monomial, each_alone, error_arrays
-from models.geometry.chain import deviation_mm, exact_deviation_mm
-from models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.functions.monomials import ErrorArrays, Monomial, each_alone, error_arrays
+from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
 
 ANGLE_MM = 500.0
 """The vectors state coefficients of angles and squareness times this length, so that all coefficients are lengths of like size."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
-from models.solvers.designs import unit_columns
-from models.solvers.identifiability import RANK_TOLERANCE
-from models.yang.simplified import ZConvention, matrix_of
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.designs import unit_columns
+from abbe.models.solvers.identifiability import RANK_TOLERANCE
+from abbe.models.yang.simplified import ZConvention, matrix_of
 
 
 @dataclass(frozen=True)

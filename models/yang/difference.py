@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.probability import t_quantile
+from abbe.models.arrays import F1, F2
+from abbe.models.probability import t_quantile
 
 Model = Callable[[F2], F2]
 """Positions (n, 3), mm, to errors (n, 3), mm."""

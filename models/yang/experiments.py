@@ -1,7 +1,7 @@
 """The experiments of math.md 4.6 on Yang's machine as least-squares problems: what each could tell about the 21 error functions.
 
 Ball-bar helices about one or several cups, step diagonals with flat mirror, plain diagonals, and whole vector maps, with or without the
-set-up unknowns. Coefficients are those of `models.yang.complete.monomial_errors`.
+set-up unknowns. Coefficients are those of `abbe.models.yang.complete.monomial_errors`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.functions.monomials import monomials
-from models.notation.yang import workpiece_mm
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.designs import Field, Rows, bar_rows, laser_rows, stacked, vector_rows
-from models.volumetric import volume_grid
-from models.yang.complete import monomial_field
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.functions.monomials import monomials
+from abbe.models.notation.yang import workpiece_mm
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.designs import Field, Rows, bar_rows, laser_rows, stacked, vector_rows
+from abbe.models.volumetric import volume_grid
+from abbe.models.yang.complete import monomial_field
 
 Problem = tuple[F2, F2]
 """Machine columns and set-up columns of one problem."""

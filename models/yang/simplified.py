@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy import linalg
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 RADIUS_TOLERANCE = 0.01
 """A larger share cannot be lost motion or polyline: radius or origin belong to other points, and all parameters scale with it."""
@@ -83,8 +83,8 @@ def matrix_of(points_mm: F2, origin_mm: F1, z_convention: ZConvention) -> F2:
 def fit_eq9(points_mm: F2, origin_mm: F1, delta_r_mm: F1, radius_mm: float, *, z_convention: ZConvention = "slide") -> SixFit:
     """Six parameters from one ball-bar test by least squares, eq (9), perfect mounting assumed.
 
-    A mounting error of 10 µm fakes about 100 µrad here (math.md 4.5): for measured data use `models.solvers.helix.fit_helix`, which takes
-    cup offset and bar length as unknowns.
+    A mounting error of 10 µm fakes about 100 µrad here (math.md 4.5): for measured data use `abbe.models.solvers.helix.fit_helix`, which
+    takes cup offset and bar length as unknowns.
 
     Parameters
     ----------

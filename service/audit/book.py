@@ -11,13 +11,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from service.audit.chain import Anchor, Event, anchor_of, faults, follow, key_name
-from service.audit.files import append_line, can_append, can_create, create, refusal
-from service.errors import AuditBroken
-from service.secrets import mask_secrets, visible
-from service.storage.engine import parse_url
-from service.storage.store import Store
-from service.storage.store_audit import AuditRecord
+from abbe.service.audit.chain import Anchor, Event, anchor_of, faults, follow, key_name
+from abbe.service.audit.files import append_line, can_append, can_create, create, refusal
+from abbe.service.errors import AuditBroken
+from abbe.service.secrets import mask_secrets, visible
+from abbe.service.storage.engine import parse_url
+from abbe.service.storage.store import Store
+from abbe.service.storage.store_audit import AuditRecord
 
 ENVIRONMENT = "ABBE_AUDIT_FOLDER"
 KEY_BYTES = 32

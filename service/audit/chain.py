@@ -7,8 +7,8 @@ import hmac
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.push.entries import GENESIS, Doc, canonical
-from service.storage.store_audit import AuditRecord
+from abbe.service.push.entries import GENESIS, Doc, canonical
+from abbe.service.storage.store_audit import AuditRecord
 
 
 @dataclass(frozen=True, slots=True)

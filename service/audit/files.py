@@ -9,8 +9,8 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-from service.errors import AuditBroken
-from service.storage.private import private_file
+from abbe.service.errors import AuditBroken
+from abbe.service.storage.private import private_file
 
 
 def create(path: Path, content: bytes) -> None:

@@ -6,14 +6,14 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from service.capture.drafts import BAR, GAPS, Drafter, gap_of
-from service.capture.ingest import chunk_of
-from service.capture.ledger import FLAG_MASK, Gap, Ledger
-from service.capture.records import CHUNK, CLOSE, GAP, Record
-from service.capture.scan import Scan
-from service.runs.codec import decode_bar, decode_json
-from service.storage.records import ChunkRecord
-from service.storage.store import Store
+from abbe.service.capture.drafts import BAR, GAPS, Drafter, gap_of
+from abbe.service.capture.ingest import chunk_of
+from abbe.service.capture.ledger import FLAG_MASK, Gap, Ledger
+from abbe.service.capture.records import CHUNK, CLOSE, GAP, Record
+from abbe.service.capture.scan import Scan
+from abbe.service.runs.codec import decode_bar, decode_json
+from abbe.service.storage.records import ChunkRecord
+from abbe.service.storage.store import Store
 
 DAMAGED = "the segment is damaged here"
 TORN = "the end of the segment is torn or damaged: it is not known how many samples were in it"

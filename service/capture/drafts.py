@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from drivers.api import BarBatch, BarSample
-from service.capture.ledger import OVERRUN_BIT, Gap, Ledger
-from service.capture.records import CHUNK, CLOSE, GAP, OPEN, Record
-from service.runs.codec import BAR_CODEC, JSON_CODEC, decode_json, encode_bar, encode_json
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.service.capture.ledger import OVERRUN_BIT, Gap, Ledger
+from abbe.service.capture.records import CHUNK, CLOSE, GAP, OPEN, Record
+from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_json, encode_bar, encode_json
 
 BAR, GAPS, RUN = "bar", "gaps", "run"
 MAX_SAMPLES = 4096

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.capture.settings import CaptureSettings, segment_folder
-from service.storage.engine import parse_url
-from service.storage.store import Store
+from abbe.service.capture.settings import CaptureSettings, segment_folder
+from abbe.service.storage.engine import parse_url
+from abbe.service.storage.store import Store
 
 
 def folder_of(store: Store, settings: CaptureSettings) -> Path:

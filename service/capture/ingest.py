@@ -11,10 +11,10 @@ from pathlib import Path
 
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError, TimeoutError
 
-from service.capture.records import CHUNK, GAP, Record, decode_at
-from service.errors import AbbeError, CaptureFault, StoreError
-from service.storage.records import ChunkRecord
-from service.storage.store import Store
+from abbe.service.capture.records import CHUNK, GAP, Record, decode_at
+from abbe.service.errors import AbbeError, CaptureFault, StoreError
+from abbe.service.storage.records import ChunkRecord
+from abbe.service.storage.store import Store
 
 RETRY_S = 0.1
 END_S = 10.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from drivers.api import BarSample
+from abbe.drivers.api import BarSample
 
 FLAGS = {0: "out of range", 2: "samples lost before it", 4: "no bar"}
 """Status bits that make a reading no measurement (docs/protocols/ballbar.md); the sample is kept all the same."""

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.api import BarBatch, Point
-from service.runs.helix_axis import about_axis, helix_axis
+from abbe.drivers.api import BarBatch, Point
+from abbe.service.runs.helix_axis import about_axis, helix_axis
 
 F1 = NDArray[np.float64]
 Values = NDArray[np.float32]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.errors import CaptureFault
+from abbe.service.errors import CaptureFault
 
 LOCK_NAME = "recovery.lock"
 WAIT_S = 30.0

@@ -12,14 +12,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from drivers.api import BarBatch
-from service.capture.account import joined, streams_doc
-from service.capture.drafts import Drafter, Item
-from service.capture.ledger import Gap
-from service.capture.records import CHUNK, GAP, Record
-from service.capture.reserve import Reserve
-from service.capture.segment import Segment
-from service.errors import AbbeError, CaptureFault, DiskFull
+from abbe.drivers.api import BarBatch
+from abbe.service.capture.account import joined, streams_doc
+from abbe.service.capture.drafts import Drafter, Item
+from abbe.service.capture.ledger import Gap
+from abbe.service.capture.records import CHUNK, GAP, Record
+from abbe.service.capture.reserve import Reserve
+from abbe.service.capture.segment import Segment
+from abbe.service.errors import AbbeError, CaptureFault, DiskFull
 
 GROUP_S = 0.01
 """So long after its arrival the first sample waits for company, so that a group costs one sync. No longer: what it waited before counts, be

@@ -6,9 +6,9 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from service.capture.file_io import RealFileIO
-from service.capture.scan import Scan
-from service.capture.settings import DAMAGED_SUFFIX, TAIL, free_name, set_aside
+from abbe.service.capture.file_io import RealFileIO
+from abbe.service.capture.scan import Scan
+from abbe.service.capture.settings import DAMAGED_SUFFIX, TAIL, free_name, set_aside
 
 
 def put_away(path: Path, held: Scan, *, keep: bool) -> None:

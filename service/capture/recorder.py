@@ -9,19 +9,19 @@ from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from drivers.api import BarBatch
-from drivers.links.shielded import run_to_end
-from service.capture.drafts import BAR, Drafter
-from service.capture.file_io import FileIO, RealFileIO
-from service.capture.folder import folder_of
-from service.capture.ingest import Ingest
-from service.capture.log import CaptureLog, Published
-from service.capture.reserve import Reserve
-from service.capture.segment import Segment, fault
-from service.capture.settings import ORPHAN, CaptureSettings, is_memory, segment_path, set_aside
-from service.clock import Clock
-from service.errors import StoreError
-from service.storage.store import Store
+from abbe.drivers.api import BarBatch
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.capture.drafts import BAR, Drafter
+from abbe.service.capture.file_io import FileIO, RealFileIO
+from abbe.service.capture.folder import folder_of
+from abbe.service.capture.ingest import Ingest
+from abbe.service.capture.log import CaptureLog, Published
+from abbe.service.capture.reserve import Reserve
+from abbe.service.capture.segment import Segment, fault
+from abbe.service.capture.settings import ORPHAN, CaptureSettings, is_memory, segment_path, set_aside
+from abbe.service.clock import Clock
+from abbe.service.errors import StoreError
+from abbe.service.storage.store import Store
 
 CATCH_UP_S = 120.0
 LASER = "laser"

@@ -11,7 +11,7 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 
-from service.errors import CaptureFault
+from abbe.service.errors import CaptureFault
 
 MAGIC = b"AbbC"
 VERSION = 1

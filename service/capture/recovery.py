@@ -11,21 +11,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.capture.account import DAMAGED, ledger_of, settle, streams_doc
-from service.capture.folder import folder_of
-from service.capture.ingest import BATCH, chunk_of, may_pass
-from service.capture.ledger import Ledger
-from service.capture.locks import LOCK_NAME, held_alone, is_free
-from service.capture.put_away import put_away
-from service.capture.recorder import is_active
-from service.capture.records import CHUNK, CLOSE, GAP, OPEN
-from service.capture.scan import Scan, scan
-from service.capture.settings import CONFLICT, DAMAGED_SUFFIX, ORPHAN, SUFFIX, CaptureSettings, other_folders, segment_path, set_aside
-from service.errors import AbbeError, CaptureConflict, CaptureFault, StoreError
-from service.runs.codec import decode_json
-from service.storage.owner import this_process
-from service.storage.records import INTERRUPTED, RUNNING, ChunkRecord, RunRecord
-from service.storage.store import Store
+from abbe.service.capture.account import DAMAGED, ledger_of, settle, streams_doc
+from abbe.service.capture.folder import folder_of
+from abbe.service.capture.ingest import BATCH, chunk_of, may_pass
+from abbe.service.capture.ledger import Ledger
+from abbe.service.capture.locks import LOCK_NAME, held_alone, is_free
+from abbe.service.capture.put_away import put_away
+from abbe.service.capture.recorder import is_active
+from abbe.service.capture.records import CHUNK, CLOSE, GAP, OPEN
+from abbe.service.capture.scan import Scan, scan
+from abbe.service.capture.settings import CONFLICT, DAMAGED_SUFFIX, ORPHAN, SUFFIX, CaptureSettings, other_folders, segment_path, set_aside
+from abbe.service.errors import AbbeError, CaptureConflict, CaptureFault, StoreError
+from abbe.service.runs.codec import decode_json
+from abbe.service.storage.owner import this_process
+from abbe.service.storage.records import INTERRUPTED, RUNNING, ChunkRecord, RunRecord
+from abbe.service.storage.store import Store
 
 __all__ = ["DAMAGED", "Recovered", "ledger_of", "read_segment", "recover_segments"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.capture.file_io import FileIO
-from service.capture.segment import fault
+from abbe.service.capture.file_io import FileIO
+from abbe.service.capture.segment import fault
 
 
 class Reserve:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from service.capture.records import CLOSE, MAGIC, NO_HASH, Record, decode_at, digest
+from abbe.service.capture.records import CLOSE, MAGIC, NO_HASH, Record, decode_at, digest
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from service.capture.file_io import FileIO
-from service.capture.records import NO_HASH, Record, digest, encode
-from service.errors import CaptureFault, DiskFull
+from abbe.service.capture.file_io import FileIO
+from abbe.service.capture.records import NO_HASH, Record, digest, encode
+from abbe.service.errors import CaptureFault, DiskFull
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 

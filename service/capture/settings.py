@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from service.errors import ConfigError
-from service.storage.engine import parse_url
+from abbe.service.errors import ConfigError
+from abbe.service.storage.engine import parse_url
 
 MIB = 1 << 20
 SUFFIX = ".seg"

@@ -13,7 +13,7 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from service.errors import ChannelBroken
+from abbe.service.errors import ChannelBroken
 
 T = TypeVar("T")
 
@@ -48,7 +48,8 @@ class DeviceSeen:
 
 @dataclass(frozen=True, slots=True)
 class CheckNow:
-    """The check that runs. ``state`` as `service.sequences.control` has it; ``step`` of ``steps`` and points read: of the test in hand.
+    """The check that runs. ``state`` as `abbe.service.sequences.control` has it; ``step`` of ``steps`` and points read: of the test in
+    hand.
 
     ``prompt``: number of what a person is asked to do, ``ask``: what that is; 0: nothing.
     """

@@ -10,8 +10,8 @@ import socket
 import struct
 from typing import Self
 
-from service.channel.messages import LARGEST_B, FromCore, FromWeb, encode
-from service.errors import ChannelBroken
+from abbe.service.channel.messages import LARGEST_B, FromCore, FromWeb, encode
+from abbe.service.errors import ChannelBroken
 
 _LENGTH = struct.Struct(">I")
 FULL_B = 2 * LARGEST_B

@@ -47,10 +47,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """
     import typer
 
-    from drivers.errors import DriverError
-    from service.cli.app import app
-    from service.cli.plain_text import degrade
-    from service.errors import AbbeError
+    from abbe.drivers.errors import DriverError
+    from abbe.service.cli.app import app
+    from abbe.service.cli.plain_text import degrade
+    from abbe.service.errors import AbbeError
 
     if sys.stdout is None:
         sys.stdout = _Closed()
@@ -111,7 +111,7 @@ def complain(code: str, text: str) -> int:
     int
         Exit code for bad input.
     """
-    from service.secrets import mask_secrets, visible
+    from abbe.service.secrets import mask_secrets, visible
 
     if sys.stderr is not None:  # closed: only the exit code is left
         sys.stderr.write(f"error {code}: {visible(mask_secrets(' '.join(text.split())))}\n")

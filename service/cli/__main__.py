@@ -1,6 +1,6 @@
 """``abbe`` as a module, for children of ours."""
 
-from service.cli import main
+from abbe.service.cli import main
 
 if __name__ == "__main__":
     main()

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, print_json, print_table
 
 alarm = typer.Typer(help="Alarms of the scheduled checks.", no_args_is_help=True)
 
@@ -21,9 +21,9 @@ def list_alarms(
     as_json: JsonOption = False,
 ) -> None:
     """Alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
-    from service.cli.common import open_store
-    from service.config import load_machine
-    from service.workflows.alarms import alarm_doc, alarms_of, open_alarms
+    from abbe.service.cli.common import open_store
+    from abbe.service.config import load_machine
+    from abbe.service.workflows.alarms import alarm_doc, alarms_of, open_alarms
 
     loaded = load_machine(machine)
     with open_store(loaded.database_url) as store:
@@ -46,10 +46,10 @@ def acknowledge(
     name: Annotated[str, typer.Option("--as", metavar="NAME", help="Who has seen it. Default: the account.", show_default=False)] = "",
 ) -> None:
     """Note that a person has seen an alarm. It stays active until a check clears it."""
-    from service.cli.common import open_store
-    from service.config import load_machine
-    from service.workflows.alarms import acknowledge as work
-    from service.workflows.proposals import login
+    from abbe.service.cli.common import open_store
+    from abbe.service.config import load_machine
+    from abbe.service.workflows.alarms import acknowledge as work
+    from abbe.service.workflows.proposals import login
 
     loaded = load_machine(machine)
     with open_store(loaded.database_url) as store:

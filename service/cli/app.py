@@ -4,38 +4,38 @@ from __future__ import annotations
 
 import typer
 
-from service.cli.alarm import alarm
-from service.cli.audit import audit
-from service.cli.audited import record_all
-from service.cli.backup import backup, restore
-from service.cli.comp import comp
-from service.cli.comp_commission import commission
-from service.cli.comp_proposals import approve, diff, propose, reject, show_proposals
-from service.cli.comp_push import push, rollback
-from service.cli.configuration import check_config, schema
-from service.cli.demo import demo
-from service.cli.discover import discover
-from service.cli.effects import effects
-from service.cli.errors import errors
-from service.cli.exchange import export_campaign, import_campaign
-from service.cli.fleet import fleet
-from service.cli.key import key
-from service.cli.listen import listen
-from service.cli.measure import correct, measure
-from service.cli.model import model
-from service.cli.papers import papers
-from service.cli.plan import plan
-from service.cli.report import report
-from service.cli.serve import serve
-from service.cli.show import runs, show
-from service.cli.simulate import simulate
-from service.cli.solve import solve
-from service.cli.solve_all import solve_all
-from service.cli.system import SIM_SETTINGS, sim, version
-from service.cli.table import accept_table
-from service.cli.trend import trend
-from service.cli.user import user
-from service.cli.vectors import vectors
+from abbe.service.cli.alarm import alarm
+from abbe.service.cli.audit import audit
+from abbe.service.cli.audited import record_all
+from abbe.service.cli.backup import backup, restore
+from abbe.service.cli.comp import comp
+from abbe.service.cli.comp_commission import commission
+from abbe.service.cli.comp_proposals import approve, diff, propose, reject, show_proposals
+from abbe.service.cli.comp_push import push, rollback
+from abbe.service.cli.configuration import check_config, schema
+from abbe.service.cli.demo import demo
+from abbe.service.cli.discover import discover
+from abbe.service.cli.effects import effects
+from abbe.service.cli.errors import errors
+from abbe.service.cli.exchange import export_campaign, import_campaign
+from abbe.service.cli.fleet import fleet
+from abbe.service.cli.key import key
+from abbe.service.cli.listen import listen
+from abbe.service.cli.measure import correct, measure
+from abbe.service.cli.model import model
+from abbe.service.cli.papers import papers
+from abbe.service.cli.plan import plan
+from abbe.service.cli.report import report
+from abbe.service.cli.serve import serve
+from abbe.service.cli.show import runs, show
+from abbe.service.cli.simulate import simulate
+from abbe.service.cli.solve import solve
+from abbe.service.cli.solve_all import solve_all
+from abbe.service.cli.system import SIM_SETTINGS, sim, version
+from abbe.service.cli.table import accept_table
+from abbe.service.cli.trend import trend
+from abbe.service.cli.user import user
+from abbe.service.cli.vectors import vectors
 
 app = typer.Typer(
     name="abbe",

@@ -7,10 +7,10 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from service.errors import ConfigError
+from abbe.service.errors import ConfigError
 
 if TYPE_CHECKING:
-    from service.devices.session import Ask
+    from abbe.service.devices.session import Ask
 
 
 async def console_ask(text: str) -> None:
@@ -36,7 +36,7 @@ async def console_ask(text: str) -> None:
 
 def whoever_is_there() -> Ask:
     """Who is asked at this console: the person at the terminal, or, known before anything moves, nobody."""
-    from service.devices.session import no_console
+    from abbe.service.devices.session import no_console
 
     return console_ask if sys.stdin is not None and sys.stdin.isatty() else no_console
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
 
 audit = typer.Typer(help="The audit: who did what, when, on what, and how it ended.", no_args_is_help=True)
 SHOWN = 10
@@ -21,7 +21,7 @@ def show_audit(
     as_json: JsonOption = False,
 ) -> None:
     """Show the newest records, oldest first."""
-    from service.secrets import visible
+    from abbe.service.secrets import visible
 
     with open_store(database_url(db, machine)) as store:
         found = store.audit(last)
@@ -36,8 +36,8 @@ def show_audit(
 @audit.command("verify")
 def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """Prove that no record was changed, removed, exchanged or cut off at the end (exit code 1: one was)."""
-    from service.audit.book import AuditBook
-    from service.secrets import visible
+    from abbe.service.audit.book import AuditBook
+    from abbe.service.secrets import visible
 
     url = database_url(db, machine)
     with open_store(url) as store:

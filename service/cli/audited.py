@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from service.cli.declared import is_recorded
+from abbe.service.cli.declared import is_recorded
 
 if TYPE_CHECKING:
-    from service.audit.chain import Event
+    from abbe.service.audit.chain import Event
 
 INTERRUPTED = "interrupted"
 
@@ -76,9 +76,9 @@ def _make_sure(words: str, given: Mapping[str, Any]) -> None:
     AbbeError
         What the machine file or the database would be refused for anyway; or the audit, with the remedy.
     """
-    from service.audit.book import HEADS, KEY, AuditBook, files_ready, place
-    from service.cli.common import database_url, open_store
-    from service.errors import AuditBroken
+    from abbe.service.audit.book import HEADS, KEY, AuditBook, files_ready, place
+    from abbe.service.cli.common import database_url, open_store
+    from abbe.service.errors import AuditBroken
 
     url = _database(given, database_url)
     missing = _missing(url)
@@ -96,9 +96,9 @@ def _make_sure(words: str, given: Mapping[str, Any]) -> None:
 
 
 def _record(words: str, given: Mapping[str, Any], outcome: str, error: BaseException | None = None) -> None:
-    from service.audit.book import AuditBook
-    from service.cli.common import database_url, open_store
-    from service.errors import AbbeError, AuditBroken
+    from abbe.service.audit.book import AuditBook
+    from abbe.service.cli.common import database_url, open_store
+    from abbe.service.errors import AbbeError, AuditBroken
 
     url = _database(given, database_url)
     missing = _missing(url)
@@ -123,7 +123,7 @@ def _database(given: Mapping[str, Any], url_of: Any) -> str:
 
 def _missing(url: str) -> Path | None:
     """The SQLite file of a database that is not there (yet); None: it is there, or is no file."""
-    from service.storage.engine import parse_url
+    from abbe.service.storage.engine import parse_url
 
     parsed = parse_url(url)
     if parsed.drivername != "sqlite" or parsed.database in {None, "", ":memory:"}:
@@ -134,8 +134,8 @@ def _missing(url: str) -> Path | None:
 
 def event_of(words: str, given: Mapping[str, Any], outcome: str) -> Event:
     """What is recorded of a command: who ran it here, on what, with which options."""
-    from service.audit.book import this_account
-    from service.audit.chain import Event
+    from abbe.service.audit.book import this_account
+    from abbe.service.audit.chain import Event
 
     target = next((str(given[key]) for key in ("name", "campaign", "file", "out", "folder", "solution", "machine") if given.get(key)), "")
     told = {key: str(value) for key, value in given.items() if value not in (None, False, "", []) and key not in {"db", "as_json"}}

@@ -13,8 +13,8 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from service.storage.records import CampaignRecord, RunRecord
-    from service.storage.store import Store
+    from abbe.service.storage.records import CampaignRecord, RunRecord
+    from abbe.service.storage.store import Store
 
 ENVIRONMENT = "ABBE_DB"
 DEFAULT = "sqlite:///abbe.sqlite3"
@@ -49,12 +49,12 @@ def database_url(db: str | None, machine: Path | None = None) -> str:
     ConfigError
         If both options are given.
     """
-    from service.errors import ConfigError
+    from abbe.service.errors import ConfigError
 
     if db is not None and machine is not None:
         raise ConfigError("--db and --machine both name a database", "give one of them")
     if machine is not None:
-        from service.config import load_machine
+        from abbe.service.config import load_machine
 
         return load_machine(machine).database_url
     return db or os.environ.get(ENVIRONMENT) or DEFAULT
@@ -80,9 +80,9 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
     StoreError
         If it cannot be opened.
     """
-    from service.errors import StoreError
-    from service.storage.engine import parse_url
-    from service.storage.store import Store
+    from abbe.service.errors import StoreError
+    from abbe.service.storage.engine import parse_url
+    from abbe.service.storage.store import Store
 
     parsed = parse_url(url)
     if (
@@ -98,7 +98,7 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
 
 def warn_of_readers(url: str) -> None:
     """Say on stderr if others than its owner may read the file of a database: hashes of passwords are in it."""
-    from service.storage.private import database_seen_by_others
+    from abbe.service.storage.private import database_seen_by_others
 
     if (words := database_seen_by_others(url)) and sys.stderr is not None:
         sys.stderr.write(f"warning: {words}\n")
@@ -112,7 +112,7 @@ def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
     StoreError
         Neither is in the database.
     """
-    from service.errors import StoreError
+    from abbe.service.errors import StoreError
 
     try:
         return store.run(name)
@@ -131,7 +131,7 @@ def print_json(value: Any) -> None:
     value : object
         JSON value.
     """
-    from service.secrets import visible_json
+    from abbe.service.secrets import visible_json
 
     sys.stdout.write(visible_json(json.dumps(value, indent=2, ensure_ascii=False)) + "\n")
 
@@ -153,7 +153,7 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: s
     from rich.table import Table
     from rich.text import Text
 
-    from service.secrets import visible
+    from abbe.service.secrets import visible
 
     console = Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=400)
     table = Table(*headings, title=title, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
 
 if TYPE_CHECKING:
-    from service.config_schema import MachineFile
-    from service.formats.choice import Choice
-    from service.formats.model import Compensation
+    from abbe.service.config_schema import MachineFile
+    from abbe.service.formats.choice import Choice
+    from abbe.service.formats.model import Compensation
 
 comp = typer.Typer(help="Compensation tables: as the files that controls read, and back.", no_args_is_help=True)
 
@@ -28,8 +28,8 @@ ReferenceOption = Annotated[
 @comp.command("formats")
 def list_formats(as_json: JsonOption = False) -> None:
     """List formats and controls: what each can hold, how its sign is known."""
-    from service.formats.controls import CONTROLS
-    from service.formats.registry import FORMATS
+    from abbe.service.formats.controls import CONTROLS
+    from abbe.service.formats.registry import FORMATS
 
     rows = [(f.key, f.name, _holds(f.limits), str(f.limits.points), f.sign.evidence, f.sign.words) for f in FORMATS.values()]
     if as_json:
@@ -63,9 +63,9 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     as_json: JsonOption = False,
 ) -> None:
     """Write the best tables that a control can hold, with what each kind of table would leave."""
-    from service.clock import SystemClock
-    from service.workflows.comp_export import control_for, export, formats_in, identified, reference_of, write_files
-    from service.workflows.comp_signed import Seal, check_signing, sign_files
+    from abbe.service.clock import SystemClock
+    from abbe.service.workflows.comp_export import control_for, export, formats_in, identified, reference_of, write_files
+    from abbe.service.workflows.comp_signed import Seal, check_signing, sign_files
 
     doc = _solution(solution, db, machine)
     known = identified(doc)
@@ -107,10 +107,10 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     """Read a control's files as the control would: show the tables, what they are worth (signed for this machine, or only a candidate),
     and how they differ from a solution's.
     """
-    from service.clock import SystemClock
-    from service.formats.compare import check_same
-    from service.workflows.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
-    from service.workflows.comp_signed import Asked, standing
+    from abbe.service.clock import SystemClock
+    from abbe.service.formats.compare import check_same
+    from abbe.service.workflows.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
+    from abbe.service.workflows.comp_signed import Asked, standing
 
     control, known, at = control_for(form), None, reference_of(reference)
     if solution is not None:
@@ -137,7 +137,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
 
 
 def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, Any]:
-    from service.workflows.comp_export import solution_document
+    from abbe.service.workflows.comp_export import solution_document
 
     def stored(number: int) -> dict[str, Any]:
         with open_store(database_url(db, machine)) as store:
@@ -148,8 +148,8 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
 
 def _fresh(source: str, db: str | None, machine: Path | None, *, said_so: bool) -> bool:
     """Whether a solution is known to have been measured without a correction; refused where there was one."""
-    from service.workflows.comp_export import solution_document
-    from service.workflows.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
+    from abbe.service.workflows.comp_export import solution_document
+    from abbe.service.workflows.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
 
     if not source.isdigit():
         return check_fresh(tables_of(solution_document(source, lambda _: {})), no_images, said_so=said_so)
@@ -159,7 +159,7 @@ def _fresh(source: str, db: str | None, machine: Path | None, *, said_so: bool) 
 
 def _machine_file(file: Path | None) -> MachineFile | None:
     """What a machine file says; None without one."""
-    from service.config import load_machine
+    from abbe.service.config import load_machine
 
     return None if file is None else load_machine(file).machine
 
@@ -168,9 +168,9 @@ def _machine(file: Path | None) -> Any:
     """Nominal geometry of a machine file; without one, a machine that only says where zero is."""
     import numpy as np
 
-    from models.machine import Machine
-    from service.config import load_machine
-    from service.site import site_of
+    from abbe.models.machine import Machine
+    from abbe.service.config import load_machine
+    from abbe.service.site import site_of
 
     if file is not None:
         return site_of(load_machine(file).machine).machine

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import JsonOption, print_json, print_table
-from service.cli.measure import AcceptTable, MachineArgument, ready_session
+from abbe.service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session
 
 if TYPE_CHECKING:
-    from service.storage.store import Store
-    from service.workflows.commission import Proved
-    from service.workflows.commission_levels import Levels
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.commission import Proved
+    from abbe.service.workflows.commission_levels import Levels
 
 ALLOWED = {3: "unattended pushes", 2: "pushes that a person attends", 1: "no push", 0: "no push: read and export only"}
 
@@ -33,15 +33,15 @@ def commission(
 
     Proves its level for pushes, and sign, axis and unit of its tables. Exit code 1: something was not proved.
     """
-    from service.cli.progress import display
-    from service.cli.running import run_job
-    from service.cli.waiting import taken_back_when_safe
-    from service.config import load_machine
-    from service.site import site_of
-    from service.storage.store import Store
-    from service.workflows.commission import commission as work_commission
-    from service.workflows.commission_levels import commission_levels
-    from service.workflows.proved_levels import check_level
+    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import run_job
+    from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.config import load_machine
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.commission import commission as work_commission
+    from abbe.service.workflows.commission_levels import commission_levels
+    from abbe.service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)

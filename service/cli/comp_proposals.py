@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
-from service.cli.measure import MachineArgument, ready_session
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from abbe.service.cli.measure import MachineArgument, ready_session
 
 if TYPE_CHECKING:
-    from service.storage.store import Store
-    from service.workflows.proposal_doc import Proposed
-    from service.workflows.proposals import Made
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.proposal_doc import Proposed
+    from abbe.service.workflows.proposals import Made
 
 ProposalArgument = Annotated[int, typer.Argument(metavar="PROPOSAL", help="Number of a proposal; abbe comp show lists them.")]
 
@@ -26,13 +26,13 @@ def propose(
     """Solve a campaign and store the tables that follow as a proposal; writes nothing to the controller (exit code 1: reasons against)."""
     from dataclasses import replace
 
-    from service.cli.progress import display
-    from service.cli.running import run_job
-    from service.config import load_machine
-    from service.devices.session import DeviceUrls
-    from service.site import site_of
-    from service.storage.store import Store
-    from service.workflows.proposals import gather, make
+    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import run_job
+    from abbe.service.config import load_machine
+    from abbe.service.devices.session import DeviceUrls
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.proposals import gather, make
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
@@ -71,7 +71,7 @@ def show_proposals(
     as_json: JsonOption = False,
 ) -> None:
     """Proposals: what they promise, with uncertainty, where they stand, what spoke against them."""
-    from service.workflows.proposal_doc import load
+    from abbe.service.workflows.proposal_doc import load
 
     with open_store(database_url(db, machine)) as store:
         if proposal is None:
@@ -94,8 +94,8 @@ def show_proposals(
 
 
 def _print_list(store: Store, *, as_json: bool) -> None:
-    from service.errors import StoreError
-    from service.workflows.proposal_doc import load
+    from abbe.service.errors import StoreError
+    from abbe.service.workflows.proposal_doc import load
 
     rows: list[dict[str, Any]] = []
     for record in store.proposals():
@@ -122,9 +122,9 @@ def diff(
     as_json: JsonOption = False,
 ) -> None:
     """What a proposal changes: each of the nine tables in numbers, and as a picture."""
-    from service.report.page_file import write_page
-    from service.workflows.proposal_diff import HEADINGS, compare, diff_html, diff_json, largest, rows
-    from service.workflows.proposal_doc import load
+    from abbe.service.report.page_file import write_page
+    from abbe.service.workflows.proposal_diff import HEADINGS, compare, diff_html, diff_json, largest, rows
+    from abbe.service.workflows.proposal_doc import load
 
     with open_store(database_url(db, machine)) as store:
         found = compare(store, proposal, other)
@@ -148,13 +148,13 @@ def approve(
     machine: MachineOption = None,
 ) -> None:
     """Approve exactly this table on exactly this base, for this machine, under these limits (exit code 1: it cannot be approved)."""
-    from service.clock import SystemClock
-    from service.errors import TableRefused
-    from service.workflows.proposal_checks import approve as work_approve
-    from service.workflows.proposal_doc import load
-    from service.workflows.proposal_states import check_waiting
-    from service.workflows.proposals import login
-    from service.workflows.push_word import open_pushes
+    from abbe.service.clock import SystemClock
+    from abbe.service.errors import TableRefused
+    from abbe.service.workflows.proposal_checks import approve as work_approve
+    from abbe.service.workflows.proposal_doc import load
+    from abbe.service.workflows.proposal_states import check_waiting
+    from abbe.service.workflows.proposals import login
+    from abbe.service.workflows.push_word import open_pushes
 
     with open_store(database_url(db, machine)) as store:
         proposed = load(store, proposal)
@@ -172,8 +172,8 @@ def approve(
 
 def _control(machine: Path | None, name: str) -> str:
     """Identity of a machine's control; empty where its machine file was not given."""
-    from service.config import load_machine
-    from service.devices.urls import control_of
+    from abbe.service.config import load_machine
+    from abbe.service.devices.urls import control_of
 
     found = None if machine is None else load_machine(machine).machine
     return control_of(found.devices.cnc) if found is not None and found.name == name else ""
@@ -187,12 +187,12 @@ def reject(
     machine: MachineOption = None,
 ) -> None:
     """Reject a proposal for good: it cannot be approved or pushed any more (exit code 1: it cannot be rejected any more)."""
-    from service.clock import SystemClock
-    from service.errors import TableRefused
-    from service.workflows.proposal_checks import reject as work_reject
-    from service.workflows.proposal_doc import load
-    from service.workflows.proposal_states import check_waiting
-    from service.workflows.proposals import login
+    from abbe.service.clock import SystemClock
+    from abbe.service.errors import TableRefused
+    from abbe.service.workflows.proposal_checks import reject as work_reject
+    from abbe.service.workflows.proposal_doc import load
+    from abbe.service.workflows.proposal_states import check_waiting
+    from abbe.service.workflows.proposals import login
 
     with open_store(database_url(db, machine)) as store:
         try:
@@ -214,9 +214,9 @@ def _row(store: Store, number: int, proposed: Proposed) -> dict[str, Any]:
     """Everything about a proposal that people and programs ask for, and where it stands."""
     from datetime import UTC, datetime
 
-    from service.clock import SystemClock
-    from service.storage.base import utc_text
-    from service.workflows.proposal_states import standing
+    from abbe.service.clock import SystemClock
+    from abbe.service.storage.base import utc_text
+    from abbe.service.workflows.proposal_states import standing
 
     now = standing(store, number, proposed, SystemClock().utc().timestamp())
     p, c = proposed.predicted, proposed.candidate

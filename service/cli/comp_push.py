@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.comp_proposals import ProposalArgument
-from service.cli.measure import AcceptTable, MachineArgument, ready_session, verification_before
+from abbe.service.cli.comp_proposals import ProposalArgument
+from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session, verification_before
 
 if TYPE_CHECKING:
-    from service.storage.store import Store
-    from service.workflows.correct import Correction
-    from service.workflows.rollback import Back
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.correct import Correction
+    from abbe.service.workflows.rollback import Back
 
 
 def push(
@@ -27,17 +27,17 @@ def push(
     accept_table: AcceptTable = False,
 ) -> None:
     """Push a proposal, prove it, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
-    from service.cli.progress import display
-    from service.cli.running import run_job
-    from service.cli.waiting import taken_back_when_safe
-    from service.config import load_machine
-    from service.errors import TableRefused
-    from service.site import site_of
-    from service.storage.store import Store
-    from service.workflows.commission import check_commissioned
-    from service.workflows.correct import push as work_push
-    from service.workflows.correct import reasons_now
-    from service.workflows.proved_levels import check_level
+    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import run_job
+    from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.config import load_machine
+    from abbe.service.errors import TableRefused
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.commission import check_commissioned
+    from abbe.service.workflows.correct import push as work_push
+    from abbe.service.workflows.correct import reasons_now
+    from abbe.service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
@@ -83,16 +83,16 @@ def rollback(
     """Make the table active again that was in force before the last kept push: by a person's order, without measuring. Asks first."""
     from dataclasses import replace
 
-    from service.cli.running import run_job
-    from service.config import load_machine
-    from service.devices.session import DeviceUrls
-    from service.errors import ConfigError
-    from service.push.book import read_entries
-    from service.push.states import TERMINAL
-    from service.site import site_of
-    from service.storage.store import Store
-    from service.workflows.rollback import rollback as work_rollback
-    from service.workflows.verified_by import measure_now
+    from abbe.service.cli.running import run_job
+    from abbe.service.config import load_machine
+    from abbe.service.devices.session import DeviceUrls
+    from abbe.service.errors import ConfigError
+    from abbe.service.push.book import read_entries
+    from abbe.service.push.states import TERMINAL
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.rollback import rollback as work_rollback
+    from abbe.service.workflows.verified_by import measure_now
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
@@ -120,7 +120,7 @@ def rollback(
 
 async def _asked(to: int | None) -> bool:
     """Whether the person at the console wants the table of before; nobody there: no."""
-    from service.cli.ask import console_confirm
+    from abbe.service.cli.ask import console_confirm
 
     which = {None: "from before the last kept push", 0: "from before the first push"}.get(to, f"that was in force after push {to}")
     return await console_confirm(f"The table {which} comes back without a measurement, and the machine is unverified then. Really?")

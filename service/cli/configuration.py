@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, print_json, print_table
 
 
 def check_config(
@@ -16,11 +16,11 @@ def check_config(
     as_json: JsonOption = False,
 ) -> None:
     """Check a machine file and print its effective values and where each comes from; exit code 2 where something cannot work."""
-    from service.clock import SystemClock
-    from service.config import load_machine
-    from service.errors import ConfigError
-    from service.secrets import mask_secrets, visible
-    from service.workflows.plausible import doubts
+    from abbe.service.clock import SystemClock
+    from abbe.service.config import load_machine
+    from abbe.service.errors import ConfigError
+    from abbe.service.secrets import mask_secrets, visible
+    from abbe.service.workflows.plausible import doubts
 
     loaded = load_machine(file)
     found = doubts(loaded.machine, loaded.path.resolve().parent, SystemClock().utc().date())
@@ -42,8 +42,8 @@ def check_config(
 
 def schema(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")] = Path("docs/schemas")) -> None:
     """Write the JSON Schemas of the machine file and of the exchange files."""
-    from service.errors import ConfigError
-    from service.schemas import write_schemas
+    from abbe.service.errors import ConfigError
+    from abbe.service.schemas import write_schemas
 
     try:
         for path in write_schemas(folder):

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from service.workflows.demo import DemoResult
-    from service.workflows.demo_hidden import HiddenDemo
+    from abbe.service.workflows.demo import DemoResult
+    from abbe.service.workflows.demo_hidden import HiddenDemo
 
 DEFAULT_FOLDER = "abbe-demo"
 
@@ -45,12 +45,12 @@ def demo(
         return
     from rich.console import Console
 
-    from service.cli.progress import display
-    from service.cli.running import run_job
-    from service.report.html import render_report
-    from service.workflows.demo import run_demo
-    from service.workflows.demo_report import demo_json, demo_report
-    from service.workflows.demo_serve import run_served_demo
+    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import run_job
+    from abbe.service.report.html import render_report
+    from abbe.service.workflows.demo import run_demo
+    from abbe.service.workflows.demo_report import demo_json, demo_report
+    from abbe.service.workflows.demo_serve import run_served_demo
 
     folder = _folder(keep)
 
@@ -73,11 +73,11 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     """Play a discovery; only the simulator knows what the seed stands for."""
     from rich.console import Console
 
-    from service.cli.progress import display
-    from service.cli.running import run_job
-    from service.report.page_file import write_page
-    from service.workflows.demo_hidden import run_hidden_demo
-    from service.workflows.demo_hidden_words import hidden_json, story
+    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import run_job
+    from abbe.service.report.page_file import write_page
+    from abbe.service.workflows.demo_hidden import run_hidden_demo
+    from abbe.service.workflows.demo_hidden_words import hidden_json, story
 
     folder = _folder(keep)
     with display() as sink, work_folder(folder, keep) as work:
@@ -94,8 +94,8 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
 
 def hidden_page(result: HiddenDemo) -> str:
     """The report of what was found, as HTML; the truth is not in it, nobody at a real machine has one."""
-    from service.report.discovery_page import render_discovery
-    from service.workflows.discovery_pages import discovery_page, page_facts
+    from abbe.service.report.discovery_page import render_discovery
+    from abbe.service.workflows.discovery_pages import discovery_page, page_facts
 
     assert result.job is not None
     assert result.journal is not None
@@ -111,7 +111,7 @@ def _folder(keep: Path | None) -> Path:
     ConfigError
         It cannot be one.
     """
-    from service.errors import ConfigError
+    from abbe.service.errors import ConfigError
 
     folder = keep or Path(DEFAULT_FOLDER)
     try:
@@ -129,7 +129,7 @@ def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix="abbe-") as name:
             yield Path(name)
         return
-    from service.errors import AbbeError
+    from abbe.service.errors import AbbeError
 
     if (folder / "abbe.sqlite3").exists():
         raise AbbeError(f"{folder} already holds a demonstration", "name another folder with --keep, or delete it")
@@ -140,7 +140,7 @@ def print_result(out: Console, result: DemoResult) -> None:
     """Before and after as a table, then the verdict."""
     from rich.table import Table
 
-    from service.workflows.demo_report import demo_json, summary_rows
+    from abbe.service.workflows.demo_report import demo_json, summary_rows
 
     table = Table(title=f"Simulated machine {result.seed}: before and after")
     for name in ("figure", "before", "after", "factor", "source"):

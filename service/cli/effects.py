@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, print_json, print_table
 
 
 def effects(
@@ -14,9 +14,9 @@ def effects(
     as_json: JsonOption = False,
 ) -> None:
     """The catalogue of physical effects: how each looks, what shows it, how large it usually is, what to do about it."""
-    from service.workflows.axis_test import SLOW_DRIFT
-    from service.workflows.discovery_engine import catalogue, effect_named, plugins
-    from service.workflows.effect_pages import HEADINGS, effect_doc, effect_lines, effect_row
+    from abbe.service.workflows.axis_test import SLOW_DRIFT
+    from abbe.service.workflows.discovery_engine import catalogue, effect_named, plugins
+    from abbe.service.workflows.effect_pages import HEADINGS, effect_doc, effect_lines, effect_row
 
     for broken in plugins().broken:
         typer.echo(f"{broken.code}: {broken}", err=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import DbOption, MachineOption, database_url, open_store
+from abbe.service.cli.common import DbOption, MachineOption, database_url, open_store
 
 
 def export_campaign(
@@ -17,7 +17,7 @@ def export_campaign(
     machine: MachineOption = None,
 ) -> None:
     """Write a campaign as a folder with campaign.json and one file a run."""
-    from service.runs.exchange import export_folder
+    from abbe.service.runs.exchange import export_folder
 
     with open_store(database_url(db, machine)) as store:
         written = export_folder(store, campaign, folder)
@@ -31,7 +31,7 @@ def import_campaign(
     machine: MachineOption = None,
 ) -> None:
     """Check a campaign folder and store it: all of it or, after any mistake, nothing."""
-    from service.runs.exchange import import_folder, read_folder
+    from abbe.service.runs.exchange import import_folder, read_folder
 
     read_folder(folder)  # before a database is made
     with open_store(database_url(db, machine), must_exist=False) as store:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import JsonOption, MachineOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, print_json, print_table
 
 
 def fleet(
@@ -17,11 +17,11 @@ def fleet(
     as_json: JsonOption = False,
 ) -> None:
     """List every machine of a database: state, last check with figures and U, next due, and which limit comes first."""
-    from service.cli.common import database_url, open_store
-    from service.clock import SystemClock
-    from service.scheduler.fleet import HEADINGS, as_doc, row
-    from service.scheduler.fleet import fleet as lines_of
-    from service.scheduler.store import ServiceStore
+    from abbe.service.cli.common import database_url, open_store
+    from abbe.service.clock import SystemClock
+    from abbe.service.scheduler.fleet import HEADINGS, as_doc, row
+    from abbe.service.scheduler.fleet import fleet as lines_of
+    from abbe.service.scheduler.store import ServiceStore
 
     url = database_url(db, machine)
     open_store(url).close()  # a missing file is one line, and none is made

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import DbOption, MachineOption
+from abbe.service.cli.common import DbOption, MachineOption
 
 key = typer.Typer(help="Keys with which compensation files are signed.", no_args_is_help=True)
 
@@ -19,6 +19,6 @@ def new(
     machine: MachineOption = None,
 ) -> None:
     """Make a key. The private one stays in FILE, for its owner only; the public one is printed, for [signatures] trusted."""
-    from service.signed.keys import new_key
+    from abbe.service.signed.keys import new_key
 
     typer.echo(new_key(file))

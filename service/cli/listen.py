@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.measure import AcceptTable, MachineArgument, ready_session
+from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session
 
 if TYPE_CHECKING:
-    from service.storage.store import Store
+    from abbe.service.storage.store import Store
 
 
 def listen(
@@ -21,15 +21,15 @@ def listen(
     accept_table: AcceptTable = False,
 ) -> None:
     """Listen to the laser while the operator runs the NC program of a recipe; its standstills become the readings."""
-    from service.cli.running import run_job
-    from service.clock import SystemClock
-    from service.config import load_machine
-    from service.sequences.check import paced
-    from service.sequences.recipe_file import read_recipe
-    from service.sequences.steps import CampaignPlan
-    from service.site import site_of
-    from service.storage.store import Store
-    from service.workflows import listen_campaign
+    from abbe.service.cli.running import run_job
+    from abbe.service.clock import SystemClock
+    from abbe.service.config import load_machine
+    from abbe.service.sequences.check import paced
+    from abbe.service.sequences.recipe_file import read_recipe
+    from abbe.service.sequences.steps import CampaignPlan
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows import listen_campaign
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)

@@ -13,15 +13,15 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from models.machine import Machine
-    from service.config import Loaded
-    from service.config_schema import MachineFile
-    from service.devices.session import Session
-    from service.events import ProgressSink
-    from service.sequences.control import Control
-    from service.sequences.steps import CampaignPlan
-    from service.site import Site
-    from service.storage.store import Store
+    from abbe.models.machine import Machine
+    from abbe.service.config import Loaded
+    from abbe.service.config_schema import MachineFile
+    from abbe.service.devices.session import Session
+    from abbe.service.events import ProgressSink
+    from abbe.service.sequences.control import Control
+    from abbe.service.sequences.steps import CampaignPlan
+    from abbe.service.site import Site
+    from abbe.service.storage.store import Store
 
 MachineArgument = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")]
 AcceptTable = Annotated[
@@ -49,14 +49,14 @@ def measure(  # noqa: PLR0913 - one argument for each option
     accept_table: AcceptTable = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
-    from service.cli.rehearse import Rehearsal
-    from service.cli.running import run_job
-    from service.clock import SystemClock
-    from service.config import load_machine
-    from service.sequences.check import dry_run_campaign, paced
-    from service.sequences.control import Control
-    from service.site import site_of
-    from service.storage.store import Store
+    from abbe.service.cli.rehearse import Rehearsal
+    from abbe.service.cli.running import run_job
+    from abbe.service.clock import SystemClock
+    from abbe.service.config import load_machine
+    from abbe.service.sequences.check import dry_run_campaign, paced
+    from abbe.service.sequences.control import Control
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
 
     rehearsal = Rehearsal(dry_run, path, picture, nc, out)
     instead = rehearsal.check((machine, Path(recipe)))
@@ -95,12 +95,12 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
     """Judge what was measured and store it as a check of the machine, which began with its campaign: a word for the table came before."""
     from datetime import datetime
 
-    from service.clock import SystemClock
-    from service.errors import MeasurementFault
-    from service.runs.columns import load_run
-    from service.scheduler.record import Occasion, found
-    from service.scheduler.slots import Schedule
-    from service.workflows.check import judged
+    from abbe.service.clock import SystemClock
+    from abbe.service.errors import MeasurementFault
+    from abbe.service.runs.columns import load_run
+    from abbe.service.scheduler.record import Occasion, found
+    from abbe.service.scheduler.slots import Schedule
+    from abbe.service.workflows.check import judged
 
     record = store.campaign(campaign)
     started = datetime.fromisoformat(record.created_utc)
@@ -119,9 +119,9 @@ def _said_before(loaded: Loaded, site: Site, plan: CampaignPlan, *, dry: bool) -
 
     With a controller `measure` refuses it, after what an interrupted push left there is taken back.
     """
-    from service.clock import SystemClock
-    from service.sequences.needed import check_configured, needed_by
-    from service.workflows.plausible import certificates, unattended
+    from abbe.service.clock import SystemClock
+    from abbe.service.sequences.needed import check_configured, needed_by
+    from abbe.service.workflows.plausible import certificates, unattended
 
     needed = needed_by(plan, air=site.watching.air_c is not None)
     if dry or site.urls.cnc is None:
@@ -142,11 +142,11 @@ class ByHand:
 
 async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: dict[str, Any], said: ByHand) -> None:
     """The measurement itself, from the beginning or from where it was broken off."""
-    from service.cli.ask import console_confirm
-    from service.cli.progress import display
-    from service.workflows.measure import Manner
-    from service.workflows.measure import measure as work
-    from service.workflows.resume import resume as find
+    from abbe.service.cli.ask import console_confirm
+    from abbe.service.cli.progress import display
+    from abbe.service.workflows.measure import Manner
+    from abbe.service.workflows.measure import measure as work
+    from abbe.service.workflows.resume import resume as find
 
     async def yes(_: str) -> bool:
         return True
@@ -165,7 +165,7 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
 
 def _source(recipe: str, helix: str, rate_hz: int) -> dict[str, Any]:
     """What a plan is made of; a recipe file's text with it, so that nobody needs the file to go on."""
-    from service.sequences.recipe_file import recipe_source
+    from abbe.service.sequences.recipe_file import recipe_source
 
     text = recipe_source(Path(recipe)) if recipe.endswith(".toml") else None
     return {"recipe": recipe or "quick-check", "helix": helix, "rate_hz": rate_hz, "text": text}
@@ -173,7 +173,7 @@ def _source(recipe: str, helix: str, rate_hz: int) -> dict[str, Any]:
 
 def _begun(store: Store, campaign: str) -> dict[str, Any]:
     """What the plan of a campaign was made of that was broken off."""
-    from service.workflows.resume import begun_source
+    from abbe.service.workflows.resume import begun_source
 
     return begun_source(store, campaign)
 
@@ -188,17 +188,17 @@ def correct(
     accept_table: AcceptTable = False,
 ) -> None:
     """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
-    from service.cli.running import run_job
-    from service.cli.waiting import taken_back_when_safe
-    from service.config import load_machine
-    from service.errors import TakenBack
-    from service.site import site_of
-    from service.storage.store import Store
-    from service.workflows.commission import check_commissioned
-    from service.workflows.correct import Correction
-    from service.workflows.correct import correct as work_correct
-    from service.workflows.proposals import check_certificates
-    from service.workflows.proved_levels import check_level
+    from abbe.service.cli.running import run_job
+    from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.config import load_machine
+    from abbe.service.errors import TakenBack
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.workflows.commission import check_commissioned
+    from abbe.service.workflows.correct import Correction
+    from abbe.service.workflows.correct import correct as work_correct
+    from abbe.service.workflows.proposals import check_certificates
+    from abbe.service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
@@ -207,7 +207,7 @@ def correct(
     said: list[str] = []
 
     async def work(store: Store) -> Correction:
-        from service.cli.progress import display
+        from abbe.service.cli.progress import display
 
         store.campaign(campaign)
         with display() as sink:
@@ -234,11 +234,11 @@ def correct(
 
 async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[dict[str, Any]]:
     """Runs of a verification with the present table: of a campaign in the store, or measured now where none is named."""
-    from service.clock import SystemClock
-    from service.sequences.campaigns import verification
-    from service.sequences.check import paced
-    from service.workflows.measure import measure as work_measure
-    from service.workflows.proposals import load_runs
+    from abbe.service.clock import SystemClock
+    from abbe.service.sequences.campaigns import verification
+    from abbe.service.sequences.check import paced
+    from abbe.service.workflows.measure import measure as work_measure
+    from abbe.service.workflows.proposals import load_runs
 
     if campaign:
         ids = [r.id for r in store.runs(campaign) if r.visible_status == "complete"]
@@ -254,10 +254,10 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
 
     ``accept_table``: the person at the console vouches for a table in force that this database did not push.
     """
-    from service.cli.ask import whoever_is_there
-    from service.devices.alone import alone
-    from service.workflows.proposals import by_whom
-    from service.workflows.recovered import recovered_session
+    from abbe.service.cli.ask import whoever_is_there
+    from abbe.service.devices.alone import alone
+    from abbe.service.workflows.proposals import by_whom
+    from abbe.service.workflows.recovered import recovered_session
 
     def told(text: str) -> None:
         typer.echo(text, err=True)
@@ -272,9 +272,9 @@ def warn_of_open_push(url: str, site: Site) -> None:
     """Without a connection: say on standard error what the journals know of a push that has not come to its end, into this control, or into
     another one that may be this one under another address (`open_pushes`).
     """
-    from service.cli.common import open_store
-    from service.errors import StoreError
-    from service.workflows.push_word import open_pushes
+    from abbe.service.cli.common import open_store
+    from abbe.service.errors import StoreError
+    from abbe.service.workflows.push_word import open_pushes
 
     try:
         store = open_store(url)
@@ -288,11 +288,11 @@ def warn_of_open_push(url: str, site: Site) -> None:
 
 def _plan(machine: Machine, source: dict[str, Any]) -> CampaignPlan:
     """The campaign, named after its recipe."""
-    from service.errors import ConfigError
-    from service.sequences.campaigns import identification, quick_check, verification
-    from service.sequences.recipe_file import parse_recipe, recipe_text
-    from service.sequences.recipes import Helix
-    from service.sequences.steps import CampaignPlan
+    from abbe.service.errors import ConfigError
+    from abbe.service.sequences.campaigns import identification, quick_check, verification
+    from abbe.service.sequences.recipe_file import parse_recipe, recipe_text
+    from abbe.service.sequences.recipes import Helix
+    from abbe.service.sequences.steps import CampaignPlan
 
     recipe, helix, rate_hz = str(source["recipe"]), str(source["helix"]), int(source["rate_hz"])
     if rate_hz < 1 or 1000 % rate_hz:

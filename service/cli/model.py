@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
 
 if TYPE_CHECKING:
-    from service.storage.records import ModelRecord
+    from abbe.service.storage.records import ModelRecord
 
 model = typer.Typer(
     help="The model book of a machine: versions with their effects, where each came from, and the way back.", no_args_is_help=True
@@ -44,8 +44,8 @@ def show_model(
     as_json: JsonOption = False,
 ) -> None:
     """Show one version: its effects with their size, what takes them out, and the runs they came from."""
-    from service.workflows.discovery_words import size_text
-    from service.workflows.model_book import REMEDIES, name_of
+    from abbe.service.workflows.discovery_words import size_text
+    from abbe.service.workflows.model_book import REMEDIES, name_of
 
     with open_store(database_url(db, machine_file)) as store:
         found = _version(store, machine, version)
@@ -71,10 +71,10 @@ def diff_models(
     as_json: JsonOption = False,
 ) -> None:
     """Show what one version has more, less or of another size than another."""
-    from service.report.numbers import with_uncertainty
-    from service.workflows.discovery_engine import catalogue
-    from service.workflows.discovery_words import unit
-    from service.workflows.model_book import differences, version
+    from abbe.service.report.numbers import with_uncertainty
+    from abbe.service.workflows.discovery_engine import catalogue
+    from abbe.service.workflows.discovery_words import unit
+    from abbe.service.workflows.model_book import differences, version
 
     with open_store(database_url(db, machine_file)) as store:
         a, b = version(store, machine, first), _version(store, machine, second)
@@ -101,7 +101,7 @@ def revert_model(
     machine_file: MachineOption = None,
 ) -> None:
     """Make an older version current again. Nothing is deleted: it is appended as a new version."""
-    from service.workflows.model_book import revert
+    from abbe.service.workflows.model_book import revert
 
     with open_store(database_url(db, machine_file)) as store:
         number = revert(store, machine, version)
@@ -110,7 +110,7 @@ def revert_model(
 
 def _version(store: Any, machine: str, number: int | None) -> ModelRecord:
     """A version, or the current one."""
-    from service.workflows.model_book import current, version
+    from abbe.service.workflows.model_book import current, version
 
     newest = current(store, machine)
     return version(store, machine, number if number is not None else (newest.version if newest is not None else 0))

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import JsonOption, print_json
+from abbe.service.cli.common import JsonOption, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from rich.console import Console
 
-    from service.papers.check import Outcome
-    from service.papers.row import Row, Status
-    from service.papers.run import PaperResult
+    from abbe.service.papers.check import Outcome
+    from abbe.service.papers.row import Row, Status
+    from abbe.service.papers.run import PaperResult
 
 WIDTH = 120
 """Columns of piped output; a terminal has its own."""
@@ -59,11 +59,11 @@ def papers(
     ] = None,
 ) -> None:
     """Compute what the four papers print, side by side with the printed numbers, and say for each other one why it cannot be."""
-    from service.papers.run import TITLES, document, results
+    from abbe.service.papers.run import TITLES, document, results
 
     found = results(TITLES if paper is None else (paper.value,))
     if html is not None:
-        from service.papers.page import write_page
+        from abbe.service.papers.page import write_page
 
         write_page(found, html)
     if as_json:
@@ -100,7 +100,7 @@ def show(found: Sequence[PaperResult], console: Console) -> None:
 
 
 def _numbers(console: Console, title: str, rows: Sequence[Row], notes: dict[str, int]) -> None:
-    from service.papers.words import lines
+    from abbe.service.papers.words import lines
 
     cells = [
         (line.where, line.quantity, line.printed, line.computed, line.difference, line.within, line.status, _key(line.note, notes))
@@ -111,7 +111,7 @@ def _numbers(console: Console, title: str, rows: Sequence[Row], notes: dict[str,
 
 
 def _checks(console: Console, result: PaperResult, notes: dict[str, int]) -> None:
-    from service.papers.words import check_lines
+    from abbe.service.papers.words import check_lines
 
     cells = [(*line[:-1], _key(line[-1], notes)) for line in check_lines(result.checks)]
     if cells:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, print_json, print_table
 
 if TYPE_CHECKING:
-    from service.workflows.plan import Planned
+    from abbe.service.workflows.plan import Planned
 
 HEADINGS = ("no", "label", "measurement", "min", "until min", "worst U µm", "mean U µm")
 
@@ -31,12 +31,12 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
-    from service.cli.progress import display
-    from service.config import load_machine
-    from service.report.page_file import write_page
-    from service.site import site_of
-    from service.workflows.plan import plan_doc, plan_for, plan_page
-    from service.workflows.plan_instruments import read_instruments
+    from abbe.service.cli.progress import display
+    from abbe.service.config import load_machine
+    from abbe.service.report.page_file import write_page
+    from abbe.service.site import site_of
+    from abbe.service.workflows.plan import plan_doc, plan_for, plan_page
+    from abbe.service.workflows.plan_instruments import read_instruments
 
     site = site_of(load_machine(machine).machine)
     tools = read_instruments(instruments)
@@ -55,7 +55,7 @@ def plan(
 
 def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:
     """Before half a minute of planning: no folder, nothing that is read here, no file twice."""
-    from service.errors import ConfigError
+    from abbe.service.errors import ConfigError
 
     taken = [p.resolve() for p in sources if p is not None]
     for target in targets:
@@ -70,7 +70,7 @@ def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None,
 
 
 def _print(planned: Planned, out: Path | None, picture: Path | None) -> None:
-    from service.workflows.plan import BOUND_NOTE, goal_words, step_rows, temperature_words
+    from abbe.service.workflows.plan import BOUND_NOTE, goal_words, step_rows, temperature_words
 
     print_table(HEADINGS, step_rows(planned.plan), f"{planned.plan.minutes:.0f} minutes, set-ups included")
     typer.echo(BOUND_NOTE)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from service.events import Progress, ProgressSink
+    from abbe.service.events import Progress, ProgressSink
 
 
 @contextmanager

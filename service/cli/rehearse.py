@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from service.sequences.check import DryRun
-    from service.sequences.steps import CampaignPlan
-    from service.site import Site
+    from abbe.service.sequences.check import DryRun
+    from abbe.service.sequences.steps import CampaignPlan
+    from abbe.service.site import Site
 
 
 HAIR = 1e-6
@@ -38,7 +38,7 @@ class Rehearsal:
         ConfigError
             Options that do not go together, or a file that would overwrite what it is made of.
         """
-        from service.errors import ConfigError
+        from abbe.service.errors import ConfigError
 
         if self.picture is not None and not self.dry_run:
             raise ConfigError("--picture draws a dry run", "add --dry-run")
@@ -55,9 +55,9 @@ class Rehearsal:
 
     def run(self, site: Site, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> None:
         """Print, draw or write it."""
-        from service.report.page_file import write_page
-        from service.sequences.nc.write import nc_program
-        from service.workflows.dry_page import dry_page
+        from abbe.service.report.page_file import write_page
+        from abbe.service.sequences.nc.write import nc_program
+        from abbe.service.workflows.dry_page import dry_page
 
         if self.nc and self.out is not None:
             made = nc_program(site.name, site.machine, plan, self.nc, site.nc)
@@ -74,7 +74,7 @@ class Rehearsal:
 
 def print_path(plan: CampaignPlan) -> None:
     """Every commanded position of the plan, one CSV line each: test, X, Y, Z in mm."""
-    from service.sequences.check import positions
+    from abbe.service.sequences.check import positions
 
     typer.echo("test,x_mm,y_mm,z_mm")
     for test in plan.tests:

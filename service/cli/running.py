@@ -11,8 +11,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, TypeVar
 
-from service.errors import Stopped
-from service.sequences.control import Control
+from abbe.service.errors import Stopped
+from abbe.service.sequences.control import Control
 
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
 T = TypeVar("T")
@@ -63,7 +63,7 @@ async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int],
     assert task is not None
 
     def stop(number: int, _frame: FrameType | None) -> None:
-        # A second signal cancels once more: what must reach the machine is shielded from it (drivers.links.shielded).
+        # A second signal cancels once more: what must reach the machine is shielded from it (abbe.drivers.links.shielded).
         received.append(number)
         gently = control is not None and number == signal.SIGINT and len(received) == 1
         if control is not None:  # whatever takes a cancellation for something else still sees what was asked for

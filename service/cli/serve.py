@@ -7,33 +7,33 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.errors import AbbeError
+from abbe.service.errors import AbbeError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from service.capture.live import LiveFeed
-    from service.channel.messages import MachineTold
-    from service.config import Loaded
-    from service.config_timetable import AlarmSection
-    from service.core.campaigns import CampaignOrder, MeasureCampaign
-    from service.core.orders import Hands
-    from service.core.setup import Setup
-    from service.events import ProgressSink
-    from service.mqtt.broker import Broker
-    from service.plant.opcua.setup import OpcUaSetup
-    from service.scheduler.desk import Duties
-    from service.scheduler.ports import Check, CheckResult
-    from service.scheduler.store import ServiceStore
-    from service.sequences.control import Control
-    from service.sequences.steps import CampaignPlan
-    from service.site import Site
-    from service.workflows.alarm_states import Alarm
-    from service.workflows.bring_back import BackOrder
-    from service.workflows.investigate import Note
-    from service.workflows.led_campaign import Led
-    from service.workflows.push_approved import Order
-    from service.workflows.push_word import Outcome
+    from abbe.service.capture.live import LiveFeed
+    from abbe.service.channel.messages import MachineTold
+    from abbe.service.config import Loaded
+    from abbe.service.config_timetable import AlarmSection
+    from abbe.service.core.campaigns import CampaignOrder, MeasureCampaign
+    from abbe.service.core.orders import Hands
+    from abbe.service.core.setup import Setup
+    from abbe.service.events import ProgressSink
+    from abbe.service.mqtt.broker import Broker
+    from abbe.service.plant.opcua.setup import OpcUaSetup
+    from abbe.service.scheduler.desk import Duties
+    from abbe.service.scheduler.ports import Check, CheckResult
+    from abbe.service.scheduler.store import ServiceStore
+    from abbe.service.sequences.control import Control
+    from abbe.service.sequences.steps import CampaignPlan
+    from abbe.service.site import Site
+    from abbe.service.workflows.alarm_states import Alarm
+    from abbe.service.workflows.bring_back import BackOrder
+    from abbe.service.workflows.investigate import Note
+    from abbe.service.workflows.led_campaign import Led
+    from abbe.service.workflows.push_approved import Order
+    from abbe.service.workflows.push_word import Outcome
 
 
 LONGEST_NAME = 180
@@ -48,9 +48,9 @@ def serve(
     ] = False,
 ) -> None:
     """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
-    from service.config import load_machine
-    from service.logs import configure_logs
-    from service.serve import serve as run
+    from abbe.service.config import load_machine
+    from abbe.service.logs import configure_logs
+    from abbe.service.serve import serve as run
 
     setup = setup_of(load_machine(machine), port)
     configure_logs()
@@ -73,21 +73,21 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: better now than at
         the first slot, at night.
     """
-    from service.capture.live import LiveFeed
-    from service.clock import SystemClock
-    from service.core.setup import Setup
-    from service.mqtt.topics import Topics
-    from service.scheduler.ready import Ready, look_at
-    from service.scheduler.timetable import schedules_of, windows_of
-    from service.sequences.check import dry_run_campaign, paced
-    from service.sequences.steps import CampaignPlan
-    from service.site import site_of
-    from service.workflows.at_start import recover_at_start
-    from service.workflows.check import run_check
-    from service.workflows.in_force import look_at_table
-    from service.workflows.plausible import check_unattended, doubts
-    from service.workflows.report import rules_of
-    from service.workflows.shipped import RECIPES, campaign_plan
+    from abbe.service.capture.live import LiveFeed
+    from abbe.service.clock import SystemClock
+    from abbe.service.core.setup import Setup
+    from abbe.service.mqtt.topics import Topics
+    from abbe.service.scheduler.ready import Ready, look_at
+    from abbe.service.scheduler.timetable import schedules_of, windows_of
+    from abbe.service.sequences.check import dry_run_campaign, paced
+    from abbe.service.sequences.steps import CampaignPlan
+    from abbe.service.site import site_of
+    from abbe.service.workflows.at_start import recover_at_start
+    from abbe.service.workflows.check import run_check
+    from abbe.service.workflows.in_force import look_at_table
+    from abbe.service.workflows.plausible import check_unattended, doubts
+    from abbe.service.workflows.report import rules_of
+    from abbe.service.workflows.shipped import RECIPES, campaign_plan
 
     config = loaded.machine
     check_unattended(config, loaded.path.resolve().parent)
@@ -137,7 +137,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
 
 
 def _told(site: Site) -> MachineTold:
-    from service.channel.messages import MachineTold
+    from abbe.service.channel.messages import MachineTold
 
     doc = site.doc
     axes = {axis: (float(low), float(high)) for axis, (low, high) in doc["stroke_mm"].items()}
@@ -149,7 +149,7 @@ def _told(site: Site) -> MachineTold:
 def _broker(loaded: Loaded) -> Broker | None:
     from dataclasses import replace
 
-    from service.mqtt.broker import parse
+    from abbe.service.mqtt.broker import parse
 
     mqtt = loaded.machine.mqtt
     if mqtt.url is None:
@@ -161,7 +161,7 @@ def _broker(loaded: Loaded) -> Broker | None:
 
 
 def _opcua(loaded: Loaded) -> OpcUaSetup | None:
-    from service.plant.opcua.setup import OpcUaSetup
+    from abbe.service.plant.opcua.setup import OpcUaSetup
 
     given = loaded.machine.opcua
     if not given.enabled:
@@ -179,10 +179,10 @@ def duties_on(
 
     ``plan``: the full campaign; ``rate_hz``: of verifications; ``live``: is shown what the campaign's paths read.
     """
-    from service.clock import SystemClock
-    from service.scheduler.desk import Duties
-    from service.workflows.investigate import Bench, investigate
-    from service.workflows.push_approved import push_approved
+    from abbe.service.clock import SystemClock
+    from abbe.service.scheduler.desk import Duties
+    from abbe.service.workflows.investigate import Bench, investigate
+    from abbe.service.workflows.push_approved import push_approved
 
     def duties(store: ServiceStore) -> Duties:
         clock = SystemClock()
@@ -200,10 +200,10 @@ def duties_on(
 
 def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]:
     """Return what a person can order of tables, given the service's store: a push only where the service does not push by itself."""
-    from service.clock import SystemClock
-    from service.core.orders import Hands
-    from service.workflows.bring_back import bring_back
-    from service.workflows.push_approved import push_approved
+    from abbe.service.clock import SystemClock
+    from abbe.service.core.orders import Hands
+    from abbe.service.workflows.bring_back import bring_back
+    from abbe.service.workflows.push_approved import push_approved
 
     def on(store: ServiceStore) -> Hands:
         async def back(order: BackOrder) -> Outcome:
@@ -219,9 +219,9 @@ def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]
 
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[ServiceStore], MeasureCampaign]:
     """Return how a full campaign is measured that a person starts, given the service's store."""
-    from service.clock import SystemClock
-    from service.workflows.investigate import Bench
-    from service.workflows.led_campaign import full_campaign, led_campaign, named_now
+    from abbe.service.clock import SystemClock
+    from abbe.service.workflows.investigate import Bench
+    from abbe.service.workflows.led_campaign import full_campaign, led_campaign, named_now
 
     def on(store: ServiceStore) -> MeasureCampaign:
         async def measure(order: CampaignOrder) -> Led:
@@ -236,9 +236,9 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
 
 def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
     """The full campaigns that can be started on this machine: the shipped one, and what the machine file names for alarms."""
-    from service.sequences.check import dry_run_campaign, paced
-    from service.workflows.led_campaign import full_campaign
-    from service.workflows.shipped import IDENTIFICATION
+    from abbe.service.sequences.check import dry_run_campaign, paced
+    from abbe.service.workflows.led_campaign import full_campaign
+    from abbe.service.workflows.shipped import IDENTIFICATION
 
     def fits(name: str) -> bool:
         try:
@@ -258,8 +258,8 @@ def _beside(machine_file: Path, name: str) -> str:
 
 def _fits(recipe: str, site: Site) -> bool:
     """Whether a recipe can be offered on this machine at all: its paths lie inside the strokes."""
-    from service.sequences.check import dry_run_campaign
-    from service.workflows.shipped import recipe_plan
+    from abbe.service.sequences.check import dry_run_campaign
+    from abbe.service.workflows.shipped import recipe_plan
 
     try:
         dry_run_campaign(site.machine, recipe_plan(recipe, site.machine), site.max_feed_mm_min)

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, run_or_campaign
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, run_or_campaign
 
 if TYPE_CHECKING:
-    from service.storage.records import ChunkRecord, RunRecord
+    from abbe.service.storage.records import ChunkRecord, RunRecord
 
 
 def runs(
@@ -38,10 +38,10 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show one run: state, setup and what its columns hold (--json: as an exchange file). Or a campaign: runs and incidents."""
-    from service.cli.show_campaign import show_campaign
-    from service.runs.columns import run_document, whole_document
-    from service.runs.coverage import not_judged, with_state
-    from service.storage.records import RunRecord
+    from abbe.service.cli.show_campaign import show_campaign
+    from abbe.service.runs.columns import run_document, whole_document
+    from abbe.service.runs.coverage import not_judged, with_state
+    from abbe.service.storage.records import RunRecord
 
     with open_store(database_url(db, machine)) as store:
         record = run_or_campaign(store, run)
@@ -86,8 +86,8 @@ def _told(run: RunRecord) -> str:
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
     """Where every ball-bar sample ended: stored, flagged, or in which gap."""
-    from service.capture.account import ledger_of, streams_told
-    from service.capture.ledger import FLAGS
+    from abbe.service.capture.account import ledger_of, streams_told
+    from abbe.service.capture.ledger import FLAGS
 
     streams = streams_told(run.end_doc)
     ledger = ledger_of(chunks, streams)

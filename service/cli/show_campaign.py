@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from service.cli.common import print_json, print_table
+from abbe.service.cli.common import print_json, print_table
 
 if TYPE_CHECKING:
-    from service.sequences.incident_account import Trouble
-    from service.storage.records import CampaignRecord
-    from service.storage.store import Store
+    from abbe.service.sequences.incident_account import Trouble
+    from abbe.service.storage.records import CampaignRecord
+    from abbe.service.storage.store import Store
 
 
 def show_campaign(store: Store, campaign: CampaignRecord, *, as_json: bool) -> None:
     """Print a campaign: one line for each run, one for each kind of trouble on a link and how it ended."""
-    from service.sequences.incident_account import not_written, troubles
+    from abbe.service.sequences.incident_account import not_written, troubles
 
     runs, journal = store.runs(campaign.id), store.checkpoints(campaign.id)
     found, lost = troubles(journal), not_written(journal)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, print_json, print_table
-from service.cli.discover import opened
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, print_json, print_table
+from abbe.service.cli.discover import opened
 
 if TYPE_CHECKING:
-    from service.workflows.discover import Job
-    from service.workflows.simulate import Simulation
+    from abbe.service.workflows.discover import Job
+    from abbe.service.workflows.simulate import Simulation
 
 
 def simulate(
@@ -27,14 +27,14 @@ def simulate(
 
     The present model is what the campaign says, with the effects of the machine's model book.
     """
-    from service.cli.progress import display
-    from service.events import Progress
-    from service.workflows.discover import prepare
-    from service.workflows.discovery_engine import catalogue
-    from service.workflows.model_book import current
-    from service.workflows.simulate import simulate as work
-    from service.workflows.simulate import simulation_doc
-    from service.workflows.table_out import NO_TABLE, table_then
+    from abbe.service.cli.progress import display
+    from abbe.service.events import Progress
+    from abbe.service.workflows.discover import prepare
+    from abbe.service.workflows.discovery_engine import catalogue
+    from abbe.service.workflows.model_book import current
+    from abbe.service.workflows.simulate import simulate as work
+    from abbe.service.workflows.simulate import simulation_doc
+    from abbe.service.workflows.table_out import NO_TABLE, table_then
 
     with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
         sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
@@ -55,12 +55,12 @@ def simulate(
 
 
 def _write_report(job: Job, told: Simulation, target: Path) -> None:
-    from service.clock import SystemClock
-    from service.report.discovery_page import render_discovery
-    from service.report.page_file import write_page
-    from service.workflows.discover import Journal
-    from service.workflows.discovery_pages import discovery_page, page_facts
-    from service.workflows.simulate import simulated_finding, verdict_line
+    from abbe.service.clock import SystemClock
+    from abbe.service.report.discovery_page import render_discovery
+    from abbe.service.report.page_file import write_page
+    from abbe.service.workflows.discover import Journal
+    from abbe.service.workflows.discovery_pages import discovery_page, page_facts
+    from abbe.service.workflows.simulate import simulated_finding, verdict_line
 
     facts, said = page_facts(job, Journal(), SystemClock().utc().isoformat(timespec="seconds"))
     finding = simulated_finding(job, told)
@@ -69,8 +69,8 @@ def _write_report(job: Job, told: Simulation, target: Path) -> None:
 
 
 def _print(doc: dict[str, Any]) -> None:
-    from service.report.numbers import plain
-    from service.workflows.simulate import verdict_line
+    from abbe.service.report.numbers import plain
+    from abbe.service.workflows.simulate import verdict_line
 
     version = (
         "" if doc["model_version"] is None else f", model version {doc['model_version']} ({', '.join(doc['known_effects']) or 'no effect'})"

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import JsonOption, MachineOption, print_json, print_table
-from service.cli.solve import ModelName
+from abbe.service.cli.common import JsonOption, MachineOption, print_json, print_table
+from abbe.service.cli.solve import ModelName
 
 if TYPE_CHECKING:
-    from service.workflows.executors import Executor
+    from abbe.service.workflows.executors import Executor
 
 
 def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
@@ -26,10 +26,10 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     as_json: JsonOption = False,
 ) -> None:
     """Solve many campaigns of a database anew, each exactly as abbe solve does; exit code 1 if one was refused."""
-    from service.cli.common import database_url, open_store
-    from service.errors import StoreError
-    from service.workflows.reanalysis import HEADINGS, row, tasks_of
-    from service.workflows.reanalysis import solve_all as run
+    from abbe.service.cli.common import database_url, open_store
+    from abbe.service.errors import StoreError
+    from abbe.service.workflows.reanalysis import HEADINGS, row, tasks_of
+    from abbe.service.workflows.reanalysis import solve_all as run
 
     url = database_url(db, machine)
     with open_store(url) as store:
@@ -45,8 +45,8 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
 
 
 def _executor(workers: int, dask: str | None) -> Executor:
-    from service.errors import ConfigError
-    from service.workflows.executors import Dask, Here, Processes
+    from abbe.service.errors import ConfigError
+    from abbe.service.workflows.executors import Dask, Here, Processes
 
     if dask is None:
         return Here() if workers == 1 else Processes(workers)

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from service.children import python_words
+from abbe.service.children import python_words
 
 SIM_SETTINGS: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Everything after ``sim`` belongs to the simulators, ``--help`` included."""
@@ -22,14 +22,14 @@ def version() -> None:
     import sqlite3
     from importlib import metadata
 
-    from service.storage.engine import wal_is_safe
+    from abbe.service.storage.engine import wal_is_safe
 
     log = "write-ahead log" if wal_is_safe() else "no write-ahead log: this SQLite has the WAL-reset bug"
     typer.echo(f"abbe {metadata.version('abbe')} (Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}, {log})")
 
 
 def sim(context: typer.Context) -> None:
-    """Run the simulated machine and its instruments; arguments go to the module `simulators`."""
+    """Run the simulated machine and its instruments; arguments go to the module `abbe.simulators`."""
     # A group of its own: Ctrl-C reaches the child once, from here, and not a second time from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
     words = list(context.args)
@@ -37,7 +37,7 @@ def sim(context: typer.Context) -> None:
         # The child ends when this pipe closes: not even SIGKILL of this process leaves it behind.
         words.append("--watch-stdin")
         own_group["stdin"] = subprocess.PIPE
-    child = subprocess.Popen(python_words("simulators", *words), **own_group)  # noqa: S603 - our own package
+    child = subprocess.Popen(python_words("abbe.simulators", *words), **own_group)  # noqa: S603 - our own package
 
     def forward(number: int, _frame: FrameType | None) -> None:
         if child.poll() is None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, print_json, print_table
 
 
 def trend(
@@ -25,12 +25,12 @@ def trend(
     as_json: JsonOption = False,
 ) -> None:
     """Trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
-    from service.cli.common import open_store
-    from service.config import load_machine
-    from service.devices.urls import control_of
-    from service.scheduler.store import ServiceStore
-    from service.workflows.trend_table import HEADINGS, as_doc, row, trends
-    from service.workflows.verified_by import measure_now, verified_by
+    from abbe.service.cli.common import open_store
+    from abbe.service.config import load_machine
+    from abbe.service.devices.urls import control_of
+    from abbe.service.scheduler.store import ServiceStore
+    from abbe.service.workflows.trend_table import HEADINGS, as_doc, row, trends
+    from abbe.service.workflows.verified_by import measure_now, verified_by
 
     loaded = load_machine(machine)
     since = _moment(after)
@@ -55,7 +55,7 @@ def trend(
 def _moment(text: str | None) -> datetime | None:
     from datetime import UTC
 
-    from service.errors import ConfigError
+    from abbe.service.errors import ConfigError
 
     if text is None:
         return None

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
 
 if TYPE_CHECKING:
-    from service.storage.store import Store
-    from service.users.people import People
+    from abbe.service.storage.store import Store
+    from abbe.service.users.people import People
 
 user = typer.Typer(help="Users of the page and of the interface: viewer, operator, metrologist, approver, admin.", no_args_is_help=True)
 token = typer.Typer(help="Tokens of programs: the rights of a user, at most those of their scopes.", no_args_is_help=True)
@@ -120,8 +120,8 @@ def revoke_token(
 
 @contextmanager
 def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) -> Iterator[tuple[People, Store]]:
-    from service.clock import SystemClock
-    from service.users.people import People
+    from abbe.service.clock import SystemClock
+    from abbe.service.users.people import People
 
     url = database_url(db, machine)
     with open_store(url, must_exist=must_exist) as store:
@@ -131,7 +131,7 @@ def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) ->
 
 def _password() -> str:
     """From a terminal, typed twice and not shown; else the first line of standard input. Never an argument: those are seen by everybody."""
-    from service.errors import PasswordRefused
+    from abbe.service.errors import PasswordRefused
 
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\r\n")

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli import BAD_INPUT, complain
-from service.cli.common import JsonOption, print_json, print_table
-from service.errors import FileFormatError
+from abbe.service.cli import BAD_INPUT, complain
+from abbe.service.cli.common import JsonOption, print_json, print_table
+from abbe.service.errors import FileFormatError
 
 if TYPE_CHECKING:
-    from service.vectors.checks import Checks
+    from abbe.service.vectors.checks import Checks
 
 
 def vectors(
@@ -20,7 +20,7 @@ def vectors(
     as_json: JsonOption = False,
 ) -> None:
     """Compute every number of the vector files anew from the files' own inputs and compare. Exit 1: one is off; 2: a file is unusable."""
-    from service.vectors.run import READERS, examine, vector_files
+    from abbe.service.vectors.run import READERS, examine, vector_files
 
     files = vector_files(folder)
     checked = []

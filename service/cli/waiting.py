@@ -12,9 +12,9 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from service.devices.session import Session
-    from service.site import Site
-    from service.storage.store import Store
+    from abbe.service.devices.session import Session
+    from abbe.service.site import Site
+    from abbe.service.storage.store import Store
 
 
 @asynccontextmanager
@@ -24,9 +24,9 @@ async def taken_back_when_safe(session: Session, store: Store, site: Site, wait_
     Without a console, or with ``wait_s`` 0, the error goes on as it is: the next start of any command takes the table back first. Ctrl-C
     ends the waiting, with the same consequence.
     """
-    from service.clock import SystemClock
-    from service.errors import StillActive
-    from service.workflows.pending import finish_when_safe
+    from abbe.service.clock import SystemClock
+    from abbe.service.errors import StillActive
+    from abbe.service.workflows.pending import finish_when_safe
 
     try:
         yield

@@ -13,18 +13,18 @@ from functools import partial
 
 import structlog
 
-from service.audit.book import AuditBook
-from service.audit.chain import Event
-from service.core.jobs import BY_HAND, ByHand, Full
-from service.core.rights import person
-from service.errors import AbbeError, Aborted, Stopped
-from service.events import Progress, ProgressSink
-from service.scheduler import record
-from service.scheduler.job import FAILURES
-from service.scheduler.ports import JobWatcher, SlotState
-from service.scheduler.slots import Schedule
-from service.sequences.control import Control, State
-from service.workflows.led_campaign import Led, is_full
+from abbe.service.audit.book import AuditBook
+from abbe.service.audit.chain import Event
+from abbe.service.core.jobs import BY_HAND, ByHand, Full
+from abbe.service.core.rights import person
+from abbe.service.errors import AbbeError, Aborted, Stopped
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.scheduler import record
+from abbe.service.scheduler.job import FAILURES
+from abbe.service.scheduler.ports import JobWatcher, SlotState
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.sequences.control import Control, State
+from abbe.service.workflows.led_campaign import Led, is_full
 
 log = structlog.get_logger("abbe.campaign")
 

@@ -1,5 +1,6 @@
 """The jobs of this run of the service, by number, and how a person steers them: checks of the timetable, checks and full campaigns that a
-person starts, and what follows from alarms: investigations and pushes. What a person orders of tables (`service.core.orders`) is a job too.
+person starts, and what follows from alarms: investigations and pushes. What a person orders of tables (`abbe.service.core.orders`) is a job
+too.
 
 Rights are decided here, not where a request comes from: the web process says who asks, and the users' table says what he may.
 """
@@ -16,12 +17,12 @@ from typing import Protocol
 
 import structlog
 
-from service.channel.messages import MOST_JOBS, Answer, DoneByHand, JobSeen, Outcome, StartJob, SteerJob
-from service.clock import Clock
-from service.scheduler.ports import Errand, JobKind, SlotState
-from service.scheduler.slots import Schedule
-from service.sequences.control import Control, State
-from service.workflows.shipped import parted
+from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, JobSeen, Outcome, StartJob, SteerJob
+from abbe.service.clock import Clock
+from abbe.service.scheduler.ports import Errand, JobKind, SlotState
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.sequences.control import Control, State
+from abbe.service.workflows.shipped import parted
 
 log = structlog.get_logger("abbe.jobs")
 

@@ -6,10 +6,10 @@ import asyncio
 from base64 import b64encode
 from dataclasses import asdict
 
-from service.capture.live import LiveFeed, Stretch
-from service.channel.messages import LivePath, LiveSamples
-from service.channel.wire import Wire
-from service.clock import Clock
+from abbe.service.capture.live import LiveFeed, Stretch
+from abbe.service.channel.messages import LivePath, LiveSamples
+from abbe.service.channel.wire import Wire
+from abbe.service.clock import Clock
 
 FRAME_S = 0.05
 """Between two messages: 20 Hz, about 50 samples each at 1 kHz."""

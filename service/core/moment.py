@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from service.channel.messages import CheckNow, DeviceSeen, DueSlot, Moment
-from service.clock import Clock
-from service.core.jobs import JobBook
-from service.scheduler.slots import Schedule
-from service.web.board import Board
+from abbe.service.channel.messages import CheckNow, DeviceSeen, DueSlot, Moment
+from abbe.service.clock import Clock
+from abbe.service.core.jobs import JobBook
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.web.board import Board
 
 AGAIN = timedelta(minutes=1)
 """The timetable is looked at no more often than this, unless a slot has come: it changes only then."""

@@ -9,12 +9,12 @@ from collections.abc import Awaitable, Callable, MutableSequence
 
 import structlog
 
-from drivers.errors import DriverError
-from service.clock import Clock
-from service.core.jobs import Place
-from service.errors import AbbeError, MachineInUse
-from service.scheduler import record
-from service.scheduler.loop import Alarms
+from abbe.drivers.errors import DriverError
+from abbe.service.clock import Clock
+from abbe.service.core.jobs import Place
+from abbe.service.errors import AbbeError, MachineInUse
+from abbe.service.scheduler import record
+from abbe.service.scheduler.loop import Alarms
 
 log = structlog.get_logger("abbe.recovery")
 

@@ -17,28 +17,28 @@ from typing import Final, Literal
 
 import structlog
 
-from service.audit.book import AuditBook
-from service.audit.chain import Event
-from service.channel.messages import Answer, PushNow, RollBack
-from service.channel.messages import Outcome as Word
-from service.clock import Clock
-from service.core.jobs import BY_HAND, JobBook, Wish
-from service.errors import AbbeError, Aborted, Stopped, StoreError, TableRefused
-from service.events import Progress
-from service.scheduler import record
-from service.scheduler.job import FAILURES
-from service.scheduler.keep import Patient
-from service.scheduler.ports import Doc, JobKind, JobWatcher, SlotState
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.sequences.control import Control, State
-from service.workflows.bring_back import BackOrder
-from service.workflows.proposal_doc import load
-from service.workflows.proposal_states import standing
-from service.workflows.push_approved import Order
-from service.workflows.push_word import STOPPED, Outcome, in_force, last_push, ordered, put_right
-from service.workflows.rollback import Ordered
-from service.workflows.table_story import offered
+from abbe.service.audit.book import AuditBook
+from abbe.service.audit.chain import Event
+from abbe.service.channel.messages import Answer, PushNow, RollBack
+from abbe.service.channel.messages import Outcome as Word
+from abbe.service.clock import Clock
+from abbe.service.core.jobs import BY_HAND, JobBook, Wish
+from abbe.service.errors import AbbeError, Aborted, Stopped, StoreError, TableRefused
+from abbe.service.events import Progress
+from abbe.service.scheduler import record
+from abbe.service.scheduler.job import FAILURES
+from abbe.service.scheduler.keep import Patient
+from abbe.service.scheduler.ports import Doc, JobKind, JobWatcher, SlotState
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.control import Control, State
+from abbe.service.workflows.bring_back import BackOrder
+from abbe.service.workflows.proposal_doc import load
+from abbe.service.workflows.proposal_states import standing
+from abbe.service.workflows.push_approved import Order
+from abbe.service.workflows.push_word import STOPPED, Outcome, in_force, last_push, ordered, put_right
+from abbe.service.workflows.rollback import Ordered
+from abbe.service.workflows.table_story import offered
 
 log = structlog.get_logger("abbe.orders")
 

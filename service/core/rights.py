@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.storage.store import Store
-from service.users.roles import ALLOWED, Permission, Role
+from abbe.service.storage.store import Store
+from abbe.service.users.roles import ALLOWED, Permission, Role
 
 
 def may(store: Store, who: str, need: Permission) -> bool:
@@ -14,7 +14,7 @@ def may(store: Store, who: str, need: Permission) -> bool:
     store : Store
         Holds the users.
     who : str
-        As `service.users.people.Principal` names him.
+        As `abbe.service.users.people.Principal` names him.
     need : Permission
         The right.
     """

@@ -1,4 +1,4 @@
-"""What the service is to do, taken from the machine file: everything that `service.serve` is wired from."""
+"""What the service is to do, taken from the machine file: everything that `abbe.service.serve` is wired from."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.capture.live import LiveFeed
-from service.channel.messages import PAGE_MEMORY_MB, MachineTold
-from service.clock import Clock
-from service.core.campaigns import MeasureCampaign
-from service.core.open_ends import Recover
-from service.core.orders import Hands
-from service.devices.urls import control_of
-from service.mqtt.broker import Broker
-from service.mqtt.topics import Topics
-from service.plant.opcua.setup import OpcUaSetup
-from service.scheduler.desk import Duties
-from service.scheduler.ports import Check, Readiness
-from service.scheduler.ready import AlwaysReady
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.scheduler.windows import Window
-from service.workflows.in_force import LookAtTable
-from service.workflows.report_parts import Rules
+from abbe.service.capture.live import LiveFeed
+from abbe.service.channel.messages import PAGE_MEMORY_MB, MachineTold
+from abbe.service.clock import Clock
+from abbe.service.core.campaigns import MeasureCampaign
+from abbe.service.core.open_ends import Recover
+from abbe.service.core.orders import Hands
+from abbe.service.devices.urls import control_of
+from abbe.service.mqtt.broker import Broker
+from abbe.service.mqtt.topics import Topics
+from abbe.service.plant.opcua.setup import OpcUaSetup
+from abbe.service.scheduler.desk import Duties
+from abbe.service.scheduler.ports import Check, Readiness
+from abbe.service.scheduler.ready import AlwaysReady
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.scheduler.windows import Window
+from abbe.service.workflows.in_force import LookAtTable
+from abbe.service.workflows.report_parts import Rules
 
 
 @dataclass(frozen=True, slots=True)

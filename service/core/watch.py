@@ -7,14 +7,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 
-from service.clock import Clock
-from service.errors import StoreError
-from service.events import Progress
-from service.mqtt.publisher import Publisher
-from service.scheduler.ports import Doc
-from service.scheduler.slots import Schedule
-from service.web.board import Board
-from service.workflows.verified_by import VerifiedBy
+from abbe.service.clock import Clock
+from abbe.service.errors import StoreError
+from abbe.service.events import Progress
+from abbe.service.mqtt.publisher import Publisher
+from abbe.service.scheduler.ports import Doc
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.web.board import Board
+from abbe.service.workflows.verified_by import VerifiedBy
 
 LOOK_S = 5.0
 

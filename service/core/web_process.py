@@ -14,8 +14,8 @@ from contextlib import suppress
 
 import structlog
 
-from service.capture.live import LiveFeed
-from service.channel.messages import (
+from abbe.service.capture.live import LiveFeed
+from abbe.service.channel.messages import (
     PROTOCOL,
     Alive,
     Answer,
@@ -31,14 +31,14 @@ from service.channel.messages import (
     Up,
     from_web,
 )
-from service.channel.wire import Wire
-from service.children import python_words
-from service.clock import Clock
-from service.core.jobs import JobBook
-from service.core.limits import keep_within
-from service.core.live import show_live
-from service.core.orders import Orders
-from service.errors import AbbeError, ChannelBroken
+from abbe.service.channel.wire import Wire
+from abbe.service.children import python_words
+from abbe.service.clock import Clock
+from abbe.service.core.jobs import JobBook
+from abbe.service.core.limits import keep_within
+from abbe.service.core.live import show_live
+from abbe.service.core.orders import Orders
+from abbe.service.errors import AbbeError, ChannelBroken
 
 log = structlog.get_logger("abbe.web")
 
@@ -152,7 +152,7 @@ class WebProcess:
         # Nothing secret on the command line; and in its environment neither the broker's password nor systemd's address.
         env = {k: v for k, v in os.environ.items() if k in PASSED_ON or not (k.startswith("ABBE_") or k in WITHHELD)}
         ends = (theirs.fileno(), self._listening.fileno())
-        words = python_words("service.web.process", *ends)
+        words = python_words("abbe.service.web.process", *ends)
         child = await asyncio.create_subprocess_exec(*words, stdin=subprocess.DEVNULL, pass_fds=ends, env=env)
         keep_within(child.pid, self._begin.memory_mb)
         return child

@@ -17,8 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 
-from service.devices.urls import address_of
-from service.errors import MachineInUse, UnsafeToMove
+from abbe.service.devices.urls import address_of
+from abbe.service.errors import MachineInUse, UnsafeToMove
 
 ENVIRONMENT = "ABBE_LOCK_FOLDER"
 """Names another folder, for a computer or a container where the usual ones do not serve."""

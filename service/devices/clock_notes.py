@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, cast
 
-from drivers.api import Controller, ControllerStatus
+from abbe.drivers.api import Controller, ControllerStatus
 
 MOST = 50_000
 KEPT = 500

@@ -7,12 +7,12 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
-from drivers import registry
-from drivers.api import BallBar, Controller, DisplacementMeter, Fixture
-from drivers.errors import DriverError
-from service.devices.clock_notes import noted
-from service.devices.urls import DeviceUrls as DeviceUrls
-from service.errors import AbbeError, ConfigError, DevicesNotReady
+from abbe.drivers import registry
+from abbe.drivers.api import BallBar, Controller, DisplacementMeter, Fixture
+from abbe.drivers.errors import DriverError
+from abbe.service.devices.clock_notes import noted
+from abbe.service.devices.urls import DeviceUrls as DeviceUrls
+from abbe.service.errors import AbbeError, ConfigError, DevicesNotReady
 
 Ask = Callable[[str], Awaitable[None]]
 First = Callable[[Controller], Awaitable[None]]
@@ -67,7 +67,7 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First 
     ask : callable
         Asks the person at the console.
     first : callable, optional
-        Gets the open controller before any other device is opened (`service.workflows.recovered`). What it raises ends it.
+        Gets the open controller before any other device is opened (`abbe.service.workflows.recovered`). What it raises ends it.
 
     Raises
     ------

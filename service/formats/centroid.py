@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.machine import AXES
-from service.errors import FormatRefused
-from service.formats.limits import NOTHING, Limits, check_kinds, check_table
-from service.formats.model import AxisTable, Compensation
-from service.formats.settings import Settings
-from service.formats.signs import from_file, to_file
-from service.formats.text import TextFile, integers
+from abbe.models.machine import AXES
+from abbe.service.errors import FormatRefused
+from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_table
+from abbe.service.formats.model import AxisTable, Compensation
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.signs import from_file, to_file
+from abbe.service.formats.text import TextFile, integers
 
 LIMITS = Limits(points=1000, equidistant=True, directional=False)
 WHAT = "Centroid ballscrew table"

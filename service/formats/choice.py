@@ -11,12 +11,12 @@ from functools import partial
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.machine import AXES
-from models.volumetric import remove_rigid, volume_grid
-from service.formats.controls import Control
-from service.formats.identified import Identified, Values, axis_tables, grid_mm, lattice_of, motions_of, products_of, table_values
-from service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable, correction_at
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.formats.controls import Control
+from abbe.service.formats.identified import Identified, Values, axis_tables, grid_mm, lattice_of, motions_of, products_of, table_values
+from abbe.service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable, correction_at
 
 JUDGE_NODES, COARSE_NODES = 12, 6
 WORTH = 0.02

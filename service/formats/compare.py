@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.machine import AXES
-from service.errors import TableContradicts
-from service.formats.model import Compensation, correction_at
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.service.errors import TableContradicts
+from abbe.service.formats.model import Compensation, correction_at
 
 REMEDY = "do not load this file"
 ALIKE = 0.2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.errors import FormatRefused
-from service.formats.model import Lookup
+from abbe.service.errors import FormatRefused
+from abbe.service.formats.model import Lookup
 
 
 @dataclass(frozen=True, slots=True)

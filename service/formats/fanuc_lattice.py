@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.errors import FormatRefused
-from service.formats.limits import NOTHING, Limits, check_kinds, check_positions, check_size
-from service.formats.model import Compensation, Lattice
-from service.formats.settings import Settings
-from service.formats.signs import from_file, to_file
-from service.formats.text import TextFile, integers, whole
+from abbe.service.errors import FormatRefused
+from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_positions, check_size
+from abbe.service.formats.model import Compensation, Lattice
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.signs import from_file, to_file
+from abbe.service.formats.text import TextFile, integers, whole
 
 LIMITS = Limits(points=1000, equidistant=True, own=False, lattice=True)
 WHAT = "Fanuc 3-D error compensation"

@@ -12,16 +12,16 @@ from itertools import product
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.compensation.additive import additive
-from models.compensation.grid import nodes_mm
-from models.compensation.interpolation import FIT_SAMPLES, cells
-from models.functions.legendre import legendre_values
-from models.functions.motions import PLACES, SQUARENESS
-from models.geometry.bases import Term, term_values
-from models.geometry.chain import design
-from models.machine import AXES, Machine, lever_masks
-from service.formats.model import AxisTable, Curve, Lattice, Motions, ProductTable
+from abbe.models.arrays import F1, F2
+from abbe.models.compensation.additive import additive
+from abbe.models.compensation.grid import nodes_mm
+from abbe.models.compensation.interpolation import FIT_SAMPLES, cells
+from abbe.models.functions.legendre import legendre_values
+from abbe.models.functions.motions import PLACES, SQUARENESS
+from abbe.models.geometry.bases import Term, term_values
+from abbe.models.geometry.chain import design
+from abbe.models.machine import AXES, Machine, lever_masks
+from abbe.service.formats.model import AxisTable, Curve, Lattice, Motions, ProductTable
 
 Grids = tuple[F1, F1, F1]
 NODES = 9

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.functions.motions import PLACES, SQUARENESS
-from models.machine import AXES
-from service.errors import FormatRefused
-from service.formats.limits import NOTHING, Limits, check_kinds, check_positions, check_size, check_table
-from service.formats.model import Compensation, Curve, Motions
-from service.formats.settings import Settings
-from service.formats.signs import from_file, to_file
-from service.formats.text import TextFile, increasing, short
+from abbe.models.functions.motions import PLACES, SQUARENESS
+from abbe.models.machine import AXES
+from abbe.service.errors import FormatRefused
+from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.model import Compensation, Curve, Motions
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.signs import from_file, to_file
+from abbe.service.formats.text import TextFile, increasing, short
 
 LIMITS = Limits(points=2000, directional=False, cross=True, motions=True, zero_at_reference=False)
 WHAT = "ISG volumetric CSV"

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
-from models.machine import AXES
-from service.errors import FormatRefused
-from service.formats.model import AxisTable, Compensation
+from abbe.models.arrays import F1
+from abbe.models.machine import AXES
+from abbe.service.errors import FormatRefused
+from abbe.service.formats.model import AxisTable, Compensation
 
 NOTHING = "nothing was written"
 PLAUSIBLE_MM = 1.0

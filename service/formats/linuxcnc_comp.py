@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.formats.limits import PLAUSIBLE_MM, Limits, check_kinds, check_table
-from service.formats.model import AxisTable, Compensation
-from service.formats.settings import Settings
-from service.formats.signs import SIGNS, from_file, to_file
-from service.formats.text import TextFile, fixed, increasing, whole
+from abbe.service.formats.limits import PLAUSIBLE_MM, Limits, check_kinds, check_table
+from abbe.service.formats.model import AxisTable, Compensation
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.signs import SIGNS, from_file, to_file
+from abbe.service.formats.text import TextFile, fixed, increasing, whole
 
 LIMITS = Limits(points=256)
 POSITION_DECIMALS = 6

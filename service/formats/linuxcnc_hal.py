@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from service.formats.limits import Limits, check_kinds, check_positions, check_size, check_table
-from service.formats.model import AxisTable, Compensation, Curve, ProductTable
-from service.formats.settings import Settings
-from service.formats.signs import from_file, to_file
-from service.formats.text import TextFile, increasing, short
+from abbe.service.formats.limits import Limits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.model import AxisTable, Compensation, Curve, ProductTable
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.signs import from_file, to_file
+from abbe.service.formats.text import TextFile, increasing, short
 
 LIMITS = Limits(points=16, directional=False, own=True, cross=True, products=True)
 LEVERS = Limits(points=16, size_mm=1e5)

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.formats.limits import Limits, check_kinds, check_table
-from service.formats.model import AxisTable, Compensation
-from service.formats.settings import Settings
-from service.formats.signs import from_file, to_file
-from service.formats.text import TextFile, fixed, short
+from abbe.service.formats.limits import Limits, check_kinds, check_table
+from abbe.service.formats.model import AxisTable, Compensation
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.signs import from_file, to_file
+from abbe.service.formats.text import TextFile, fixed, short
 
 LIMITS = Limits(points=10000, equidistant=True)
 WHAT = "Mach4 screw map"

@@ -11,12 +11,12 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F4
-from models.compensation.interpolation import trilinear
-from models.functions.motions import PLACES, SQUARENESS
-from models.geometry.chain import deviation_mm
-from models.geometry.jacobian import squareness_motions
-from models.machine import AXES, Machine
+from abbe.models.arrays import F1, F2, F4
+from abbe.models.compensation.interpolation import trilinear
+from abbe.models.functions.motions import PLACES, SQUARENESS
+from abbe.models.geometry.chain import deviation_mm
+from abbe.models.geometry.jacobian import squareness_motions
+from abbe.models.machine import AXES, Machine
 
 Lookup = Literal["command", "corrected"]
 """Where a control looks cross, product and grid tables up: at the command, or at the position that the own-axis tables have corrected."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.machine import AXES, Machine
-from service.formats.model import AxisTable, Compensation, Curve, Lattice, ProductTable, correction_at
-from service.formats.registry import FORMATS, Format
-from service.formats.settings import Settings
+from abbe.models.machine import AXES, Machine
+from abbe.service.formats.model import AxisTable, Compensation, Curve, Lattice, ProductTable, correction_at
+from abbe.service.formats.registry import FORMATS, Format
+from abbe.service.formats.settings import Settings
 
 STEP_MM = 0.010
 POSITION_MM = np.array([0.0, 50.0, 100.0, 150.0, 200.0])

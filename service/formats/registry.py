@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from service.errors import FormatRefused
-from service.formats import (
+from abbe.service.errors import FormatRefused
+from abbe.service.formats import (
     centroid,
     fanuc_lattice,
     fanuc_pitch,
@@ -19,11 +19,11 @@ from service.formats import (
     siemens_cec,
     siemens_eec,
 )
-from service.formats.limits import Limits
-from service.formats.model import Compensation
-from service.formats.settings import Settings
-from service.formats.signs import SIGNS, SignRule
-from service.formats.text import TextFile
+from abbe.service.formats.limits import Limits
+from abbe.service.formats.model import Compensation
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.signs import SIGNS, SignRule
+from abbe.service.formats.text import TextFile
 
 Write = Callable[[Compensation, Settings], tuple[TextFile, ...]]
 Read = Callable[[tuple[TextFile, ...], Settings], Compensation]

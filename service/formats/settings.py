@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from models.machine import Machine
+from abbe.models.machine import Machine
 
 
 @dataclass(frozen=True)

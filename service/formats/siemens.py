@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from models.arrays import F1
-from service.errors import FormatRefused
-from service.formats.limits import NOTHING
-from service.formats.text import TextFile
+from abbe.models.arrays import F1
+from abbe.service.errors import FormatRefused
+from abbe.service.formats.limits import NOTHING
+from abbe.service.formats.text import TextFile
 
 _LINE = re.compile(r"\$(\w+)\s*\[([^\]]*)\]\s*=\s*\(?([^;)]*?)\)?\s*(;.*)?")
 HEAD = "CHANDATA(1)"

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.machine import AXES
-from service.formats.limits import Limits, check_kinds, check_positions, check_size, check_table
-from service.formats.model import AxisTable, Compensation, Curve, ProductTable
-from service.formats.settings import Settings
-from service.formats.siemens import END, HEAD, POSITION_DECIMALS, Assignments, grid, parse, step_of
-from service.formats.signs import from_file, to_file
-from service.formats.text import TextFile, short
+from abbe.models.machine import AXES
+from abbe.service.formats.limits import Limits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.model import AxisTable, Compensation, Curve, ProductTable
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, Assignments, grid, parse, step_of
+from abbe.service.formats.signs import from_file, to_file
+from abbe.service.formats.text import TextFile, short
 
 LIMITS = Limits(points=2000, equidistant=True, own=True, cross=True, products=True)
 LEVERS = Limits(points=2000, equidistant=True, size_mm=1e5)

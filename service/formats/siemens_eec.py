@@ -6,13 +6,13 @@ The table must be zero at the reference point. Lost motion that does not depend 
 
 from __future__ import annotations
 
-from models.machine import AXES
-from service.formats.limits import Limits, check_kinds, check_table
-from service.formats.model import AxisTable, Compensation
-from service.formats.settings import Settings
-from service.formats.siemens import END, HEAD, POSITION_DECIMALS, grid, parse, step_of
-from service.formats.signs import from_file, to_file
-from service.formats.text import TextFile, short
+from abbe.models.machine import AXES
+from abbe.service.formats.limits import Limits, check_kinds, check_table
+from abbe.service.formats.model import AxisTable, Compensation
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, grid, parse, step_of
+from abbe.service.formats.signs import from_file, to_file
+from abbe.service.formats.text import TextFile, short
 
 LIMITS = Limits(points=5000, equidistant=True, directional=False)
 WHAT = "Siemens ENC_COMP"

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 Evidence = Literal["verified by execution", "by manual"]
 

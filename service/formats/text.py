@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
-from service.errors import TableFileError
+from abbe.models.arrays import F1
+from abbe.service.errors import TableFileError
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 

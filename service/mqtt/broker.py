@@ -6,7 +6,7 @@ import ssl
 from dataclasses import dataclass
 from urllib.parse import unquote, urlsplit
 
-from service.errors import ConfigError
+from abbe.service.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from service.clock import Clock
-from service.mqtt.topics import Topics
+from abbe.service.clock import Clock
+from abbe.service.mqtt.topics import Topics
 
 KEPT_DELIVERED = 1000
 """Delivered messages that stay in the database, to be looked at."""

@@ -15,11 +15,11 @@ from typing import Any
 import aiomqtt
 import structlog
 
-from service.clock import Clock
-from service.errors import ConfigError, StoreError
-from service.mqtt.broker import Broker
-from service.mqtt.outbox import Outbox, encode, with_id
-from service.mqtt.topics import Topics, client_id
+from abbe.service.clock import Clock
+from abbe.service.errors import ConfigError, StoreError
+from abbe.service.mqtt.broker import Broker
+from abbe.service.mqtt.outbox import Outbox, encode, with_id
+from abbe.service.mqtt.topics import Topics, client_id
 
 log = structlog.get_logger("abbe.mqtt")
 

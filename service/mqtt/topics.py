@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.errors import ConfigError
+from abbe.service.errors import ConfigError
 
 _LEVEL = 100
 _FORBIDDEN = "+#\0"

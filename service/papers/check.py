@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from service.papers.row import Paper
+from abbe.service.papers.row import Paper
 
 Outcome = Literal["holds", "fails"]
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from service.papers.printed import Printed
+from abbe.service.papers.printed import Printed
 
 Fit = Literal["equal", "rounding", "padding", "bound", "no"]
 """Equal to the last printed digit; within the rounding of the inputs; that only if zeros at the end are padding; below a bound; not."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1
-from models.kwon.geometry import Geometry
-from models.kwon.kinematics import forward, forward_as_printed, inverse, links, square_commands
-from service.papers import kwon_printed as paper
-from service.papers import kwon_tables
-from service.papers.check import Check
-from service.papers.printed import Printed
-from service.papers.row import Row, stated
+from abbe.models.arrays import F1
+from abbe.models.kwon.geometry import Geometry
+from abbe.models.kwon.kinematics import forward, forward_as_printed, inverse, links, square_commands
+from abbe.service.papers import kwon_printed as paper
+from abbe.service.papers import kwon_tables
+from abbe.service.papers.check import Check
+from abbe.service.papers.printed import Printed
+from abbe.service.papers.row import Row, stated
 
 IK_BOUND_MM = 1e-7
 """How near the inverse has to come to the commands of math.md's example."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.papers.printed import Printed, printed
+from abbe.service.papers.printed import Printed, printed
 
 COMPONENTS = ("e_x", "e_y", "e_z")
 

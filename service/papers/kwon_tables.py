@@ -8,9 +8,9 @@ from functools import cache
 
 import numpy as np
 
-from models.arrays import F1
-from models.kwon.anova import anova_from_sums, critical_f
-from models.kwon.forensics import (
+from abbe.models.arrays import F1
+from abbe.models.kwon.anova import anova_from_sums, critical_f
+from abbe.models.kwon.forensics import (
     GridSums,
     ImpliedPlane,
     grid_sums,
@@ -20,13 +20,13 @@ from models.kwon.forensics import (
     ladder_name,
     square_grid,
 )
-from models.kwon.layout import layout
-from models.kwon.terms import CUBIC, IN_PLANE
-from service.papers import kwon_printed as paper
-from service.papers.compare import Computed, agrees, computed_from
-from service.papers.printed import Printed, values
-from service.papers.row import Erratum, Row, stated
-from service.papers.words import minus
+from abbe.models.kwon.layout import layout
+from abbe.models.kwon.terms import CUBIC, IN_PLANE
+from abbe.service.papers import kwon_printed as paper
+from abbe.service.papers.compare import Computed, agrees, computed_from
+from abbe.service.papers.printed import Printed, values
+from abbe.service.papers.row import Erratum, Row, stated
+from abbe.service.papers.words import minus
 
 ALPHA = 0.01
 GRID = "9 × 9 points, steps of 0.25 mm as printed, ± 1 mm assumed from the stroke of 2 mm and the 82 points of the text"

@@ -11,15 +11,15 @@ from pathlib import Path
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.papers.check import Check
-from service.papers.pictures import figures
-from service.papers.row import Row
-from service.papers.run import PaperResult
-from service.papers.words import NONE, check_cells, computed_cells, note, short
-from service.report.numbers import printable
-from service.report.page_file import write_page as write_text
-from service.report.palette import style_rules
-from service.report.plots.signed import signed_rules
+from abbe.service.papers.check import Check
+from abbe.service.papers.pictures import figures
+from abbe.service.papers.row import Row
+from abbe.service.papers.run import PaperResult
+from abbe.service.papers.words import NONE, check_cells, computed_cells, note, short
+from abbe.service.report.numbers import printable
+from abbe.service.report.page_file import write_page as write_text
+from abbe.service.report.palette import style_rules
+from abbe.service.report.plots.signed import signed_rules
 
 _MARKS = {"reproduced": "✔", "consistent": "≈", "differs": "≠", "input": "▷", "not reproducible": "○"}
 _CHECK_MARKS = {"holds": "✔", "fails": "✘"}
@@ -56,7 +56,7 @@ def render_page(found: Sequence[PaperResult]) -> str:
 
 @cache
 def _environment() -> Environment:
-    loader = ChoiceLoader([PackageLoader("service.papers"), PackageLoader("service.report")])
+    loader = ChoiceLoader([PackageLoader("abbe.service.papers"), PackageLoader("abbe.service.report")])
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.pahk.squareness_only import best_assignment, squareness_diagonals_mm
-from service.papers import pahk_printed as paper
-from service.papers.compare import Computed
-from service.papers.pahk_printed import Cmm
-from service.papers.printed import values
-from service.papers.probe_example import pattern
-from service.papers.row import Erratum, Row, stated
-from service.papers.words import minus
+from abbe.models.pahk.squareness_only import best_assignment, squareness_diagonals_mm
+from abbe.service.papers import pahk_printed as paper
+from abbe.service.papers.compare import Computed
+from abbe.service.papers.pahk_printed import Cmm
+from abbe.service.papers.printed import values
+from abbe.service.papers.probe_example import pattern
+from abbe.service.papers.row import Erratum, Row, stated
+from abbe.service.papers.words import minus
 
 URAD = 1e-6
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.papers.printed import Printed, printed
+from abbe.service.papers.printed import Printed, printed
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,25 +7,25 @@ from typing import Literal
 
 import numpy as np
 
-from models.arrays import F1
-from models.geometry.chain import deviation_mm
-from models.kwon.forensics import square_grid
-from models.kwon.terms import IN_PLANE, regressors
-from models.notation.pahk import motions_from_pahk, pahk_machine, pahk_type
-from service.papers import kwon_printed, pahk_printed, yang_printed
-from service.papers.kwon_tables import in_plane, plane
-from service.papers.pahk import machine_inputs
-from service.papers.pahk_printed import Cmm
-from service.papers.printed import values
-from service.papers.probe_example import EXAMPLE, example
-from service.papers.row import Paper
-from service.papers.words import minus, short
-from service.papers.yang_table3 import bar_line_um, restored_x_mm
-from service.report.plots.comparison import Comparison, comparison_plot
-from service.report.plots.contours import contour_plot
-from service.report.plots.deformed import deformed_grid
-from service.report.plots.facets import Surface, lobing_plot, surface_plot
-from service.report.plots.signed import SignedScale
+from abbe.models.arrays import F1
+from abbe.models.geometry.chain import deviation_mm
+from abbe.models.kwon.forensics import square_grid
+from abbe.models.kwon.terms import IN_PLANE, regressors
+from abbe.models.notation.pahk import motions_from_pahk, pahk_machine, pahk_type
+from abbe.service.papers import kwon_printed, pahk_printed, yang_printed
+from abbe.service.papers.kwon_tables import in_plane, plane
+from abbe.service.papers.pahk import machine_inputs
+from abbe.service.papers.pahk_printed import Cmm
+from abbe.service.papers.printed import values
+from abbe.service.papers.probe_example import EXAMPLE, example
+from abbe.service.papers.row import Paper
+from abbe.service.papers.words import minus, short
+from abbe.service.papers.yang_table3 import bar_line_um, restored_x_mm
+from abbe.service.report.plots.comparison import Comparison, comparison_plot
+from abbe.service.report.plots.contours import contour_plot
+from abbe.service.report.plots.deformed import deformed_grid
+from abbe.service.report.plots.facets import Surface, lobing_plot, surface_plot
+from abbe.service.report.plots.signed import SignedScale
 
 NODES = 5
 SURFACE_NODES = 41

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.probe.calibration import ProbeCalibration, calibrate, master_sphere_pattern, without_absorbed
-from models.probe.frame import direction
-from service.papers import pahk_printed as paper
+from abbe.models.arrays import F1, F2
+from abbe.models.probe.calibration import ProbeCalibration, calibrate, master_sphere_pattern, without_absorbed
+from abbe.models.probe.frame import direction
+from abbe.service.papers import pahk_printed as paper
 
 THREE_LOBES_MM, POLE_MM = 0.005, 0.0025
 EXAMPLE = "5 µm · sin²φ cos 3θ + 2.5 µm · cos 2φ, less what centre and radius of a sphere absorb"

@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass
 from decimal import ROUND_HALF_UP, Decimal
 from typing import Any, Literal
 
-from service.papers.compare import Computed, Fit, agrees, fit, within_if_padded
-from service.papers.printed import Printed
+from abbe.service.papers.compare import Computed, Fit, agrees, fit, within_if_padded
+from abbe.service.papers.printed import Printed
 
 Paper = Literal["pahk", "kwon", "yang", "wang"]
 Status = Literal["reproduced", "consistent", "differs", "input", "not reproducible"]

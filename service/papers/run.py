@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, get_args
 
-from service.papers.check import Check, Outcome, count
-from service.papers.row import Paper, Row, Source, Status
+from abbe.service.papers.check import Check, Outcome, count
+from abbe.service.papers.row import Paper, Row, Source, Status
 
 TITLES: dict[Paper, str] = {
     "pahk": "Pahk 1995: numerical CMM (paper 000)",
@@ -59,7 +59,7 @@ def results(papers: Iterable[Paper] = tuple(TITLES)) -> list[PaperResult]:
     for paper, title in TITLES.items():
         if paper in wanted:
             # A paper's module is loaded when it is asked for: scipy takes its time.
-            module = import_module(f"service.papers.{paper}")
+            module = import_module(f"abbe.service.papers.{paper}")
             rows: list[Row] = module.rows()
             checks: list[Check] = module.checks() if paper in CHECKED else []
             own = [r for r in rows if r.source == "paper"]

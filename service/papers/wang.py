@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from models.wang.mirror import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
-from service.papers import wang_printed as paper
-from service.papers.compare import Computed
-from service.papers.row import Erratum, Row
+from abbe.models.wang.mirror import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
+from abbe.service.papers import wang_printed as paper
+from abbe.service.papers.compare import Computed
+from abbe.service.papers.row import Erratum, Row
 
 CUBE = np.ones(3)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.papers.printed import Printed, printed
+from abbe.service.papers.printed import Printed, printed
 
 PROJECTION, RESOLUTION = printed("0.577", "1.732")
 """IV.A: share of an axis' error seen along the diagonal of a cube, and the factor on the resolution."""

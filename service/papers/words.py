@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-from service.papers.check import Check
-from service.papers.compare import FLOAT, OPERANDS
-from service.papers.printed import Printed
-from service.papers.row import Row
+from abbe.service.papers.check import Check
+from abbe.service.papers.compare import FLOAT, OPERANDS
+from abbe.service.papers.printed import Printed
+from abbe.service.papers.row import Row
 
 NONE = "–"
 _HYPHEN = re.compile(r"(?<![\w.])-(?=\d)|(?<=\de)-(?=\d)")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.yang.difference import confidence_interval
-from service.papers import yang_printed as paper
-from service.papers import yang_simulation, yang_table3
-from service.papers.check import Check
-from service.papers.compare import Computed, computed_from
-from service.papers.printed import Printed
-from service.papers.row import Erratum, Row
+from abbe.models.yang.difference import confidence_interval
+from abbe.service.papers import yang_printed as paper
+from abbe.service.papers import yang_simulation, yang_table3
+from abbe.service.papers.check import Check
+from abbe.service.papers.compare import Computed, computed_from
+from abbe.service.papers.printed import Printed
+from abbe.service.papers.row import Erratum, Row
 
 _OTHERS = "the ball-bar simulation used 15 more error functions, the origins of Fig. 6 and the tool vector; none is printed"
 _RAW = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.papers.printed import Printed, printed
+from abbe.service.papers.printed import Printed, printed
 
 NAMES = ("dxx", "dyy", "dzz", "Sxy", "Sxz", "Syz")
 

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F2
-from models.notation.yang import YangErrors, iso_squareness, workpiece_mm
-from models.paths.helix import helix_points
-from models.solvers.helix import LINEAR, fit_helix, helix_design
-from models.yang.ballbar import reading_eq6, second_order_bound_mm
-from models.yang.complete import delta_exact
-from service.papers import yang_printed as paper
-from service.papers.check import Check
+from abbe.models.arrays import F2
+from abbe.models.notation.yang import YangErrors, iso_squareness, workpiece_mm
+from abbe.models.paths.helix import helix_points
+from abbe.models.solvers.helix import LINEAR, fit_helix, helix_design
+from abbe.models.yang.ballbar import reading_eq6, second_order_bound_mm
+from abbe.models.yang.complete import delta_exact
+from abbe.service.papers import yang_printed as paper
+from abbe.service.papers.check import Check
 
 TURNS = 5.0
 """Not in the paper (math.md 4.3)."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.functions.line_fit import slope_through_origin, straight_line
-from service.papers import yang_printed as paper
-from service.papers.compare import Computed, computed_from
-from service.papers.printed import Printed, values
-from service.papers.row import Erratum, Row
+from abbe.models.functions.line_fit import slope_through_origin, straight_line
+from abbe.service.papers import yang_printed as paper
+from abbe.service.papers.compare import Computed, computed_from
+from abbe.service.papers.printed import Printed, values
+from abbe.service.papers.row import Erratum, Row
 
 
 def restored_x_mm() -> list[float]:

@@ -7,8 +7,8 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Protocol
 
-from service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce, Verified
-from service.storage.records import PushEntryRecord, SlotRecord
+from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce, Verified
+from abbe.service.storage.records import PushEntryRecord, SlotRecord
 
 SHOWN_ALARMS = 20
 _NOT_RUN = {"missed": "SCH-001", "skipped": "SCH-002", "interrupted": "SCH-007"}
@@ -32,7 +32,7 @@ class Gatherer:
     Parameters
     ----------
     status : callable
-        Gives what the status page shows (`service.web.schemas.Status`): machine, job, devices, next due and last checks.
+        Gives what the status page shows (`abbe.service.web.schemas.Status`): machine, job, devices, next due and last checks.
     archive : Archive, optional
         Slots and pushes. Without it there are only the alarms of failed checks, and no table.
     """

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from service.plant.facts import Check, Facts
+from abbe.service.plant.facts import Check, Facts
 
 VERSION = "1.8"
 BUFFER = 4096

@@ -9,14 +9,14 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from drivers.api import Controller
-from drivers.errors import DriverError, Rebooted, Refused
-from service.clock import Clock
-from service.push import operations as o
-from service.push.entries import Journal, facts
-from service.push.meaning import meaning_of_bytes
-from service.push.operations import Kind, Op, Outcome, Truth
-from service.sequences.interlocks import MOVING, tripped
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import DriverError, Rebooted, Refused
+from abbe.service.clock import Clock
+from abbe.service.push import operations as o
+from abbe.service.push.entries import Journal, facts
+from abbe.service.push.meaning import meaning_of_bytes
+from abbe.service.push.operations import Kind, Op, Outcome, Truth
+from abbe.service.sequences.interlocks import MOVING, tripped
 
 LEASE_MS, BEAT_S = 60_000, 20.0
 """How long a lease is taken for, and how often it is renewed while the machine is measured."""

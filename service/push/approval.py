@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 
-from service.push.entries import Doc, canonical
+from abbe.service.push.entries import Doc, canonical
 
 
 def approval_digest(known: Doc, expiry: str) -> str:

@@ -5,11 +5,11 @@ It is taken by the process that began the push and by any later one; it may be b
 
 from __future__ import annotations
 
-from service.push.entries import Doc
-from service.push.learn import BACK
-from service.push.operations import Kind, Known, Op, Refused, Truth
-from service.push.staging import BRACKETS, EMPTY, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
-from service.push.states import State
+from abbe.service.push.entries import Doc
+from abbe.service.push.learn import BACK
+from abbe.service.push.operations import Kind, Known, Op, Refused, Truth
+from abbe.service.push.staging import BRACKETS, EMPTY, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
+from abbe.service.push.states import State
 
 DOUBTS = 3
 BACKS = 3

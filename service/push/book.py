@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
-from service.clock import Clock
-from service.errors import UnsafeToMove
-from service.push.entries import GENESIS, WORD, Doc, Entry, Journal, follow
-from service.push.states import TERMINAL, State
-from service.storage.base import utc_text
-from service.storage.records import PushEntryRecord
-from service.storage.store import Store
+from abbe.service.clock import Clock
+from abbe.service.errors import UnsafeToMove
+from abbe.service.push.entries import GENESIS, WORD, Doc, Entry, Journal, follow
+from abbe.service.push.states import TERMINAL, State
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.records import PushEntryRecord
+from abbe.service.storage.store import Store
 
 
 class StoreBook:

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from service.push.entries import Doc, Entry, Journal
-from service.push.learn import after_record, learn
-from service.push.machine import next_operation
-from service.push.operations import Kind, Known, Op, Outcome
-from service.push.order import Order
-from service.push.states import TERMINAL, State
+from abbe.service.push.entries import Doc, Entry, Journal
+from abbe.service.push.learn import after_record, learn
+from abbe.service.push.machine import next_operation
+from abbe.service.push.operations import Kind, Known, Op, Outcome
+from abbe.service.push.order import Order
+from abbe.service.push.states import TERMINAL, State
 
 
 class Port(Protocol):

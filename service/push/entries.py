@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.push.states import FOLLOWS, State
+from abbe.service.push.states import FOLLOWS, State
 
 Doc = dict[str, Any]
 GENESIS = "0" * 64

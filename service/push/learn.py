@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.push.operations import Approval, Done, Doubt, Kind, Known, Op, Outcome, Refused, Truth
-from service.push.states import State
+from abbe.service.push.operations import Approval, Done, Doubt, Kind, Known, Op, Outcome, Refused, Truth
+from abbe.service.push.states import State
 
 _QUESTIONS = frozenset({Kind.VALIDATE, Kind.APPROVE, Kind.PROBE, Kind.VERIFY})
 

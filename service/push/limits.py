@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict, dataclass
 
-from service.push.entries import canonical
+from abbe.service.push.entries import canonical
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,15 +9,15 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 
-from service.push.approval import approval_digest
-from service.push.back import DOUBTS, OWNERS, go_back, in_force, record, seen
-from service.push.entries import Doc, Journal, facts
-from service.push.learn import FORGET
-from service.push.levels import objection
-from service.push.operations import Approval, Done, Kind, Known, Op, Refused, Truth, Verdict
-from service.push.order import Order
-from service.push.staging import BRACKETS, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
-from service.push.states import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, State
+from abbe.service.push.approval import approval_digest
+from abbe.service.push.back import DOUBTS, OWNERS, go_back, in_force, record, seen
+from abbe.service.push.entries import Doc, Journal, facts
+from abbe.service.push.learn import FORGET
+from abbe.service.push.levels import objection
+from abbe.service.push.operations import Approval, Done, Kind, Known, Op, Refused, Truth, Verdict
+from abbe.service.push.order import Order
+from abbe.service.push.staging import BRACKETS, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
+from abbe.service.push.states import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, State
 
 STILL_S = 1.0
 """The axes must have stood for this long before anything is staged."""
@@ -40,7 +40,7 @@ def next_operation(journal: Journal, known: Known, order: Order | None = None) -
     Returns
     -------
     Op
-        One operation. After it: `service.push.learn`, or for RECORD the entry and `after_record`.
+        One operation. After it: `abbe.service.push.learn`, or for RECORD the entry and `after_record`.
     """
     if not journal:
         return _begin(known, order) if order is not None else Op(Kind.END, text="nothing was begun")

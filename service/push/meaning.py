@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import hashlib
 
-from drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
-from models.compensation.tables import NineTables
-from service.push.entries import canonical
+from abbe.drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
+from abbe.models.compensation.tables import NineTables
+from abbe.service.push.entries import canonical
 
 _POSITIONS_PER_MM = 1e5
 _VALUES_PER_MM = 1e6

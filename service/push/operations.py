@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
 
-from service.push.entries import Doc
-from service.push.states import State
+from abbe.service.push.entries import Doc
+from abbe.service.push.states import State
 
 
 class Kind(Enum):
@@ -89,8 +89,8 @@ class Truth:
 class Approval:
     """A person's (or the policy's) yes to exactly one table on exactly one base.
 
-    ``digest``: what was agreed to (`service.push.approval`). ``expiry``: when it ends, as text, part of the digest. ``until_s``: the same
-    end as monotonic host time, because somebody may set the wall clock.
+    ``digest``: what was agreed to (`abbe.service.push.approval`). ``expiry``: when it ends, as text, part of the digest. ``until_s``: the
+    same end as monotonic host time, because somebody may set the wall clock.
     """
 
     digest: str

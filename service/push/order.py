@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from service.push.entries import Doc
+from abbe.service.push.entries import Doc
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,13 +18,13 @@ class Order:
     image : bytes
         As the controller will hold it, with its CRC-32 ``crc``.
     meaning : str
-        Digest of what the table means, computed from the tables and not from the image (`service.push.meaning`).
+        Digest of what the table means, computed from the tables and not from the image (`abbe.service.push.meaning`).
     limits : str
         Digest of the limits that it was checked against.
     owner : int
         Owner id of the lease, u32, low 16 bits 0: those count the takings.
     level : int
-        Capability level of the controller (`service.push.levels`).
+        Capability level of the controller (`abbe.service.push.levels`).
     attended : bool
         A person who may approve is at the machine.
     chunk_words : int
@@ -32,9 +32,9 @@ class Order:
     table : int
         Number of the table in the store; 0 if it is not kept there.
     control : str
-        Identity of the control (`service.devices.urls.control_of`); empty: not known.
+        Identity of the control (`abbe.service.devices.urls.control_of`); empty: not known.
     process : dict
-        Which process pushes (`service.storage.owner.Owner`): nobody recovers while it lives.
+        Which process pushes (`abbe.service.storage.owner.Owner`): nobody recovers while it lives.
     """
 
     machine: str

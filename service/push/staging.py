@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.push.operations import Kind, Known, Op, Refused, Truth
+from abbe.service.push.operations import Kind, Known, Op, Refused, Truth
 
 BRACKETS = 4
 REWRITES_PER_CHUNK = 2

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from itertools import pairwise
 
-from service.push.candidate import Candidate, Column, Scene, Seal
-from service.push.entries import canonical
-from service.push.limits import PushLimits
-from service.push.validate_numbers import number_reasons
+from abbe.service.push.candidate import Candidate, Column, Scene, Seal
+from abbe.service.push.entries import canonical
+from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate_numbers import number_reasons
 
 AXES = ("X", "Y", "Z")
 HEADER_REGISTERS = 24

@@ -7,8 +7,8 @@ import sys
 from collections.abc import Iterator
 from itertools import pairwise
 
-from service.push.candidate import Candidate, Column, Scene
-from service.push.limits import PushLimits
+from abbe.service.push.candidate import Candidate, Column, Scene
+from abbe.service.push.limits import PushLimits
 
 LARGEST = 32767
 WHOLE = 0.01

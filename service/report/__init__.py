@@ -1,7 +1,7 @@
 """Reports: plain values in, one self-contained HTML page out. No script, no file beside it, no request to anywhere."""
 
-from service.report.html import render_report
-from service.report.model import (
+from abbe.service.report.html import render_report
+from abbe.service.report.model import (
     ArrowField,
     Contribution,
     DemoReport,

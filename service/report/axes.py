@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from service.report.numbers import finite, fixed
-from service.report.svg import XY, Svg
+from abbe.service.report.numbers import finite, fixed
+from abbe.service.report.svg import XY, Svg
 
 
 def nice_step(span: float, count: int = 5) -> float:

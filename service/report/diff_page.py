@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.report.numbers import printable
-from service.report.palette import style_rules
-from service.report.plots.table_change import DiffCurve, change_plot
+from abbe.service.report.numbers import printable
+from abbe.service.report.palette import style_rules
+from abbe.service.report.plots.table_change import DiffCurve, change_plot
 
 __all__ = ["DiffCurve", "DiffPage", "render_diff"]
 
@@ -28,7 +28,7 @@ class DiffPage:
 def render_diff(page: DiffPage) -> str:
     """The page. Equal tables give equal bytes."""
     environment = Environment(
-        loader=PackageLoader("service.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("abbe.service.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     # The SVG writer has escaped every text; escaping again would show the reader the tags.
     picture, style = Markup(change_plot(page.curves)), Markup(style_rules())  # noqa: S704

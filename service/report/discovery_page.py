@@ -7,10 +7,10 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.report.discovery_model import DiscoveryPage, GapRow
-from service.report.numbers import COVERAGE, NOT_AVAILABLE, plain, printable, tidy
-from service.report.palette import style_rules
-from service.report.plots.gap import gap_bars, place_plot, trace_plot
+from abbe.service.report.discovery_model import DiscoveryPage, GapRow
+from abbe.service.report.numbers import COVERAGE, NOT_AVAILABLE, plain, printable, tidy
+from abbe.service.report.palette import style_rules
+from abbe.service.report.plots.gap import gap_bars, place_plot, trace_plot
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
 
@@ -47,7 +47,7 @@ def render_discovery(page: DiscoveryPage) -> str:
 
 @cache
 def _environment() -> Environment:
-    loader = PackageLoader("service.report")
+    loader = PackageLoader("abbe.service.report")
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 

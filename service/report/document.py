@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from service.report.numbers import COVERAGE
+from abbe.service.report.numbers import COVERAGE
 
 FORMAT = "abbe-report/1"
 Kind = Literal["run", "campaign", "verification", "discovery", "push"]
@@ -61,7 +61,7 @@ class TextTable:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One ``<svg>`` element of `service.report.plots` with its caption; ``wide``: over the whole width of the paper."""
+    """One ``<svg>`` element of `abbe.service.report.plots` with its caption; ``wide``: over the whole width of the paper."""
 
     caption: str
     svg: str

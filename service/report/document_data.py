@@ -8,8 +8,8 @@ import json
 import math
 from typing import Any
 
-from service.report.document import DECISION_RULE, FORMAT, UNCERTAINTY, Document, Figure
-from service.report.numbers import COVERAGE, NOT_AVAILABLE, plain, printable, tidy, with_uncertainty
+from abbe.service.report.document import DECISION_RULE, FORMAT, UNCERTAINTY, Document, Figure
+from abbe.service.report.numbers import COVERAGE, NOT_AVAILABLE, plain, printable, tidy, with_uncertainty
 
 COLUMNS = ("group", "symbol", "name", "value", "expanded", "k", "unit", "limit", "verdict", "method")
 NOTHING_HIDDEN = "Nothing was found that this measurement should have shown and could not."

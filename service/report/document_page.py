@@ -10,10 +10,10 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.report.document import Document, Picture
-from service.report.document_data import shown
-from service.report.numbers import printable
-from service.report.palette import paper_rules, style_rules
+from abbe.service.report.document import Document, Picture
+from abbe.service.report.document_data import shown
+from abbe.service.report.numbers import printable
+from abbe.service.report.palette import paper_rules, style_rules
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
 FONT = "Libertinus Serif"
@@ -40,7 +40,7 @@ def document_pdf(document: Document) -> bytes:
     import typst
 
     data: dict[str, Any] = shown(document) | {"pictures": [_picture(p) for p in document.pictures], "font": FONT}
-    template = files("service.report").joinpath("templates", "document.typ").read_bytes()
+    template = files("abbe.service.report").joinpath("templates", "document.typ").read_bytes()
     inputs = {"data": json.dumps(data, ensure_ascii=False)}
     made = typst.compile(template, format="pdf", ignore_system_fonts=True, sys_inputs=inputs)
     assert isinstance(made, bytes)  # one document, not one file for each page
@@ -59,5 +59,5 @@ def standalone(svg: str) -> str:
 
 @cache
 def _environment() -> Environment:
-    loader = PackageLoader("service.report")
+    loader = PackageLoader("abbe.service.report")
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)

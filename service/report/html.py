@@ -9,11 +9,11 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.report import plots
-from service.report.model import SETUP_NOTE, DemoReport, ParameterRow, RunRow, SummaryRow
-from service.report.numbers import COVERAGE, NOT_AVAILABLE, finite, plain, printable, tidy, with_uncertainty
-from service.report.palette import style_rules
-from service.report.plots.residuals import common_range
+from abbe.service.report import plots
+from abbe.service.report.model import SETUP_NOTE, DemoReport, ParameterRow, RunRow, SummaryRow
+from abbe.service.report.numbers import COVERAGE, NOT_AVAILABLE, finite, plain, printable, tidy, with_uncertainty
+from abbe.service.report.palette import style_rules
+from abbe.service.report.plots.residuals import common_range
 
 _VERDICTS = {True: ("ok", "✔", "Accepted"), False: ("bad", "✖", "Not accepted"), None: ("open", "◐", "Undecided")}
 _MARKS = re.compile(r"^[\s✔✖◐✓✗]+")
@@ -56,7 +56,7 @@ def render_report(report: DemoReport) -> str:
 @cache
 def _environment() -> Environment:
     return Environment(
-        loader=PackageLoader("service.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("abbe.service.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
 
 

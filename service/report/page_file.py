@@ -6,7 +6,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from service.errors import FileFormatError
+from abbe.service.errors import FileFormatError
 
 
 def write_page(text: str | bytes, target: Path) -> None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.report.numbers import printable
-from service.report.palette import style_rules
+from abbe.service.report.numbers import printable
+from abbe.service.report.palette import style_rules
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PlanPage:
 def render_plan(page: PlanPage) -> str:
     """The page. Equal plans give equal bytes."""
     environment = Environment(
-        loader=PackageLoader("service.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("abbe.service.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     # The SVG writer has escaped every text; escaping again would show the reader the tags.
     picture, style = Markup(page.picture), Markup(style_rules())  # noqa: S704

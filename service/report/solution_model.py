@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.model import Contribution, ParameterRow, ResidualSeries, RunRow
+from abbe.service.report.model import Contribution, ParameterRow, ResidualSeries, RunRow
 
 Array = NDArray[np.float64]
 

@@ -8,16 +8,16 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.report.model import ParameterRow, RunRow
-from service.report.numbers import COVERAGE, finite, plain, printable, tidy, with_uncertainty
-from service.report.palette import style_rules
-from service.report.plots.bands import motion_bands
-from service.report.plots.bars import contribution_bars, uncertainty_bars
-from service.report.plots.cells import common_step, correlation_plot, slice_plot
-from service.report.plots.observability import gain_map, share_plot
-from service.report.plots.residuals import common_range, residual_plot
-from service.report.plots.signed import signed_rules
-from service.report.solution_model import SolutionPage, TableLine
+from abbe.service.report.model import ParameterRow, RunRow
+from abbe.service.report.numbers import COVERAGE, finite, plain, printable, tidy, with_uncertainty
+from abbe.service.report.palette import style_rules
+from abbe.service.report.plots.bands import motion_bands
+from abbe.service.report.plots.bars import contribution_bars, uncertainty_bars
+from abbe.service.report.plots.cells import common_step, correlation_plot, slice_plot
+from abbe.service.report.plots.observability import gain_map, share_plot
+from abbe.service.report.plots.residuals import common_range, residual_plot
+from abbe.service.report.plots.signed import signed_rules
+from abbe.service.report.solution_model import SolutionPage, TableLine
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
 
@@ -52,7 +52,7 @@ def render_solution(page: SolutionPage) -> str:
 
 @cache
 def _environment() -> Environment:
-    loader = PackageLoader("service.report")
+    loader = PackageLoader("abbe.service.report")
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 

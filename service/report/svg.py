@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from service.report.numbers import printable
+from abbe.service.report.numbers import printable
 
 XY = tuple[float, float]
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.chain import REST_MM
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.chain import REST_MM
 
 BEYOND_MM = 5.0
 """So far beyond a place an axis is taken to have turned: farther than any lost motion."""

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from drivers.api import BarSample
-from service.errors import MeasurementFault
-from service.runs.clocks import Edges
-from service.storage.records import Doc
+from abbe.drivers.api import BarSample
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.clocks import Edges
+from abbe.service.storage.records import Doc
 
 Array = npt.NDArray[np.float64]
 
@@ -49,13 +49,13 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     samples : sequence of BarSample
         All samples of the run, also those before and after the path.
     start : dict
-        Start document (service.runs.columns).
+        Start document (abbe.service.runs.columns).
     end : dict or None
         End document; None for an interrupted run, which gives the columns it has.
     complete : bool
         Whether the path ran to its end, i.e. whether durations can be checked.
     rate : float
-        Seconds of the controller per second of the box (`service.runs.clocks`).
+        Seconds of the controller per second of the box (`abbe.service.runs.clocks`).
 
     Returns
     -------

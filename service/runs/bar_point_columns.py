@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.storage.records import Doc
+from abbe.service.storage.records import Doc
 
 INVALID_BITS = 0b10101
 
@@ -21,7 +21,7 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
         ``ctrl_us`` (controller time, after the axes had settled), ``target_mm``, ``direction``, ``feed_mm_min``, and for every sample
         ``device_us``, ``reading_nm``, ``status``; in order.
     start : dict
-        Start document (service.runs.columns).
+        Start document (abbe.service.runs.columns).
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A campaign as the discovery takes it: run documents become paths, readings and roles (models.discovery.case)."""
+"""A campaign as the discovery takes it: run documents become paths, readings and roles (abbe.models.discovery.case)."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.case import Case, CaseRun
-from models.effects.path import Path, Places, driven, since_reversal, standing
-from models.geometry.chain import travel_sign
-from models.machine import Machine
-from service.errors import MeasurementFault
-from service.runs.approached import came_from
-from service.runs.formats import ASSUMED_MODEL
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.effects.path import Path, Places, driven, since_reversal, standing
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import Machine
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.approached import came_from
+from abbe.service.runs.formats import ASSUMED_MODEL
 
 RESOLUTION_MM = {"bar": 1e-4, "laser": 1e-5}
 SENSORS = ("x", "y", "z", "spindle", "air")

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
-from service.errors import FileFormatError
-from service.explain import expected, shown, where
-from service.files import NotPlainError, read_plain
-from service.runs.formats import Columns, RunFile, Setup
-from service.runs.json_text import strict_json
-from service.storage.records import Doc
+from abbe.service.errors import FileFormatError
+from abbe.service.explain import expected, shown, where
+from abbe.service.files import NotPlainError, read_plain
+from abbe.service.runs.formats import Columns, RunFile, Setup
+from abbe.service.runs.json_text import strict_json
+from abbe.service.storage.records import Doc
 
 _OF_MOTION = ("mm", "um", "nm", "m", "rad", "urad", "mrad", "deg", "s", "ms", "us", "h", "mm_min", "mm_s", "rpm", "Hz", "kHz")
 _OF_OTHERS = ("C", "K", "Pa", "hPa", "N", "kN", "Nm", "V", "mV", "A", "W", "kW", "percent", "permille", "ppm", "bits")
@@ -39,7 +39,7 @@ def read_json(path: Path) -> Doc:
     Raises
     ------
     FileFormatError
-        If it is missing, no plain file, too large, no UTF-8, or no JSON, as `service.runs.json_text.strict_json` reads it.
+        If it is missing, no plain file, too large, no UTF-8, or no JSON, as `abbe.service.runs.json_text.strict_json` reads it.
     """
     try:
         text = read_plain(path, MAX_BYTES).decode("utf-8")
@@ -67,7 +67,7 @@ def check(path: Path, document: Doc, model: type[BaseModel]) -> None:
     document : dict
         The document; it is not changed.
     model : type
-        A model of service.runs.formats.
+        A model of abbe.service.runs.formats.
 
     Raises
     ------

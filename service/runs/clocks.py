@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from models.alignment.breaks import breaks
-from models.alignment.clock import LEAST_PAIRS, ClockFit, across, fit_clock, relative_rate
-from models.arrays import F1
-from service.storage.records import ChunkRecord, Doc
+from abbe.models.alignment.breaks import breaks
+from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, fit_clock, relative_rate
+from abbe.models.arrays import F1
+from abbe.service.storage.records import ChunkRecord, Doc
 
 U_DELAY_S = 2e-3
 """Standard uncertainty of the least delay of a link, which no arrival tells: 0 to 7 ms, an adapter's and the operating system's."""

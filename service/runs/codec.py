@@ -12,8 +12,8 @@ import zlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from drivers.api import BarSample
-from service.errors import StoreError
+from abbe.drivers.api import BarSample
+from abbe.service.errors import StoreError
 
 BAR_CODEC = "bar/1"
 JSON_CODEC = "json/1"

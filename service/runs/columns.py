@@ -7,11 +7,11 @@ path's start is taken from the start document: ``path_start_us``, else ``clock.c
 ``path.measured``: first and last point of ``points_mm`` between which readings count; without it all do. A ball-bar run whose
 setup says how many ``samples`` make a reading was read at standstill, point by point: it has no ``path``, and its
 records stand where those of a laser run do.
-``path.pieces`` (run, to_mm) and ``path.offset_mm``: the path was broken off and went on (service.sequences.onward);
+``path.pieces`` (run, to_mm) and ``path.offset_mm``: the path was broken off and went on (abbe.service.sequences.onward);
 ``points_mm`` is its rest, and the readings of the broken runs belong to it up to those lengths. The end document of a broken run says how
 far it came at constant feed: ``path_start_us``, ``good_us``, ``box_boot_id``.
 ``clock_pairs`` of the end document: controller time (us) and arrival (host s) of its statuses; they check the sync line
-(service.runs.clocks; ``timing`` of the result says what came of it).
+(abbe.service.runs.clocks; ``timing`` of the result says what came of it).
 ``mounted_us`` is when cup or laser were mounted (controller time); the start document is written before.
 """
 
@@ -20,16 +20,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.errors import MeasurementFault, StoreError, StretchDiffers
-from service.runs.bar_columns import bar_columns, begins_seen, sync_edges
-from service.runs.bar_point_columns import bar_point_columns
-from service.runs.clocks import RunClock, run_clock
-from service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
-from service.runs.coverage import with_state
-from service.runs.laser_columns import laser_columns
-from service.runs.pieces import SoFar, joined, pieces_of, read_so_far, up_to
-from service.storage.records import ChunkRecord, Doc, RunRecord
-from service.storage.store import Store
+from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
+from abbe.service.runs.bar_columns import bar_columns, begins_seen, sync_edges
+from abbe.service.runs.bar_point_columns import bar_point_columns
+from abbe.service.runs.clocks import RunClock, run_clock
+from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
+from abbe.service.runs.coverage import with_state
+from abbe.service.runs.laser_columns import laser_columns
+from abbe.service.runs.pieces import SoFar, joined, pieces_of, read_so_far, up_to
+from abbe.service.storage.records import ChunkRecord, Doc, RunRecord
+from abbe.service.storage.store import Store
 
 FORMAT = "abbe-run/1"
 BAR_CHANNEL = "bar"
@@ -65,7 +65,7 @@ def load_run(store: Store, id_or_label: int | str) -> Doc:
 def whole_document(store: Store, record: RunRecord) -> Doc:
     """A run with the pieces that belong to it, as an ``abbe-run/1`` document; errors as of `load_run`.
 
-    One that is not complete says so under ``state`` (`service.runs.coverage`).
+    One that is not complete says so under ``state`` (`abbe.service.runs.coverage`).
     """
     document = run_document(record, store.chunks(record.id))
     pieces = pieces_of(record.start_doc)

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from service.errors import AbbeError, MeasurementFault
-from service.runs.helix_axis import about_axis, helix_axis
-from service.runs.pieces import arc_of
-from service.storage.records import Doc, RunRecord
+from abbe.models.arrays import F1, F2
+from abbe.service.errors import AbbeError, MeasurementFault
+from abbe.service.runs.helix_axis import about_axis, helix_axis
+from abbe.service.runs.pieces import arc_of
+from abbe.service.storage.records import Doc, RunRecord
 
 LEAST = 0.9
 """Share of the commanded path that a run has to have read, to be judged: what is left out may hold the largest deviation."""

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from models.arrays import F2
-from models.functions.axis_function import AxisFunction
-from models.functions.bspline import BSpline
-from models.functions.legendre import Legendre
-from models.functions.motions import SQUARENESS, ErrorMotions
-from models.functions.polynomial import Polynomial
-from models.functions.table import Table
-from models.geometry.covariance import checked_covariance
-from service.errors import FileFormatError
-from service.explain import nearest, shown
-from service.runs import formats
-from service.runs.checks import check, read_json
+from abbe.models.arrays import F2
+from abbe.models.functions.axis_function import AxisFunction
+from abbe.models.functions.bspline import BSpline
+from abbe.models.functions.legendre import Legendre
+from abbe.models.functions.motions import SQUARENESS, ErrorMotions
+from abbe.models.functions.polynomial import Polynomial
+from abbe.models.functions.table import Table
+from abbe.models.geometry.covariance import checked_covariance
+from abbe.service.errors import FileFormatError
+from abbe.service.explain import nearest, shown
+from abbe.service.runs import formats
+from abbe.service.runs.checks import check, read_json
 
 NOT_GIVEN = "no uncertainty given in the errors file"
 _KINDS: Mapping[str, type[BaseModel]] = MappingProxyType(

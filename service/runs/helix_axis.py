@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.machine import AXES
-from service.errors import MeasurementFault
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.service.errors import MeasurementFault
 
 STRAIGHT = 0.8
 """Along its axis a helix goes one way: its way forth is at least this share of all the way that it makes there."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from service.errors import FileFormatError
+from abbe.service.errors import FileFormatError
 
 MAX_DIGITS = 308
 """Longer integers are beyond float64 (and beyond 4300 digits Python refuses to read them at all)."""

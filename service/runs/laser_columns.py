@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.storage.records import Doc
+from abbe.service.storage.records import Doc
 
 BEAM_LOST = 1 << 0
 NO_REFLECTOR = 1 << 4
@@ -22,7 +22,7 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
         ``host_s``, ``ctrl_us``, ``target_mm`` [x, y, z], ``direction``, ``displacement_tenth_nm``, ``status``, ``signal_permille``,
         ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order. ``missing``: nobody saw that standstill.
     start : dict
-        Start document (service.runs.columns).
+        Start document (abbe.service.runs.columns).
 
     Returns
     -------

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.chain import travel_sign
-from models.solvers.observations import RunData, Test, block_average, reading_noise_mm
-from service.errors import MeasurementFault
-from service.runs.approached import came_from
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.solvers.observations import RunData, Test, block_average, reading_noise_mm
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.approached import came_from
 
 BLOCKS = 400
 """Values per ball-bar run that enter a solution: noise averages down, smooth errors stay."""
@@ -103,7 +103,7 @@ def beam_of(setup: dict[str, Any], label: str) -> F1:
 
 
 def bar_noise_mm(run: dict[str, Any]) -> float:
-    """Standard deviation of one valid ball-bar reading (`models.solvers.observations.reading_noise_mm`)."""
+    """Standard deviation of one valid ball-bar reading (`abbe.models.solvers.observations.reading_noise_mm`)."""
     columns = run["columns"]
     values = np.asarray(columns["deviation_mm"], dtype=np.float64)
     return reading_noise_mm(values[np.asarray(columns.get("valid", np.ones(values.size))).astype(bool)])

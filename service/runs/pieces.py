@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from service.storage.records import Doc, RunRecord
+from abbe.models.arrays import F1
+from abbe.service.storage.records import Doc, RunRecord
 
 STRETCH_S, STRETCH_MM = 0.5, 5.0
 """So long, and at least so far, is what is read twice."""
@@ -72,7 +72,7 @@ def read_so_far(record: RunRecord, columns: Doc) -> SoFar | None:
     seq = np.asarray(columns["device_seq"], dtype=np.int64)
     lost = int(seq[-1] - seq[0]) % 2**32 + 1 - seq.size if seq.size else 0
     if lost > max(1.0, MOST_LOST * seq.size):
-        return None  # a line that bad ends a run (service.capture); it must not get in by pieces
+        return None  # a line that bad ends a run (abbe.service.capture); it must not get in by pieces
     known = at_mm <= good_mm
     good_mm = float(at_mm[known].max(initial=0.0))  # a bar that was out of range before anything else stopped has read no farther
     if good_mm - counted_mm < max(STRETCH_MM, STRETCH_S * feed_mm_s) or int(known.sum()) < LEAST_READINGS:

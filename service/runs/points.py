@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
-from service.errors import FileFormatError
-from service.explain import nearest, shown
+from abbe.models.arrays import F1, F2
+from abbe.service.errors import FileFormatError
+from abbe.service.explain import nearest, shown
 
 POSITION = ("x_mm", "y_mm", "z_mm")
 DIRECTION = ("direction_x", "direction_y", "direction_z")

@@ -1,10 +1,10 @@
-"""What a runner gives its samples to. Who keeps them, and how safely, is another matter (service.capture)."""
+"""What a runner gives its samples to. Who keeps them, and how safely, is another matter (abbe.service.capture)."""
 
 from __future__ import annotations
 
 from typing import Any, Protocol
 
-from drivers.api import BarBatch, BarTap
+from abbe.drivers.api import BarBatch, BarTap
 
 
 class Recorder(Protocol):

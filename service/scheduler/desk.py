@@ -9,24 +9,24 @@ from functools import partial
 
 import structlog
 
-from service.audit.book import AuditBook, this_account
-from service.audit.chain import Event
-from service.clock import Clock
-from service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
-from service.events import Progress, ProgressSink
-from service.scheduler import record
-from service.scheduler.job import FAILURES
-from service.scheduler.keep import Patient
-from service.scheduler.ports import Doc, Errand, JobWatcher, SlotState
-from service.scheduler.slots import Needs, Schedule
-from service.scheduler.store import ServiceStore
-from service.sequences.control import Control, State
-from service.storage.records import AlarmEntryRecord
-from service.workflows.alarm_states import NO_ALARM, Alarm, Kind, folded, next_step
-from service.workflows.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
-from service.workflows.investigate import Note
-from service.workflows.push_approved import Approved, Order, next_approved
-from service.workflows.push_word import OPEN, STOPPED, Outcome, by_journal, in_force, last_push
+from abbe.service.audit.book import AuditBook, this_account
+from abbe.service.audit.chain import Event
+from abbe.service.clock import Clock
+from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.scheduler import record
+from abbe.service.scheduler.job import FAILURES
+from abbe.service.scheduler.keep import Patient
+from abbe.service.scheduler.ports import Doc, Errand, JobWatcher, SlotState
+from abbe.service.scheduler.slots import Needs, Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.control import Control, State
+from abbe.service.storage.records import AlarmEntryRecord
+from abbe.service.workflows.alarm_states import NO_ALARM, Alarm, Kind, folded, next_step
+from abbe.service.workflows.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
+from abbe.service.workflows.investigate import Note
+from abbe.service.workflows.push_approved import Approved, Order, next_approved
+from abbe.service.workflows.push_word import OPEN, STOPPED, Outcome, by_journal, in_force, last_push
 
 log = structlog.get_logger("abbe.alarm")
 

@@ -7,14 +7,14 @@ from datetime import datetime
 
 import structlog
 
-from drivers.errors import DriverError
-from service.clock import Clock
-from service.errors import AbbeError
-from service.events import Progress
-from service.scheduler import record
-from service.scheduler.ports import AfterCheck, Check, Doc, JobWatcher, Shelf, SlotState
-from service.scheduler.slots import Schedule
-from service.sequences.control import Control
+from abbe.drivers.errors import DriverError
+from abbe.service.clock import Clock
+from abbe.service.errors import AbbeError
+from abbe.service.events import Progress
+from abbe.service.scheduler import record
+from abbe.service.scheduler.ports import AfterCheck, Check, Doc, JobWatcher, Shelf, SlotState
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.sequences.control import Control
 
 log = structlog.get_logger("abbe.check")
 

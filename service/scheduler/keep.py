@@ -9,12 +9,12 @@ from typing import ParamSpec, TypeVar
 
 import structlog
 
-from service.clock import Clock
-from service.errors import StoreError
-from service.scheduler import record
-from service.scheduler.ports import Doc, OpenSlot
-from service.scheduler.store import ServiceStore
-from service.storage.store_slots import RUNNING
+from abbe.service.clock import Clock
+from abbe.service.errors import StoreError
+from abbe.service.scheduler import record
+from abbe.service.scheduler.ports import Doc, OpenSlot
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store_slots import RUNNING
 
 log = structlog.get_logger("abbe.store")
 

@@ -1,7 +1,7 @@
 """The timetable at work: each slot claimed once, one job at a time, nothing missed in silence.
 
 A slot that is due waits until it may start: no other check runs, no maintenance window, the machine as the schedule needs it. How long it
-may wait is the schedule's grace; a slot found later than that is a missed one. What a slot ends as is in `service.scheduler.outcomes`.
+may wait is the schedule's grace; a slot found later than that is a missed one. What a slot ends as is in `abbe.service.scheduler.outcomes`.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Protocol
 
 import structlog
 
-from service.clock import Clock
-from service.scheduler import outcomes
-from service.scheduler.ports import Carry, Doc, Errand, Errands, Ledger, Readiness, SlotState, carried_alone
-from service.scheduler.ready import AlwaysReady
-from service.scheduler.slots import Schedule, next_slot, previous_slot, slots_after
-from service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
-from service.scheduler.windows import Window, covering
+from abbe.service.clock import Clock
+from abbe.service.scheduler import outcomes
+from abbe.service.scheduler.ports import Carry, Doc, Errand, Errands, Ledger, Readiness, SlotState, carried_alone
+from abbe.service.scheduler.ready import AlwaysReady
+from abbe.service.scheduler.slots import Schedule, next_slot, previous_slot, slots_after
+from abbe.service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
+from abbe.service.scheduler.windows import Window, covering
 
 log = structlog.get_logger("abbe.scheduler")
 

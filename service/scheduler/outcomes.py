@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from service.scheduler.slots import Schedule
-from service.scheduler.waiting import Hindrance, Waiting
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.waiting import Hindrance, Waiting
 
 
 class Outcome(NamedTuple):

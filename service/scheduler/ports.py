@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal, NamedTuple, Protocol, Self
 
-from service.events import Progress, ProgressSink
-from service.scheduler.slots import Schedule
-from service.sequences.control import Control
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.sequences.control import Control
 
 Verdict = Literal["pass", "fail", "cannot tell"]
 JobKind = Literal["check", "campaign", "investigation", "push", "rollback"]

@@ -6,15 +6,15 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.api import ControllerStatus
-from drivers.errors import DriverError
-from service.clock import Clock
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls, open_session
-from service.errors import AbbeError
-from service.scheduler.slots import Needs, Schedule
-from service.scheduler.windows import Window, covering
-from service.sequences.interlocks import MOVING, PATH, PROGRAM, SPINDLE, somebody_at_work, tripped
+from abbe.drivers.api import ControllerStatus
+from abbe.drivers.errors import DriverError
+from abbe.service.clock import Clock
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.errors import AbbeError
+from abbe.service.scheduler.slots import Needs, Schedule
+from abbe.service.scheduler.windows import Window, covering
+from abbe.service.sequences.interlocks import MOVING, PATH, PROGRAM, SPINDLE, somebody_at_work, tripped
 
 LOOK_S = 60.0
 """How often the controller is looked at where a schedule needs a warm machine."""

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from drivers.errors import DriverError
-from service.errors import AbbeError
-from service.scheduler.ports import CheckResult, Doc
-from service.scheduler.slots import Schedule
+from abbe.drivers.errors import DriverError
+from abbe.service.errors import AbbeError
+from abbe.service.scheduler.ports import CheckResult, Doc
+from abbe.service.scheduler.slots import Schedule
 
 SCHEMA = 1
 """Version of the documents. Raised when a key changes its meaning or goes; new keys do not raise it."""

@@ -16,8 +16,8 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from cronsim import CronSim, CronSimError
 
-from service.errors import ConfigError
-from service.scheduler import wall
+from abbe.service.errors import ConfigError
+from abbe.service.scheduler import wall
 
 FIRST_UTC = datetime(2026, 1, 1, tzinfo=UTC)
 """Intervals are counted from here unless the machine file names another instant."""

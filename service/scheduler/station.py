@@ -9,11 +9,11 @@ from typing import Protocol
 
 import structlog
 
-from service.clock import Clock
-from service.errors import StoreError
-from service.events import Progress
-from service.scheduler.ports import Doc
-from service.scheduler.slots import Schedule
+from abbe.service.clock import Clock
+from abbe.service.errors import StoreError
+from abbe.service.events import Progress
+from abbe.service.scheduler.ports import Doc
+from abbe.service.scheduler.slots import Schedule
 
 log = structlog.get_logger("abbe.station")
 

@@ -8,11 +8,11 @@ from datetime import datetime
 
 from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
 
-from service.storage.records import Doc, SlotRecord
-from service.storage.store import Store
-from service.storage.store_campaigns import new_id
-from service.storage.store_slots import SLOT_COLUMNS, slot_record
-from service.storage.tables import campaigns, machines, outbox, slots, verifications
+from abbe.service.storage.records import Doc, SlotRecord
+from abbe.service.storage.store import Store
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.store_slots import SLOT_COLUMNS, slot_record
+from abbe.service.storage.tables import campaigns, machines, outbox, slots, verifications
 
 
 class ServiceStore(Store):
@@ -26,7 +26,7 @@ class ServiceStore(Store):
         machine_id : int
             The machine, for checks that failed before they had a campaign.
         doc : dict
-            As made by `service.scheduler.record`.
+            As made by `abbe.service.scheduler.record`.
         messages : sequence of (topic, document)
             What the broker is to be told; each is given the number of the verification.
 

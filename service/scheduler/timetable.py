@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, time
 
-from service.config_schema import MachineFile
-from service.config_timetable import ScheduleEntry, WindowEntry
-from service.scheduler.slots import FIRST_UTC, Needs, Schedule, checked
-from service.scheduler.windows import Window
+from abbe.service.config_schema import MachineFile
+from abbe.service.config_timetable import ScheduleEntry, WindowEntry
+from abbe.service.scheduler.slots import FIRST_UTC, Needs, Schedule, checked
+from abbe.service.scheduler.windows import Window
 
 
 def schedules_of(config: MachineFile) -> tuple[Schedule, ...]:

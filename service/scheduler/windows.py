@@ -8,7 +8,7 @@ from datetime import datetime, time, timedelta
 from functools import lru_cache
 from zoneinfo import ZoneInfo
 
-from service.scheduler.slots import Schedule, next_slot, previous_slot
+from abbe.service.scheduler.slots import Schedule, next_slot, previous_slot
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 

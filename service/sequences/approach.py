@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machine import AXES, Machine
-from models.paths.circles import way_on_sphere
-from service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Point, Step, TakeBarOut
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.circles import way_on_sphere
+from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Point, Step, TakeBarOut
 
 Array = NDArray[np.float64]
 RAPID_MM_MIN = 6000.0

@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from models.machine import AXES, Machine
-from models.paths.circles import Plane, arc_through, circle_points, way_on_sphere
-from models.paths.helix import Law, even_helix_points, helix_points
-from service.errors import ConfigError
-from service.sequences.approach import BAR_APPROACH_MM, LINK_CHORD_MM, Array, as_point, pole_of, to_path
-from service.sequences.steps import MAX_PATH_POINTS, FollowPath, MoveTo, Point, ReadBar, RecordPath, Step, TestPlan, Unmount
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.circles import Plane, arc_through, circle_points, way_on_sphere
+from abbe.models.paths.helix import Law, even_helix_points, helix_points
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.approach import BAR_APPROACH_MM, LINK_CHORD_MM, Array, as_point, pole_of, to_path
+from abbe.service.sequences.steps import MAX_PATH_POINTS, FollowPath, MoveTo, Point, ReadBar, RecordPath, Step, TestPlan, Unmount
 
 MIN_TURNS = 3.0
 """Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition 28 at 3 turns, 58 at 2, 1900 at 1; math.md 4.5)."""

@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
-from models.machine import AXES
-from service.sequences.bar_recipes import BarRecipe, Circle, Helix, HelixPoints
-from service.sequences.recipe_tables import Coordinate, Feed, Letter, Settle, TestTable
+from abbe.models.machine import AXES
+from abbe.service.sequences.bar_recipes import BarRecipe, Circle, Helix, HelixPoints
+from abbe.service.sequences.recipe_tables import Coordinate, Feed, Letter, Settle, TestTable
 
 Arc = Annotated[float, Field(ge=0.0, le=360.0)]
 Turns = Annotated[float, Field(ge=3.0, le=50.0)]

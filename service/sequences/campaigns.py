@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.machine import AXES, Machine
-from models.paths.lines import DIAGONALS
-from service.sequences.recipes import Diagonal, Helix, Linear, Recipe, as_point
-from service.sequences.steps import CampaignPlan, Point
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.lines import DIAGONALS
+from abbe.service.sequences.recipes import Diagonal, Helix, Linear, Recipe, as_point
+from abbe.service.sequences.steps import CampaignPlan, Point
 
 
 def hemisphere(machine: Machine, rel: tuple[float, float, float], share: float) -> tuple[Point, float]:

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from models.machine import AXES, Machine
-from service.errors import StrokeError
-from service.sequences.approach import LOW_SHARE, as_point, cup_of
-from service.sequences.steps import (
+from abbe.models.machine import AXES, Machine
+from abbe.service.errors import StrokeError
+from abbe.service.sequences.approach import LOW_SHARE, as_point, cup_of
+from abbe.service.sequences.steps import (
     MAX_PATH_POINTS,
     CampaignPlan,
     ChangeBar,

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, TypeVar
 
-from service.errors import Aborted, Stopped
-from service.sequences.prompts import Prompts
+from abbe.service.errors import Aborted, Stopped
+from abbe.service.sequences.prompts import Prompts
 
 T = TypeVar("T")
 STOPPED = Stopped("stopped as asked", "`abbe measure MACHINE.toml --resume CAMPAIGN` goes on from here")

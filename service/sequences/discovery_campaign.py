@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from models.machine import AXES, Machine
-from models.paths.lines import DIAGONALS
-from service.sequences.campaigns import hemisphere, verification, verification_helix
-from service.sequences.recipes import Diagonal, Helix, Linear, Recipe
-from service.sequences.steps import CampaignPlan
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.lines import DIAGONALS
+from abbe.service.sequences.campaigns import hemisphere, verification, verification_helix
+from abbe.service.sequences.recipes import Diagonal, Helix, Linear, Recipe
+from abbe.service.sequences.steps import CampaignPlan
 
 SLOW, MIDDLE, FAST = 1000.0, 2000.0, 3000.0
 STEPS, LINE_N = 12, 13

@@ -6,10 +6,10 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
-from drivers.api import Controller
-from drivers.errors import DriverError
-from drivers.links.shielded import run_to_end
-from service.errors import AbbeError
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.errors import AbbeError
 
 STOP_S = 10.0
 """Outer bound only. The driver's own limits govern: seconds for each write, five until the axes stand still."""

@@ -11,12 +11,12 @@ from datetime import timedelta
 from functools import partial
 from typing import Any
 
-from drivers.errors import NO_RUN, on_behalf_of
-from drivers.links.incidents import Incident, Incidents
-from drivers.links.shielded import run_to_end
-from service.clock import Clock
-from service.devices.session import Session
-from service.sequences.journal import INCIDENT, OUTCOME, Journal
+from abbe.drivers.errors import NO_RUN, on_behalf_of
+from abbe.drivers.links.incidents import Incident, Incidents
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.clock import Clock
+from abbe.service.devices.session import Session
+from abbe.service.sequences.journal import INCIDENT, OUTCOME, Journal
 
 LINKS = {"controller": "controller", "laser": "laser", "ballbar": "ball-bar"}
 STILL_OPEN = "open"

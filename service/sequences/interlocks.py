@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from drivers.api import ControllerStatus, LaserReading
-from service.errors import (
+from abbe.drivers.api import ControllerStatus, LaserReading
+from abbe.service.errors import (
     AlarmOn,
     BeamLost,
     DoorOpen,

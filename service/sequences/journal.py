@@ -11,10 +11,10 @@ from __future__ import annotations
 import asyncio
 from typing import Any, Protocol
 
-from service.capture.ingest import may_pass
-from service.capture.recorder import CATCH_UP_S
-from service.errors import StoreError
-from service.storage.store import Store
+from abbe.service.capture.ingest import may_pass
+from abbe.service.capture.recorder import CATCH_UP_S
+from abbe.service.errors import StoreError
+from abbe.service.storage.store import Store
 
 BEGUN, HAND, RUN, POINT, DONE, WAITS, GOES_ON, ENDED = "begun", "hand", "run", "point", "done", "waits", "goes-on", "ended"
 INCIDENT = "incident"

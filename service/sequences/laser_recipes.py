@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from models.machine import AXES, Machine
-from models.paths.lines import cycles_of, diagonal_ends, face_ends, step_diagonal, straight_line, target_shares
-from service.errors import ConfigError
-from service.sequences.approach import RAPID_MM_MIN, Array, as_point
-from service.sequences.steps import MountLaser, MoveTo, ReadLaser, Step, TestPlan, Unmount, ZeroLaser
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.lines import cycles_of, diagonal_ends, face_ends, step_diagonal, straight_line, target_shares
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.approach import RAPID_MM_MIN, Array, as_point
+from abbe.service.sequences.steps import MountLaser, MoveTo, ReadLaser, Step, TestPlan, Unmount, ZeroLaser
 
 APPROACH_MM = 1.0
 CLEARANCE_MM = 10.0

@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from models.machine import AXES
-from service.sequences.approach import RAPID_MM_MIN
-from service.sequences.laser_recipes import Diagonal, FaceDiagonal, LaserRecipe, Linear
-from service.sequences.recipe_tables import Feed, Letter, Settle, Share, TestTable
+from abbe.models.machine import AXES
+from abbe.service.sequences.approach import RAPID_MM_MIN
+from abbe.service.sequences.laser_recipes import Diagonal, FaceDiagonal, LaserRecipe, Linear
+from abbe.service.sequences.recipe_tables import Feed, Letter, Settle, Share, TestTable
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Steps = Annotated[int, Field(ge=1, le=500)]

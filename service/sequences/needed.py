@@ -10,13 +10,13 @@ from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.api import LaserReading
-from drivers.errors import DriverError, ReplyTimeout, WrongDevice
-from drivers.fixture.driver import ConsoleFixture
-from service.devices.session import Session, raise_all
-from service.errors import AbbeError, ConfigError
-from service.sequences.rewind import BY_HAND
-from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, ReadBar, ReadLaser, RecordPath, ZeroLaser
+from abbe.drivers.api import LaserReading
+from abbe.drivers.errors import DriverError, ReplyTimeout, WrongDevice
+from abbe.drivers.fixture.driver import ConsoleFixture
+from abbe.service.devices.session import Session, raise_all
+from abbe.service.errors import AbbeError, ConfigError
+from abbe.service.sequences.rewind import BY_HAND
+from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, ReadBar, ReadLaser, RecordPath, ZeroLaser
 
 CNC, BALLBAR, LASER, FIXTURE = "cnc", "ballbar", "laser", "fixture"
 IN_WORDS = {CNC: "a controller", BALLBAR: "a ball-bar", LASER: "a laser", FIXTURE: "a fixture"}

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.api import BarSample, ControllerStatus
-from models.arrays import F1
-from service.errors import RunInterrupted, StretchDiffers
-from service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, Piece, SoFar, arc_of
-from service.sequences.steps import Point, RecordPath
+from abbe.drivers.api import BarSample, ControllerStatus
+from abbe.models.arrays import F1
+from abbe.service.errors import RunInterrupted, StretchDiffers
+from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, Piece, SoFar, arc_of
+from abbe.service.sequences.steps import Point, RecordPath
 
 LEAD_S, LEAD_MM = 0.5, 5.0
 """So long, and at least so far, the axes drive before readings count: they have speeded up, and their lost motion is taken up."""

@@ -5,16 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 
-from drivers.api import BarBatch, Controller, ControllerStatus
-from service.devices.session import Session
-from service.errors import BarOutOfRange, MeasurementFault, RunInterrupted
-from service.runs.recorder import Recorder
-from service.sequences.control import Control
-from service.sequences.guard import motion_guard
-from service.sequences.interlocks import HOLD, MOVING, PATH, check_interlocks
-from service.sequences.onward import Onward, SameStretch, Way
-from service.sequences.steps import FollowPath, RecordPath
-from service.sequences.watch import first_of
+from abbe.drivers.api import BarBatch, Controller, ControllerStatus
+from abbe.service.devices.session import Session
+from abbe.service.errors import BarOutOfRange, MeasurementFault, RunInterrupted
+from abbe.service.runs.recorder import Recorder
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.guard import motion_guard
+from abbe.service.sequences.interlocks import HOLD, MOVING, PATH, check_interlocks
+from abbe.service.sequences.onward import Onward, SameStretch, Way
+from abbe.service.sequences.steps import FollowPath, RecordPath
+from abbe.service.sequences.watch import first_of
 
 POLL_S = 0.01
 STALL_S = 10.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.api import ControllerStatus
-from service.devices.session import Session
-from service.errors import WorldChanged
-from service.sequences.interlocks import Watching, air_trouble, beam_trouble, check_interlocks
+from abbe.drivers.api import ControllerStatus
+from abbe.service.devices.session import Session
+from abbe.service.errors import WorldChanged
+from abbe.service.sequences.interlocks import Watching, air_trouble, beam_trouble, check_interlocks
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,14 +14,14 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from service.errors import ConfigError
-from service.explain import expected, nearest, where
-from service.sequences import bar_tables, laser_tables
-from service.sequences.bar_tables import CircleTable, HelixPointsTable, HelixTable, bar_table
-from service.sequences.laser_tables import DiagonalTable, FaceTable, LineTable, laser_table
-from service.sequences.recipe_tables import Table, TestTable
-from service.sequences.recipes import BarRecipe, Recipe
-from service.sequences.setups import shared_setups
+from abbe.service.errors import ConfigError
+from abbe.service.explain import expected, nearest, where
+from abbe.service.sequences import bar_tables, laser_tables
+from abbe.service.sequences.bar_tables import CircleTable, HelixPointsTable, HelixTable, bar_table
+from abbe.service.sequences.laser_tables import DiagonalTable, FaceTable, LineTable, laser_table
+from abbe.service.sequences.recipe_tables import Table, TestTable
+from abbe.service.sequences.recipes import BarRecipe, Recipe
+from abbe.service.sequences.setups import shared_setups
 
 FORMAT = "abbe-recipe/1"
 AnyTest = Annotated[

@@ -6,9 +6,9 @@ state at the start; an axis that begins at the very end of its stroke cannot. Wh
 
 from __future__ import annotations
 
-from service.sequences.approach import RAPID_MM_MIN, as_point
-from service.sequences.bar_recipes import MIN_TURNS, BarRecipe, Circle, Helix, HelixPoints
-from service.sequences.laser_recipes import Diagonal, FaceDiagonal, LaserRecipe, Linear
+from abbe.service.sequences.approach import RAPID_MM_MIN, as_point
+from abbe.service.sequences.bar_recipes import MIN_TURNS, BarRecipe, Circle, Helix, HelixPoints
+from abbe.service.sequences.laser_recipes import Diagonal, FaceDiagonal, LaserRecipe, Linear
 
 __all__ = [
     "MIN_TURNS", "RAPID_MM_MIN", "BarRecipe", "Circle", "Diagonal", "FaceDiagonal", "Helix", "HelixPoints", "LaserRecipe", "Linear",

@@ -1,8 +1,8 @@
 """From where a test that was broken off is gone on with, and how the machine gets there. Pure.
 
 A bar must not be moved through its sphere, a mirror not out of its beam: the way back is the way that the test came, to the last
-checkpoint. A path with the ball-bar goes on where it was broken off (service.sequences.onward), or begins again; a run with the laser goes
-on after its last complete point, once that point was read again and says the same.
+checkpoint. A path with the ball-bar goes on where it was broken off (abbe.service.sequences.onward), or begins again; a run with the laser
+goes on after its last complete point, once that point was read again and says the same.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import SetupDisturbed
-from service.runs.pieces import SoFar
-from service.sequences.approach import cup_of, over_pole
-from service.sequences.onward import Onward, rest_of_path
-from service.sequences.steps import (
+from abbe.service.errors import SetupDisturbed
+from abbe.service.runs.pieces import SoFar
+from abbe.service.sequences.approach import cup_of, over_pole
+from abbe.service.sequences.onward import Onward, rest_of_path
+from abbe.service.sequences.steps import (
     ChangeBar,
     FollowPath,
     MountBar,

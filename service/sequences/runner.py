@@ -7,22 +7,22 @@ import math
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from drivers.api import ControllerStatus, Point
-from drivers.errors import Refused
-from service.devices.session import Session
-from service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
-from service.runs.recorder import Recorder
-from service.sequences.check import step_seconds
-from service.sequences.control import Control
-from service.sequences.guard import motion_guard
-from service.sequences.interlocks import AT_WORK, PAUSED, PROGRAM, REMOTE, Watching, check_interlocks, check_ours
-from service.sequences.journal import HAND, POINT, Journal, NoJournal
-from service.sequences.onward import Onward, Way
-from service.sequences.paths import follow_path, record_path
-from service.sequences.preconditions import Expected
-from service.sequences.rewind import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
-from service.sequences.standstill import read_bar
-from service.sequences.steps import (
+from abbe.drivers.api import ControllerStatus, Point
+from abbe.drivers.errors import Refused
+from abbe.service.devices.session import Session
+from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
+from abbe.service.runs.recorder import Recorder
+from abbe.service.sequences.check import step_seconds
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.guard import motion_guard
+from abbe.service.sequences.interlocks import AT_WORK, PAUSED, PROGRAM, REMOTE, Watching, check_interlocks, check_ours
+from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
+from abbe.service.sequences.onward import Onward, Way
+from abbe.service.sequences.paths import follow_path, record_path
+from abbe.service.sequences.preconditions import Expected
+from abbe.service.sequences.rewind import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
+from abbe.service.sequences.standstill import read_bar
+from abbe.service.sequences.steps import (
     ChangeBar,
     FollowPath,
     MountBar,
@@ -37,8 +37,8 @@ from service.sequences.steps import (
     Unmount,
     ZeroLaser,
 )
-from service.sequences.waiting import paused
-from service.sequences.watch import NOTHING, Watch, watched
+from abbe.service.sequences.waiting import paused
+from abbe.service.sequences.watch import NOTHING, Watch, watched
 
 COMPENSATED = 3
 SAME_PLACE_MM = 1e-3

@@ -7,9 +7,9 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from service.errors import ConfigError
-from service.sequences.approach import LOW_SHARE, Cup, pole_of
-from service.sequences.recipes import BarRecipe, Diagonal, FaceDiagonal, Linear, Recipe
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.approach import LOW_SHARE, Cup, pole_of
+from abbe.service.sequences.recipes import BarRecipe, Diagonal, FaceDiagonal, Linear, Recipe
 
 
 def shared_setups(recipes: tuple[Recipe, ...], source: str) -> tuple[Recipe, ...]:

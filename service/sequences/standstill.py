@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from drivers.api import BallBar, BarSample, ControllerStatus, Point
-from service.errors import MeasurementFault
-from service.sequences.paths import BAD_BITS, OUT_BITS, bar_trouble
-from service.sequences.steps import ReadBar
+from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point
+from abbe.service.errors import MeasurementFault
+from abbe.service.sequences.paths import BAD_BITS, OUT_BITS, bar_trouble
+from abbe.service.sequences.steps import ReadBar
 
 
 async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, here: Point | None) -> dict[str, Any]:

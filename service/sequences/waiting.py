@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable
 
-from drivers.errors import DriverError
-from service.devices.session import Session
-from service.errors import BeamLost, DoorOpen, Interlock
-from service.sequences.control import Control, State
-from service.sequences.interlocks import CAN_CLEAR, Suspending, Watching, somebody_at_work
-from service.sequences.journal import GOES_ON, WAITS, Journal
-from service.sequences.preconditions import Expected, check_world
+from abbe.drivers.errors import DriverError
+from abbe.service.devices.session import Session
+from abbe.service.errors import BeamLost, DoorOpen, Interlock
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import CAN_CLEAR, Suspending, Watching, somebody_at_work
+from abbe.service.sequences.journal import GOES_ON, WAITS, Journal
+from abbe.service.sequences.preconditions import Expected, check_world
 
 LOOK_S = 0.1
 NO_SIGNAL_BITS = 0b10010

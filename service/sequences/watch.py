@@ -14,13 +14,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import asynccontextmanager
 from typing import Any
 
-from drivers.api import ControllerStatus, DisplacementMeter
-from drivers.errors import DriverError, Rebooted
-from service.devices.clock_notes import latest_status
-from service.devices.session import Session
-from service.errors import Interlock, MeasurementFault, StatusUnknown
-from service.sequences.control import Control
-from service.sequences.interlocks import Watching, air_trouble, beam_trouble, tripped
+from abbe.drivers.api import ControllerStatus, DisplacementMeter
+from abbe.drivers.errors import DriverError, Rebooted
+from abbe.service.devices.clock_notes import latest_status
+from abbe.service.devices.session import Session
+from abbe.service.errors import Interlock, MeasurementFault, StatusUnknown
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.interlocks import Watching, air_trouble, beam_trouble, tripped
 
 AIR_PERIOD_S = 1.0
 LASER_UNKNOWN_S = 2.5

@@ -11,10 +11,10 @@ from typing import ParamSpec, Self, TypeVar
 
 from sqlalchemy import Connection, Engine
 
-from service.errors import StoreError
-from service.secrets import mask_secrets
-from service.storage.engine import DEFAULT_URL, READ_ONLY_OPTION, make_engine, translated
-from service.storage.migrate import upgrade
+from abbe.service.errors import StoreError
+from abbe.service.secrets import mask_secrets
+from abbe.service.storage.engine import DEFAULT_URL, READ_ONLY_OPTION, make_engine, translated
+from abbe.service.storage.migrate import upgrade
 
 P = ParamSpec("P")
 T = TypeVar("T")

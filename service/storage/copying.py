@@ -10,7 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from service.errors import StoreError
+from abbe.service.errors import StoreError
 
 PAGES = 1024
 """Copied at a time; between two steps others may write."""

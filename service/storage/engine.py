@@ -14,9 +14,9 @@ from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.pool import StaticPool
 
-from service.errors import StoreError
-from service.secrets import mask_secrets
-from service.storage.private import private_file
+from abbe.service.errors import StoreError
+from abbe.service.secrets import mask_secrets
+from abbe.service.storage.private import private_file
 
 DEFAULT_URL = "sqlite:///abbe.sqlite3"
 BUSY_TIMEOUT_MS = 5000

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection, Engine, inspect
 
-from service.errors import StoreError
-from service.secrets import mask_secrets
-from service.storage.private import private_file
+from abbe.service.errors import StoreError
+from abbe.service.secrets import mask_secrets
+from abbe.service.storage.private import private_file
 
 if TYPE_CHECKING:
     from alembic.config import Config
 
-_VERSIONS = "service.storage.migrations.versions"
+_VERSIONS = "abbe.service.storage.migrations.versions"
 _TABLE = "alembic_version"
 _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after the other
 
@@ -111,7 +111,7 @@ def _config(connection: Connection | None = None) -> Config:
     from alembic.config import Config
 
     config = Config()
-    config.set_main_option("script_location", "service.storage:migrations")
+    config.set_main_option("script_location", "abbe.service.storage:migrations")
     config.set_main_option("path_separator", "os")
     config.attributes["connection"] = connection
     return config

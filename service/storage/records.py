@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.storage.owner import Owner
+from abbe.service.storage.owner import Owner
 
 Doc = dict[str, Any]
 """A JSON object."""

@@ -6,24 +6,24 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection, select
 
-from service.storage.records import Doc, ImportedRun
-from service.storage.store_alarms import AlarmStore
-from service.storage.store_audit import AuditStore
-from service.storage.store_campaigns import insert_campaign, machine_id_of
-from service.storage.store_checkpoints import CheckpointStore
-from service.storage.store_decisions import DecisionStore
-from service.storage.store_discoveries import DiscoveryStore
-from service.storage.store_health import HealthStore
-from service.storage.store_pages import PageStore
-from service.storage.store_people import PeopleStore
-from service.storage.store_proposals import ProposalStore
-from service.storage.store_push import PushStore
-from service.storage.store_queues import QueueStore
-from service.storage.store_results import ResultStore
-from service.storage.store_runs import RunStore, insert_imported
-from service.storage.store_slots import SlotStore
-from service.storage.store_stations import StationStore
-from service.storage.tables import identity
+from abbe.service.storage.records import Doc, ImportedRun
+from abbe.service.storage.store_alarms import AlarmStore
+from abbe.service.storage.store_audit import AuditStore
+from abbe.service.storage.store_campaigns import insert_campaign, machine_id_of
+from abbe.service.storage.store_checkpoints import CheckpointStore
+from abbe.service.storage.store_decisions import DecisionStore
+from abbe.service.storage.store_discoveries import DiscoveryStore
+from abbe.service.storage.store_health import HealthStore
+from abbe.service.storage.store_pages import PageStore
+from abbe.service.storage.store_people import PeopleStore
+from abbe.service.storage.store_proposals import ProposalStore
+from abbe.service.storage.store_push import PushStore
+from abbe.service.storage.store_queues import QueueStore
+from abbe.service.storage.store_results import ResultStore
+from abbe.service.storage.store_runs import RunStore, insert_imported
+from abbe.service.storage.store_slots import SlotStore
+from abbe.service.storage.store_stations import StationStore
+from abbe.service.storage.tables import identity
 
 
 class Store(

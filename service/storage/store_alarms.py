@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, func, insert, select
 from sqlalchemy.exc import IntegrityError
 
-from service.errors import StoreError
-from service.storage.base import StoreBase
-from service.storage.records import AlarmEntryRecord, Doc
-from service.storage.store_campaigns import new_id
-from service.storage.tables import alarm_entries, outbox
+from abbe.service.errors import StoreError
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import AlarmEntryRecord, Doc
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables import alarm_entries, outbox
 
 
 class AlarmStore(StoreBase):
@@ -32,7 +32,7 @@ class AlarmStore(StoreBase):
         seq : int
             Number of the line: one more than the last that was read, so that whoever decided on old knowledge is refused.
         kind : str
-            What happened (`service.workflows.alarm_states`).
+            What happened (`abbe.service.workflows.alarm_states`).
         doc : dict
             What is known of it.
         messages : sequence of (topic, document)

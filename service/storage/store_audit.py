@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 
 from sqlalchemy import Connection, insert, select, text
 
-from service.errors import StoreError
-from service.storage.base import StoreBase
-from service.storage.records import Doc
-from service.storage.tables_people import audit
+from abbe.service.errors import StoreError
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import Doc
+from abbe.service.storage.tables_people import audit
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,10 @@ from typing import Any
 
 from sqlalchemy import Connection, Insert, Select, insert, select
 
-from service.errors import StoreError
-from service.storage.base import StoreBase
-from service.storage.records import CampaignRecord, Doc, MachineRecord
-from service.storage.tables import campaigns, machines
+from abbe.service.errors import StoreError
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import CampaignRecord, Doc, MachineRecord
+from abbe.service.storage.tables import campaigns, machines
 
 MOST_DIGITS = 10
 """A number with more is no number of a row."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from sqlalchemy import Connection, func, insert, select
 
-from service.storage.base import StoreBase
-from service.storage.records import CheckpointRecord, Doc
-from service.storage.store_campaigns import new_id
-from service.storage.tables import checkpoints
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import CheckpointRecord, Doc
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables import checkpoints
 
 
 class CheckpointStore(StoreBase):
@@ -21,7 +21,7 @@ class CheckpointStore(StoreBase):
         campaign_id : int
             Campaign.
         kind : str
-            What happened (service.sequences.journal lists them).
+            What happened (abbe.service.sequences.journal lists them).
         doc : dict
             What is known of it.
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, insert, select
 from sqlalchemy.exc import IntegrityError
 
-from service.errors import CaptureConflict, StoreError
-from service.storage.records import RUNNING, ChunkRecord
-from service.storage.store_campaigns import CampaignStore
-from service.storage.tables import chunks, runs
+from abbe.service.errors import CaptureConflict, StoreError
+from abbe.service.storage.records import RUNNING, ChunkRecord
+from abbe.service.storage.store_campaigns import CampaignStore
+from abbe.service.storage.tables import chunks, runs
 
 _FIELDS = tuple(ChunkRecord.__dataclass_fields__)
 

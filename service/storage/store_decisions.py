@@ -8,9 +8,9 @@ from datetime import timedelta
 from sqlalchemy import Connection, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from service.storage.base import StoreBase, utc_text
-from service.storage.store_campaigns import new_id
-from service.storage.tables_decisions import rejections, replies
+from abbe.service.storage.base import StoreBase, utc_text
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables_decisions import rejections, replies
 
 KEPT = timedelta(days=7)
 """How long an answer is kept for its key."""

@@ -9,11 +9,11 @@ from sqlalchemy import Connection, func, insert, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql import Select
 
-from service.errors import ModelMovedOn, StoreError
-from service.storage.base import StoreBase
-from service.storage.records import DiscoveryRecord, Doc, ModelRecord, NewVersion, StepRecord
-from service.storage.store_campaigns import new_id
-from service.storage.tables import discoveries, discovery_steps, machine_models
+from abbe.service.errors import ModelMovedOn, StoreError
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import DiscoveryRecord, Doc, ModelRecord, NewVersion, StepRecord
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables import discoveries, discovery_steps, machine_models
 
 
 class DiscoveryStore(StoreBase):

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, select, text
 
-from service.storage.base import StoreBase
-from service.storage.migrate import head_revision, revision_of
-from service.storage.tables import machines, outbox
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.migrate import head_revision, revision_of
+from abbe.service.storage.tables import machines, outbox
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,10 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, FromClause, Select, func, select
 
-from service.storage.base import StoreBase
-from service.storage.owner import Owner
-from service.storage.records import INCOMPLETE, RUNNING, ChunkRecord, Doc
-from service.storage.tables import (
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.owner import Owner
+from abbe.service.storage.records import INCOMPLETE, RUNNING, ChunkRecord, Doc
+from abbe.service.storage.tables import (
     campaigns,
     chunks,
     comp_tables,

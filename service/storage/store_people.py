@@ -1,4 +1,4 @@
-"""Store methods for users, sessions and tokens. Secrets come in as digests or hashes only; what they mean is decided in `service.users`."""
+"""Store methods for users, sessions and tokens. Secrets come in as digests or hashes only; `abbe.service.users` decides what they mean."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
-from service.errors import StoreError
-from service.storage.base import StoreBase, utc_text
-from service.storage.store_campaigns import new_id
-from service.storage.tables_people import api_tokens, sessions, users
+from abbe.service.errors import StoreError
+from abbe.service.storage.base import StoreBase, utc_text
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables_people import api_tokens, sessions, users
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from sqlalchemy import insert, select
 
-from service.errors import StoreError
-from service.storage.base import StoreBase
-from service.storage.records import ApprovalRecord, Doc, ProposalRecord
-from service.storage.store_campaigns import new_id
-from service.storage.tables import approvals, proposals
+from abbe.service.errors import StoreError
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import ApprovalRecord, Doc, ProposalRecord
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables import approvals, proposals
 
 
 class ProposalStore(StoreBase):

@@ -7,11 +7,11 @@ from typing import Any
 
 from sqlalchemy import Connection, func, insert, select
 
-from service.errors import StoreError
-from service.storage.base import StoreBase
-from service.storage.records import PushEntryRecord
-from service.storage.store_campaigns import new_id
-from service.storage.tables import push_entries
+from abbe.service.errors import StoreError
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import PushEntryRecord
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables import push_entries
 
 MARKS = ("base_crc", "crc", "accepted_crc", "machine", "control", "by")
 """Keys of an entry's document that say which tables, whose, and who vouched."""
@@ -38,7 +38,7 @@ def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) 
     if own is not None:
         return own
     # A control that is nowhere noted: at a new address, or pushed into by an older version. The name's journal is its, unless a machine of
-    # another name has gone on with that. An open push in it is held against the control (`service.workflows.whose_push`).
+    # another name has gone on with that. An open push in it is held against the control (`abbe.service.workflows.whose_push`).
     named = next((chain for chain, (name, _) in last.items() if name == machine), None)
     if named is not None:
         return named

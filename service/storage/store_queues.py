@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
-from service.storage.base import StoreBase
-from service.storage.records import OutboxRecord
-from service.storage.store_campaigns import new_id
-from service.storage.tables import outbox
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import OutboxRecord
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables import outbox
 
 
 class QueueStore(StoreBase):

@@ -8,11 +8,11 @@ from typing import Any
 from sqlalchemy import insert, select, update
 from sqlalchemy.sql import Select
 
-from service.errors import StoreError
-from service.storage.base import StoreBase
-from service.storage.records import Doc, PushRecord, SolutionRecord, TableRecord, VerificationRecord
-from service.storage.store_campaigns import new_id
-from service.storage.tables import comp_tables, machines, pushes, solutions, verifications
+from abbe.service.errors import StoreError
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.records import Doc, PushRecord, SolutionRecord, TableRecord, VerificationRecord
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.tables import comp_tables, machines, pushes, solutions, verifications
 
 
 class ResultStore(StoreBase):

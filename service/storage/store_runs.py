@@ -7,12 +7,12 @@ import zlib
 from sqlalchemy import Connection, Row, Select, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from service.errors import StoreError
-from service.storage.owner import Owner, this_process
-from service.storage.records import FINISHED, RUNNING, ChunkRecord, Doc, ImportedRun, RunRecord
-from service.storage.store_campaigns import new_id
-from service.storage.store_chunks import ChunkStore
-from service.storage.tables import campaigns, chunks, runs
+from abbe.service.errors import StoreError
+from abbe.service.storage.owner import Owner, this_process
+from abbe.service.storage.records import FINISHED, RUNNING, ChunkRecord, Doc, ImportedRun, RunRecord
+from abbe.service.storage.store_campaigns import new_id
+from abbe.service.storage.store_chunks import ChunkStore
+from abbe.service.storage.tables import campaigns, chunks, runs
 
 
 class RunStore(ChunkStore):
@@ -30,7 +30,7 @@ class RunStore(ChunkStore):
         test, role : str
             As in the exchange format.
         doc : dict
-            Start document (service.runs.columns says what it holds).
+            Start document (abbe.service.runs.columns says what it holds).
 
         Returns
         -------
@@ -53,7 +53,7 @@ class RunStore(ChunkStore):
         run_id : int
             Run.
         status : str
-            One of ``service.storage.records.FINISHED``.
+            One of ``abbe.service.storage.records.FINISHED``.
         reason : str
             Why, in words; empty for a complete run.
         doc : dict or None
@@ -101,7 +101,7 @@ class RunStore(ChunkStore):
         n : int
             Samples in it.
         codec : str
-            How they are packed (service.runs.codec).
+            How they are packed (abbe.service.runs.codec).
         payload : bytes
             The packed samples.
         first_host_s, last_host_s : float

@@ -6,10 +6,10 @@ from sqlalchemy import Connection, select
 from sqlalchemy.dialects.postgresql import insert as pg_insert
 from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
-from service.storage.base import StoreBase
-from service.storage.owner import Owner, this_process
-from service.storage.records import Doc, StationRecord
-from service.storage.tables import machines, stations
+from abbe.service.storage.base import StoreBase
+from abbe.service.storage.owner import Owner, this_process
+from abbe.service.storage.records import Doc, StationRecord
+from abbe.service.storage.tables import machines, stations
 
 
 class StationStore(StoreBase):

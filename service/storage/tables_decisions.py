@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import Column, ForeignKey, Index, Integer, String, Table, Text, UniqueConstraint
 
-from service.storage.tables import metadata
+from abbe.service.storage.tables import metadata
 
 rejections = Table(
     "rejections",

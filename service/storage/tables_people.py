@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import Column, ForeignKey, Index, Integer, String, Table, Text, UniqueConstraint
 from sqlalchemy.types import JSON
 
-from service.storage.tables import metadata
+from abbe.service.storage.tables import metadata
 
 users = Table(
     "users",

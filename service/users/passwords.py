@@ -10,7 +10,7 @@ from typing import TypeVar
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerifyMismatchError
 
-from service.errors import PasswordRefused
+from abbe.service.errors import PasswordRefused
 
 AT_A_TIME = 2
 """Each hash takes 19 MiB and a processor for tens of milliseconds: whoever asks for many may not starve the capture."""

@@ -9,13 +9,13 @@ import secrets
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from service.clock import Clock
-from service.errors import UserRefused
-from service.storage.base import utc_text
-from service.storage.store import Store
-from service.storage.store_people import TokenRecord, UserRecord
-from service.users.passwords import Passwords, check_new
-from service.users.roles import ALLOWED, Permission, Role
+from abbe.service.clock import Clock
+from abbe.service.errors import UserRefused
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.store import Store
+from abbe.service.storage.store_people import TokenRecord, UserRecord
+from abbe.service.users.passwords import Passwords, check_new
+from abbe.service.users.roles import ALLOWED, Permission, Role
 
 IDLE = timedelta(minutes=15)
 LONGEST = timedelta(hours=12)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from service.errors import FileFormatError
+from abbe.models.arrays import F1
+from abbe.service.errors import FileFormatError
 
 Path = tuple[str | int, ...]
 Shape = tuple[int | None, ...]

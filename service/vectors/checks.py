@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from service.vectors.case import Case
+from abbe.service.vectors.case import Case
 
 Unit = Literal["mm", "rad", "1"]
 LIMIT: dict[str, float] = {"mm": 1e-9, "rad": 1e-12, "1": np.inf}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.kwon.frames import best_fit_errors, nearest_rotation, three_point_errors, three_point_frame
-from models.kwon.geometry import PER_LEG, Geometry
-from models.kwon.kinematics import forward, forward_as_printed, inverse, jacobian, square_commands
-from models.kwon.sensitivity import parameter_jacobian
-from service.vectors.case import Case
-from service.vectors.checks import Checks
+from abbe.models.kwon.frames import best_fit_errors, nearest_rotation, three_point_errors, three_point_frame
+from abbe.models.kwon.geometry import PER_LEG, Geometry
+from abbe.models.kwon.kinematics import forward, forward_as_printed, inverse, jacobian, square_commands
+from abbe.models.kwon.sensitivity import parameter_jacobian
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
 
 HALF_MM = 1.0
 MIDDLE_MM = 1.0

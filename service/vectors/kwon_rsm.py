@@ -10,14 +10,14 @@ import re
 
 import numpy as np
 
-from models.kwon.anova import anova_from_sums, critical_f
-from models.kwon.forensics import LADDER, coefficients_from_planes, grid_sums, in_plane_coefficients, in_plane_label, square_grid
-from models.kwon.layout import layout
-from models.kwon.surface import fit_surface
-from models.kwon.terms import IN_PLANE
-from service.errors import FileFormatError
-from service.vectors.case import LAYOUT, Case
-from service.vectors.checks import Checks
+from abbe.models.kwon.anova import anova_from_sums, critical_f
+from abbe.models.kwon.forensics import LADDER, coefficients_from_planes, grid_sums, in_plane_coefficients, in_plane_label, square_grid
+from abbe.models.kwon.layout import layout
+from abbe.models.kwon.surface import fit_surface
+from abbe.models.kwon.terms import IN_PLANE
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.checks import Checks
 
 DIGITS = 4
 """Significant digits of Table 1 in print."""

@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.functions.line_fit import straight_line
-from models.notation.pahk import pahk_type
-from models.pahk.offset import Setup, as_measured, refer_to_origin
-from models.pahk.tables import ParameterTables, Triple
-from service.errors import FileFormatError
-from service.vectors.case import LAYOUT, Case
-from service.vectors.checks import Checks
-from service.vectors.pahk_parameters import AXES, squareness
+from abbe.models.arrays import F1, F2
+from abbe.models.functions.line_fit import straight_line
+from abbe.models.notation.pahk import pahk_type
+from abbe.models.pahk.offset import Setup, as_measured, refer_to_origin
+from abbe.models.pahk.tables import ParameterTables, Triple
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.checks import Checks
+from abbe.service.vectors.pahk_parameters import AXES, squareness
 
 SUBTRACTED = "coordinates of up to 900 mm were subtracted"
 LINE = "a line was fitted to the values and taken off"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F2
-from models.notation.pahk import pahk_type
-from models.pahk.diagonals import space_diagonals
-from models.pahk.tables import ParameterTables, Triple
-from service.vectors.case import Case
-from service.vectors.checks import Checks
-from service.vectors.pahk_parameters import pair, squareness
+from abbe.models.arrays import F2
+from abbe.models.notation.pahk import pahk_type
+from abbe.models.pahk.diagonals import space_diagonals
+from abbe.models.pahk.tables import ParameterTables, Triple
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
+from abbe.service.vectors.pahk_parameters import pair, squareness
 
 SUBTRACTED = "two lengths of 1142 mm were subtracted"
 

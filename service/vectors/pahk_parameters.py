@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1, F2
-from service.vectors.case import Case
+from abbe.models.arrays import F1, F2
+from abbe.service.vectors.case import Case
 
 AXES = "XYZ"
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from models.notation.pahk import pahk_type
-from models.pahk.random_errors import RandomErrors, parameter_jacobian, printed_eq5_mm, quadrature_mm
-from service.vectors.case import Case
-from service.vectors.checks import Checks
-from service.vectors.pahk_parameters import pair, squareness
+from abbe.models.notation.pahk import pahk_type
+from abbe.models.pahk.random_errors import RandomErrors, parameter_jacobian, printed_eq5_mm, quadrature_mm
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
+from abbe.service.vectors.pahk_parameters import pair, squareness
 
 FLOAT64 = 4e-15
 """A root of a sum of 21 squares: nothing cancels, so a few units in the last place are all that may be lost."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, pahk_type
-from models.pahk.volume_map import Form, chain_deviation_mm
-from service.errors import FileFormatError
-from service.vectors.case import Case
-from service.vectors.checks import Checks
-from service.vectors.pahk_parameters import pair, squareness
+from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, pahk_type
+from abbe.models.pahk.volume_map import Form, chain_deviation_mm
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
+from abbe.service.vectors.pahk_parameters import pair, squareness
 
 SUBTRACTED = "coordinates of up to 900 mm were subtracted"
 FORMS: dict[str, tuple[Form, float, str]] = {

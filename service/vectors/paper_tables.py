@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.arrays import F1
-from models.functions.line_fit import slope_through_origin, straight_line
-from models.pahk.squareness_only import squareness_diagonals_mm
-from service.vectors.case import Case
-from service.vectors.checks import Checks
+from abbe.models.arrays import F1
+from abbe.models.functions.line_fit import slope_through_origin, straight_line
+from abbe.models.pahk.squareness_only import squareness_diagonals_mm
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
 
 DECIMALS_UM = 1
 """Yang's Table 3 is printed to 0.1 um."""

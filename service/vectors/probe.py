@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.arrays import F1
-from models.probe.calibration import calibrate
-from models.probe.combined import combined_deviation_mm, printed_eq17_mm
-from models.probe.frame import direction, direction_angles, probe_frame, to_probe
-from service.vectors.case import Case
-from service.vectors.checks import Checks
+from abbe.models.arrays import F1
+from abbe.models.probe.calibration import calibrate
+from abbe.models.probe.combined import combined_deviation_mm, printed_eq17_mm
+from abbe.models.probe.frame import direction, direction_angles, probe_frame, to_probe
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
 
 Lobe = Callable[[F1, F1], F1]
 NUMBER = r"([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)"

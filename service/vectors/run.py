@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import FileFormatError
-from service.runs.json_text import strict_json
-from service.vectors import (
+from abbe.service.errors import FileFormatError
+from abbe.service.runs.json_text import strict_json
+from abbe.service.vectors import (
     kwon_kinematics,
     kwon_rsm,
     pahk_abbe,
@@ -27,8 +27,8 @@ from service.vectors import (
     yang_ranks,
     yang_volumetric,
 )
-from service.vectors.case import LAYOUT, Case
-from service.vectors.checks import Checks
+from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.checks import Checks
 
 Reader = Callable[[Case, Checks], None]
 

@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.functions.monomials import ErrorArrays, monomials
-from models.solvers.designs import shortest_solution
-from models.solvers.step_diagonal import increments, wang_eq7
-from models.volumetric import volume_grid
-from models.wang.experiments import Plan, distance_errors_mm, interpolated_mm, problem, readings
-from models.wang.model import exact_positions_mm, monomial_field
-from service.vectors.case import Case
-from service.vectors.checks import Checks
+from abbe.models.arrays import F1, F2
+from abbe.models.functions.monomials import ErrorArrays, monomials
+from abbe.models.solvers.designs import shortest_solution
+from abbe.models.solvers.step_diagonal import increments, wang_eq7
+from abbe.models.volumetric import volume_grid
+from abbe.models.wang.experiments import Plan, distance_errors_mm, interpolated_mm, problem, readings
+from abbe.models.wang.model import exact_positions_mm, monomial_field
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
 
 RANK_STEPS = 20
 RANK_POSITIONS = 20

@@ -6,19 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.functions.monomials import Kind, Monomial
-from models.notation.yang import YangErrors, workpiece_mm
-from models.paths.helix import helix_points
-from models.solvers.designs import map_noise_gain, shortest_solution
-from models.volumetric import volume_grid
-from models.yang.ballbar import measured_mm
-from models.yang.complete import delta_exact, monomial_errors, monomial_field
-from models.yang.conditioning import design_eq9
-from models.yang.experiments import BAR_POINTS, EXPERIMENTS, Plan, all_helices
-from service.errors import FileFormatError
-from service.vectors.case import LAYOUT, Case
-from service.vectors.checks import Checks
+from abbe.models.arrays import F1, F2
+from abbe.models.functions.monomials import Kind, Monomial
+from abbe.models.notation.yang import YangErrors, workpiece_mm
+from abbe.models.paths.helix import helix_points
+from abbe.models.solvers.designs import map_noise_gain, shortest_solution
+from abbe.models.volumetric import volume_grid
+from abbe.models.yang.ballbar import measured_mm
+from abbe.models.yang.complete import delta_exact, monomial_errors, monomial_field
+from abbe.models.yang.conditioning import design_eq9
+from abbe.models.yang.experiments import BAR_POINTS, EXPERIMENTS, Plan, all_helices
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.checks import Checks
 
 RADII_MM = (175.0, 100.0)
 """Two bars at every origin (math.md 4.3); the file lists the runs of one and the figures are of both, the ball being where it was."""

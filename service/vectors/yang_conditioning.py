@@ -6,12 +6,12 @@ import re
 
 import numpy as np
 
-from models.arrays import F2
-from models.paths.helix import Law, helix_points
-from models.yang.conditioning import common_scale_trace_mm, conditioning, design_eq9, spread, two_radii_design
-from service.errors import FileFormatError
-from service.vectors.case import LAYOUT, Case
-from service.vectors.checks import Checks
+from abbe.models.arrays import F2
+from abbe.models.paths.helix import Law, helix_points
+from abbe.models.yang.conditioning import common_scale_trace_mm, conditioning, design_eq9, spread, two_radii_design
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.checks import Checks
 
 RADII_MM = (175.0, 100.0)
 POINTS = 63

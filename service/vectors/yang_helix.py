@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from models.arrays import F1, F2
-from models.notation.yang import workpiece_mm
-from models.paths.helix import Law, helix_points
-from models.yang.ballbar import reading_eq6, reading_eq8
-from models.yang.simplified import SixParameters, ZConvention, delta_eq2, fit_eq9
-from service.errors import FileFormatError
-from service.vectors.case import Case
-from service.vectors.checks import Checks
+from abbe.models.arrays import F1, F2
+from abbe.models.notation.yang import workpiece_mm
+from abbe.models.paths.helix import Law, helix_points
+from abbe.models.yang.ballbar import reading_eq6, reading_eq8
+from abbe.models.yang.simplified import SixParameters, ZConvention, delta_eq2, fit_eq9
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
 
 NAMES = ("dxx", "dyy", "dzz", "Sxy", "Sxz", "Syz")
 READINGS: dict[str, ZConvention] = {"paper": "workpiece", "workpiece": "workpiece", "physical": "slide", "slide": "slide"}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.functions.monomials import monomials
-from models.solvers.designs import hidden_combination, ranks
-from models.yang.experiments import EXPERIMENTS, LATERAL_TOOL_MM, LONG_TOOL_MM, MAP_NODES, Experiment, Plan, Problem
-from models.yang.origins import origin_plan
-from service.errors import FileFormatError
-from service.vectors.case import LAYOUT, Case
-from service.vectors.checks import Checks
+from abbe.models.functions.monomials import monomials
+from abbe.models.solvers.designs import hidden_combination, ranks
+from abbe.models.yang.experiments import EXPERIMENTS, LATERAL_TOOL_MM, LONG_TOOL_MM, MAP_NODES, Experiment, Plan, Problem
+from abbe.models.yang.origins import origin_plan
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.checks import Checks
 
 DECIMALS = 4
 """The file states the combinations with four decimals; ours are rounded like that and must then agree in full."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.geometry.chain import deviation_mm
-from models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
-from models.yang.complete import delta_eq1, delta_exact
-from service.vectors.case import Case
-from service.vectors.checks import Checks
+from abbe.models.geometry.chain import deviation_mm
+from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
+from abbe.models.yang.complete import delta_eq1, delta_exact
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
 
 SUBTRACTED = "the vector subtracts coordinates of up to 1000 mm"
 

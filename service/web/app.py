@@ -13,36 +13,36 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from service.plant.facts import FactsSource
-from service.plant.gather import Gatherer
-from service.scheduler.store import ServiceStore
-from service.users.roles import Permission
-from service.web import problems
-from service.web.access import PUBLIC, needs
-from service.web.api.install import add_api
-from service.web.api.sources import Sources
-from service.web.api.table_orders import add_table_orders
-from service.web.core_line import CoreLine
-from service.web.document import complete
-from service.web.door import Door
-from service.web.frame import Framed
-from service.web.guard import Guard
-from service.web.headers import SecurityHeaders
-from service.web.jobs import add_jobs
-from service.web.live import add_live
-from service.web.login import add_login
-from service.web.metrics import add_metrics
-from service.web.mtconnect import add_mtconnect
-from service.web.page import HERE, ICON, environment, render
-from service.web.pages.live import add_live_page
-from service.web.pages.new import add_new_page
-from service.web.pages.plant_screens import add_plant_screens
-from service.web.pages.rehearsal import Rehearsals
-from service.web.pages.routes import add_pages
-from service.web.pages.table import add_table_screen
-from service.web.schemas import Health, Problem, Status, Verification, Verifications
-from service.web.silence import add_silence
-from service.workflows.report_parts import Rules
+from abbe.service.plant.facts import FactsSource
+from abbe.service.plant.gather import Gatherer
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.roles import Permission
+from abbe.service.web import problems
+from abbe.service.web.access import PUBLIC, needs
+from abbe.service.web.api.install import add_api
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.api.table_orders import add_table_orders
+from abbe.service.web.core_line import CoreLine
+from abbe.service.web.document import complete
+from abbe.service.web.door import Door
+from abbe.service.web.frame import Framed
+from abbe.service.web.guard import Guard
+from abbe.service.web.headers import SecurityHeaders
+from abbe.service.web.jobs import add_jobs
+from abbe.service.web.live import add_live
+from abbe.service.web.login import add_login
+from abbe.service.web.metrics import add_metrics
+from abbe.service.web.mtconnect import add_mtconnect
+from abbe.service.web.page import HERE, ICON, environment, render
+from abbe.service.web.pages.live import add_live_page
+from abbe.service.web.pages.new import add_new_page
+from abbe.service.web.pages.plant_screens import add_plant_screens
+from abbe.service.web.pages.rehearsal import Rehearsals
+from abbe.service.web.pages.routes import add_pages
+from abbe.service.web.pages.table import add_table_screen
+from abbe.service.web.schemas import Health, Problem, Status, Verification, Verifications
+from abbe.service.web.silence import add_silence
+from abbe.service.workflows.report_parts import Rules
 
 PAGE_ROWS = 60
 

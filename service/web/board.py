@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import datetime
 
-from service.clock import Clock
-from service.events import Progress
-from service.scheduler.ports import Doc
-from service.scheduler.slots import Schedule
-from service.web.schemas import Device, Job
+from abbe.service.clock import Clock
+from abbe.service.events import Progress
+from abbe.service.scheduler.ports import Doc
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.web.schemas import Device, Job
 
 
 class Board:

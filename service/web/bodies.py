@@ -7,7 +7,7 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute
 from starlette.types import Message, Receive, Scope
 
-from service.web.problems import problem
+from abbe.service.web.problems import problem
 
 LONGEST_B = 64 * 1024
 """Of any request that changes something; a route may have a limit of its own (``max_body_size``)."""

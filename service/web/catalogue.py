@@ -1,6 +1,6 @@
 """Every code that an error can have, from one place: the classes that carry them, and the answers of the network that have no class.
 
-``python -m service.web.catalogue`` prints the page docs/error-codes.md; a test compares the two.
+``python -m abbe.service.web.catalogue`` prints the page docs/error-codes.md; a test compares the two.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from drivers.errors import DriverError
-from service import errors
-from service.errors import AbbeError
+from abbe.drivers.errors import DriverError
+from abbe.service import errors
+from abbe.service.errors import AbbeError
 
 DEFECT = "ABB-001"
 HTTP: dict[int, tuple[str, str]] = {
@@ -82,7 +82,7 @@ def page() -> str:
         "# Codes of errors\n\n"
         "Every error has a code that does not change. The command line prints cause and remedy and ends with exit code 2; the HTTP\n"
         "interface answers `application/problem+json` (RFC 9457) with the code in `code`, and in `type` as `urn:abbe:error:CODE`.\n"
-        "This page is made by `python -m service.web.catalogue` from the classes themselves; `GET /api/v1/errors` gives the same.\n\n"
+        "This page is made by `python -m abbe.service.web.catalogue` from the classes themselves; `GET /api/v1/errors` gives the same.\n\n"
         "| code | name | HTTP | meaning |\n|---|---|---|---|\n"
     )
     return head + "\n".join(rows) + "\n"
@@ -92,7 +92,7 @@ def _tree(kind: type[AbbeError] | type[DriverError]) -> Iterator[type[AbbeError]
     """A class and all below it that are the product's own."""
     yield kind
     for below in kind.__subclasses__():
-        if below.__module__ in {"service.errors", "drivers.errors"}:
+        if below.__module__ in {"abbe.service.errors", "abbe.drivers.errors"}:
             yield from _tree(below)
 
 

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from datetime import datetime
 from itertools import count
 
-from service.channel.messages import (
+from abbe.service.channel.messages import (
     Answer,
     Asked,
     DoneByHand,
@@ -25,12 +25,12 @@ from service.channel.messages import (
     SteerJob,
     from_core,
 )
-from service.channel.wire import Wire
-from service.clock import Clock
-from service.errors import CoreSilent
-from service.scheduler.slots import Schedule
-from service.web.sample_board import MOST_EACH, MOST_LISTENERS, SampleBoard
-from service.web.schemas import Device, Job
+from abbe.service.channel.wire import Wire
+from abbe.service.clock import Clock
+from abbe.service.errors import CoreSilent
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.web.sample_board import MOST_EACH, MOST_LISTENERS, SampleBoard
+from abbe.service.web.schemas import Device, Job
 
 SILENT_S = 5.0
 """The core speaks once a second. After this its last word is not shown as if it were true."""

@@ -7,11 +7,11 @@ from typing import Any
 
 from starlette.routing import BaseRoute
 
-from service.web.access import MUTATING, PUBLIC, Need, cells
-from service.web.catalogue import HTTP
-from service.web.door import COOKIE
-from service.web.problems import MEDIA_TYPE
-from service.web.schemas import Problem
+from abbe.service.web.access import MUTATING, PUBLIC, Need, cells
+from abbe.service.web.catalogue import HTTP
+from abbe.service.web.door import COOKIE
+from abbe.service.web.problems import MEDIA_TYPE
+from abbe.service.web.schemas import Problem
 
 Doc = dict[str, Any]
 REF = {"$ref": "#/components/schemas/Problem"}

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from service.audit.book import AuditBook
-from service.audit.chain import Event
-from service.storage.store import Store
-from service.users.lockout import Buckets, Lockout
-from service.users.people import NOBODY, ONLOOKER, People, Principal
+from abbe.service.audit.book import AuditBook
+from abbe.service.audit.chain import Event
+from abbe.service.storage.store import Store
+from abbe.service.users.lockout import Buckets, Lockout
+from abbe.service.users.people import NOBODY, ONLOOKER, People, Principal
 
 COOKIE = "abbe"
 

@@ -13,13 +13,13 @@ from starlette.requests import HTTPConnection
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.report.numbers import Unit
-from service.users.roles import Permission
-from service.web import language, units
-from service.web.door import csrf_token
-from service.web.guard import Visit
-from service.web.language import DEFAULT, NAMES
-from service.web.origin import is_tls
+from abbe.service.report.numbers import Unit
+from abbe.service.users.roles import Permission
+from abbe.service.web import language, units
+from abbe.service.web.door import csrf_token
+from abbe.service.web.guard import Visit
+from abbe.service.web.language import DEFAULT, NAMES
+from abbe.service.web.origin import is_tls
 
 YEAR_S = 31_536_000
 THEMES = ("auto", "light", "dark")

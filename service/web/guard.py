@@ -14,14 +14,14 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.audit.chain import Event
-from service.errors import AbbeError
-from service.users.people import NOBODY, ONLOOKER, Principal
-from service.web.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
-from service.web.bodies import Body
-from service.web.door import Door, csrf_token
-from service.web.origin import address_of, is_ours, is_tls
-from service.web.problems import problem
+from abbe.service.audit.chain import Event
+from abbe.service.errors import AbbeError
+from abbe.service.users.people import NOBODY, ONLOOKER, Principal
+from abbe.service.web.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
+from abbe.service.web.bodies import Body
+from abbe.service.web.door import Door, csrf_token
+from abbe.service.web.origin import address_of, is_ours, is_tls
+from abbe.service.web.problems import problem
 
 CSRF_HEADER = "X-CSRF-Token"
 

@@ -11,7 +11,7 @@ from datetime import datetime
 from functools import cache
 from pathlib import Path
 
-from service.web.words import figure_name
+from abbe.service.web.words import figure_name
 
 NAMES: Mapping[str, str] = {"en": "English", "de": "Deutsch", "ja": "日本語", "ko": "한국어"}
 DEFAULT = "en"
@@ -61,7 +61,7 @@ def _weight(text: str) -> float:
 
 
 def span(language: str, seconds: float) -> str:
-    """A length of time in the largest sensible unit, as `service.web.words.span`."""
+    """A length of time in the largest sensible unit, as `abbe.service.web.words.span`."""
     s = abs(seconds)
     if s < 90:
         return say(language, "span.s", n=f"{s:.0f}")

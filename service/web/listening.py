@@ -7,7 +7,7 @@ import socket
 import ssl
 from collections.abc import Callable, Sequence
 
-from service.errors import ConfigError
+from abbe.service.errors import ConfigError
 
 
 def check_certificate(certificate: str, key: str) -> None:

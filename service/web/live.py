@@ -9,12 +9,12 @@ from contextlib import suppress
 
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 
-from service.errors import CoreSilent
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.core_line import CoreLine
-from service.web.guard import Visit
-from service.web.schemas_jobs import Live
+from abbe.service.errors import CoreSilent
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.core_line import CoreLine
+from abbe.service.web.guard import Visit
+from abbe.service.web.schemas_jobs import Live
 
 LONGEST_S = 600.0
 """Then it is closed: who listens on comes again, and is looked at again - a session that has ended in between hears no more."""

@@ -12,16 +12,16 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 from starlette.requests import ClientDisconnect
 
-from service.users.lockout import Came
-from service.users.roles import Permission
-from service.web.access import PUBLIC, needs
-from service.web.door import Door, csrf_token
-from service.web.guard import Visit
-from service.web.listening import is_local
-from service.web.origin import is_tls
-from service.web.problems import problem
-from service.web.schemas import Problem
-from service.web.schemas_people import AuditEntry, AuditList, Me, User, Users
+from abbe.service.users.lockout import Came
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import PUBLIC, needs
+from abbe.service.web.door import Door, csrf_token
+from abbe.service.web.guard import Visit
+from abbe.service.web.listening import is_local
+from abbe.service.web.origin import is_tls
+from abbe.service.web.problems import problem
+from abbe.service.web.schemas import Problem
+from abbe.service.web.schemas_people import AuditEntry, AuditList, Me, User, Users
 
 LONGEST_FORM = 4096
 DEVICE_S = 90 * 86_400

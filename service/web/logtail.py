@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 
-from service.secrets import mask_secrets, visible
+from abbe.service.secrets import mask_secrets, visible
 
 KEPT = 300
 LONGEST = 2000

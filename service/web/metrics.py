@@ -12,13 +12,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
-from service.channel.messages import Moment
-from service.errors import CoreSilent
-from service.scheduler.store import ServiceStore
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.core_line import CoreLine
-from service.workflows.verified_by import verified_by
+from abbe.service.channel.messages import Moment
+from abbe.service.errors import CoreSilent
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.core_line import CoreLine
+from abbe.service.workflows.verified_by import verified_by
 
 VERDICTS = ("pass", "fail", "cannot tell")
 

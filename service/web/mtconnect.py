@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
-from service.plant.facts import Facts, FactsSource
-from service.plant.mtconnect import Agent, Refused
-from service.users.roles import Permission
-from service.web.access import needs
+from abbe.service.plant.facts import Facts, FactsSource
+from abbe.service.plant.mtconnect import Agent, Refused
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
 
 MEDIA_TYPE = "text/xml"
 

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from starlette.requests import HTTPConnection
 
-from service.web.listening import is_local
+from abbe.service.web.listening import is_local
 
 
 def is_tls(request: HTTPConnection, *, behind_tls: bool) -> bool:

@@ -10,11 +10,11 @@ from zoneinfo import ZoneInfo
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.web import language, words
-from service.web.frame import current, template_words
-from service.web.schemas import Status, Verification
-from service.web.trend import Point, trend_svg
-from service.web.units import converted
+from abbe.service.web import language, words
+from abbe.service.web.frame import current, template_words
+from abbe.service.web.schemas import Status, Verification
+from abbe.service.web.trend import Point, trend_svg
+from abbe.service.web.units import converted
 
 HERE = Path(__file__).parent
 MARKS = {"pass": "✔", "fail": "✖", "cannot tell": "◐"}

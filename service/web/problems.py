@@ -10,9 +10,9 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from service.errors import AbbeError
-from service.web.catalogue import DEFECT, HTTP, status_of
-from service.web.schemas import Problem
+from abbe.service.errors import AbbeError
+from abbe.service.web.catalogue import DEFECT, HTTP, status_of
+from abbe.service.web.schemas import Problem
 
 MEDIA_TYPE = "application/problem+json"
 LONGEST = 1000

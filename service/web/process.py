@@ -1,4 +1,4 @@
-"""The web process: ``python -m service.web.process CHANNEL LISTENING``, two inherited sockets. Started by the core, and by nobody else."""
+"""The web process: ``python -m abbe.service.web.process CHANNEL LISTENING``, two inherited sockets. Only the core starts it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 
-from service.web import walls
+from abbe.service.web import walls
 
 
 def main() -> int:
@@ -17,8 +17,8 @@ def main() -> int:
     # Ctrl-C at the terminal goes to both; the core decides when the page ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     walls.build()
-    from service.logs import configure_logs
-    from service.web.serving import serve_pages
+    from abbe.service.logs import configure_logs
+    from abbe.service.web.serving import serve_pages
 
     configure_logs()
     with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 
 from pydantic import TypeAdapter
 
-from service.channel.messages import LivePath, LiveSamples
-from service.errors import ChannelBroken
+from abbe.service.channel.messages import LivePath, LiveSamples
+from abbe.service.errors import ChannelBroken
 
 VERSION = 1
 HEAD = struct.Struct("<IIIId")

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import uvicorn
 from fastapi import FastAPI
 
-from service.web.connections import PatientProtocol
+from abbe.service.web.connections import PatientProtocol
 
 HANDSHAKE_S = 10.0
 LONGEST_WORD_B = 1024

@@ -8,24 +8,24 @@ from dataclasses import asdict
 
 import structlog
 
-from service.audit.book import AuditBook
-from service.channel.messages import PROTOCOL, Alive, Begin, Up, from_core
-from service.channel.wire import Wire
-from service.clock import SystemClock
-from service.errors import AbbeError, ChannelBroken
-from service.plant.gather import Gatherer
-from service.scheduler.slots import Needs, Schedule
-from service.scheduler.store import ServiceStore
-from service.users.people import People
-from service.web.api.sources import Sources
-from service.web.app import Parts, create_app
-from service.web.core_line import CoreLine
-from service.web.door import Door, Front
-from service.web.logtail import keep_log
-from service.web.pages.rehearsal import Rehearsals
-from service.web.server import Server, make_server
-from service.web.view import View
-from service.workflows.report_parts import Rules
+from abbe.service.audit.book import AuditBook
+from abbe.service.channel.messages import PROTOCOL, Alive, Begin, Up, from_core
+from abbe.service.channel.wire import Wire
+from abbe.service.clock import SystemClock
+from abbe.service.errors import AbbeError, ChannelBroken
+from abbe.service.plant.gather import Gatherer
+from abbe.service.scheduler.slots import Needs, Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.people import People
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.app import Parts, create_app
+from abbe.service.web.core_line import CoreLine
+from abbe.service.web.door import Door, Front
+from abbe.service.web.logtail import keep_log
+from abbe.service.web.pages.rehearsal import Rehearsals
+from abbe.service.web.server import Server, make_server
+from abbe.service.web.view import View
+from abbe.service.workflows.report_parts import Rules
 
 log = structlog.get_logger("abbe.web")
 

@@ -6,8 +6,8 @@ from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
 from jinja2 import Environment
 
-from service.errors import CoreSilent
-from service.web.problems import problem_of
+from abbe.service.errors import CoreSilent
+from abbe.service.web.problems import problem_of
 
 RETRY_S = "5"
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from service.report.numbers import Unit, with_uncertainty
-from service.web.words import number
+from abbe.service.report.numbers import Unit, with_uncertainty
+from abbe.service.web.words import number
 
 METRIC, INCH = "mm", "inch"
 SYSTEMS = (METRIC, INCH)

@@ -9,14 +9,14 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 FORBIDDEN = (
-    "drivers.registry",
+    "abbe.drivers.registry",
     "pymodbus",
     "serial",
-    "service.devices.session",
-    "service.push.adapter",
-    "service.push.conduct",
-    "service.core",
-    "simulators",
+    "abbe.service.devices.session",
+    "abbe.service.push.adapter",
+    "abbe.service.push.conduct",
+    "abbe.service.core",
+    "abbe.simulators",
 )
 
 

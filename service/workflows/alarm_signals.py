@@ -8,11 +8,11 @@ from datetime import datetime
 
 import numpy as np
 
-from models.trend import MIN_CHECKS, Forecast, jumps, mean_of
-from service.storage.records import VerificationRecord
-from service.workflows.alarm_states import Found, Signal
-from service.workflows.trend_table import COVERAGE, FigureTrend, in_words, of_series, trends
-from service.workflows.verify import judge
+from abbe.models.trend import MIN_CHECKS, Forecast, jumps, mean_of
+from abbe.service.storage.records import VerificationRecord
+from abbe.service.workflows.alarm_states import Found, Signal
+from abbe.service.workflows.trend_table import COVERAGE, FigureTrend, in_words, of_series, trends
+from abbe.service.workflows.verify import judge
 
 NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}
 

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 
-from models.trend import MOST_CHECKS
-from service.errors import StoreError
-from service.push.book import read_entries
-from service.push.states import State
-from service.storage.records import AlarmEntryRecord, Doc, VerificationRecord
-from service.storage.store import Store
-from service.workflows.alarm_signals import Terms, found_in
-from service.workflows.alarm_states import Alarm, Found, Kind, after_check, folded, is_open
+from abbe.models.trend import MOST_CHECKS
+from abbe.service.errors import StoreError
+from abbe.service.push.book import read_entries
+from abbe.service.push.states import State
+from abbe.service.storage.records import AlarmEntryRecord, Doc, VerificationRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.alarm_signals import Terms, found_in
+from abbe.service.workflows.alarm_states import Alarm, Found, Kind, after_check, folded, is_open
 
 READ_CHECKS = 4 * MOST_CHECKS
 """Checks that are looked at: of several recipes, a multiple of what the trend uses of one."""

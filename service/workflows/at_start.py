@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
-from service.capture.recovery import recover_segments
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls
-from service.push.states import TERMINAL, State
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.recovered import recovered_session
+from abbe.service.capture.recovery import recover_segments
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.push.states import TERMINAL, State
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.recovered import recovered_session
 
 
 async def recover_at_start(store: Store, site: Site) -> str | None:
@@ -24,7 +24,7 @@ async def recover_at_start(store: Store, site: Site) -> str | None:
     Raises
     ------
     AbbeError, DriverError
-        As of `service.workflows.recover.recover`: the controller cannot be reached, or a person has to look.
+        As of `abbe.service.workflows.recover.recover`: the controller cannot be reached, or a person has to look.
     """
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
     told = [run.text for run in runs]

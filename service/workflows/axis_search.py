@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.answer import Discovery, Fitted, Significance
-from models.discovery.baseline import baseline_of
-from models.discovery.case import Case
-from models.discovery.discover import Progress, discover
-from models.discovery.finding import gaps_of
-from models.discovery.lack import Floor
-from models.discovery.prediction import left_over, predictions, solve
-from models.discovery.scene import scene_of
-from models.effects.effect import Effect
-from models.probability import chi2_above
-from models.solvers.priors import U_WAVELENGTH
-from service.workflows.axis_test import AXES, drift_at, drift_found, places_of
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Discovery, Fitted, Significance
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.discover import Progress, discover
+from abbe.models.discovery.finding import gaps_of
+from abbe.models.discovery.lack import Floor
+from abbe.models.discovery.prediction import left_over, predictions, solve
+from abbe.models.discovery.scene import scene_of
+from abbe.models.effects.effect import Effect
+from abbe.models.probability import chi2_above
+from abbe.models.solvers.priors import U_WAVELENGTH
+from abbe.service.workflows.axis_test import AXES, drift_at, drift_found, places_of
 
 CHANCE = 1e-3
 """What is missing beyond the repeats' scatter is told if chance gives as much in fewer tests than this."""

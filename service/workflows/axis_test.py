@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Significance, Where
-from models.discovery.case import Case, CaseRun
-from models.discovery.repeats import RepeatDrift, repeat_drift
-from models.effects.effect import Effect, Values
-from models.effects.path import Path
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Significance, Where
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.discovery.repeats import RepeatDrift, repeat_drift
+from abbe.models.effects.effect import Effect, Values
+from abbe.models.effects.path import Path
 
 AXES = "XYZ"
 NEAR_MM = 0.05

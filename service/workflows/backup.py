@@ -13,15 +13,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from service.audit.book import AuditBook, this_account
-from service.audit.chain import Event
-from service.capture.settings import CaptureSettings, other_folders, segment_folder
-from service.errors import BackupRefused
-from service.secrets import mask_secrets
-from service.storage.copying import copy_online, prove_copy, rows_of, sync_file
-from service.storage.engine import parse_url
-from service.storage.store import Store
-from service.workflows.backup_files import (
+from abbe.service.audit.book import AuditBook, this_account
+from abbe.service.audit.chain import Event
+from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
+from abbe.service.errors import BackupRefused
+from abbe.service.secrets import mask_secrets
+from abbe.service.storage.copying import copy_online, prove_copy, rows_of, sync_file
+from abbe.service.storage.engine import parse_url
+from abbe.service.storage.store import Store
+from abbe.service.workflows.backup_files import (
     CAPTURE,
     DATABASE,
     FORMAT,

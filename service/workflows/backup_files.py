@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.audit.book import heads_in
-from service.audit.chain import faults
-from service.errors import BackupRefused
-from service.files import is_plain, read_plain
-from service.storage.copying import rows_of
-from service.storage.store_audit import AuditRecord
+from abbe.service.audit.book import heads_in
+from abbe.service.audit.chain import faults
+from abbe.service.errors import BackupRefused
+from abbe.service.files import is_plain, read_plain
+from abbe.service.storage.copying import rows_of
+from abbe.service.storage.store_audit import AuditRecord
 
 FORMAT = "abbe-backup/1"
 LIST = "backup.json"

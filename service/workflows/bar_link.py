@@ -1,21 +1,21 @@
 """The ball-bar's box before and after a run: found again when its cable was pulled or it was switched on anew, or the run does not begin.
 
 The broken run is closed as it is, and the test goes on as a run of its own. What a box has read before it was restarted is joined to
-nothing; a path that only lost its cable may go on where it was, if somebody vouches for what is mounted (service.sequences.onward).
+nothing; a path that only lost its cable may go on where it was, if somebody vouches for what is mounted (abbe.service.sequences.onward).
 """
 
 from __future__ import annotations
 
-from drivers.api import DeviceInfo
-from drivers.errors import DriverError, LinkDown, Rebooted, ReplyTimeout
-from service.devices.session import Session
-from service.errors import RunInterrupted
-from service.sequences.control import Control, State
-from service.sequences.interlocks import Suspending
-from service.sequences.journal import WAITS, Journal
-from service.sequences.needed import BEFORE_S
-from service.sequences.runner import Runner
-from service.sequences.steps import ReadBar, RecordPath, TestPlan
+from abbe.drivers.api import DeviceInfo
+from abbe.drivers.errors import DriverError, LinkDown, Rebooted, ReplyTimeout
+from abbe.service.devices.session import Session
+from abbe.service.errors import RunInterrupted
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import Suspending
+from abbe.service.sequences.journal import WAITS, Journal
+from abbe.service.sequences.needed import BEFORE_S
+from abbe.service.sequences.runner import Runner
+from abbe.service.sequences.steps import ReadBar, RecordPath, TestPlan
 
 BALLBAR = "ballbar"
 """The word in ``[limits] continue_after``."""

@@ -9,20 +9,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.errors import DriverError
-from models.arrays import F1, F2
-from service.devices.session import Session
-from service.errors import AbbeError, MeasurementFault, PushNotBegun, TableRefused
-from service.events import ProgressSink
-from service.runs.columns import load_run
-from service.sequences.bar_recipes import HelixPoints
-from service.sequences.campaigns import hemisphere
-from service.sequences.check import paced
-from service.sequences.control import Control
-from service.sequences.steps import CampaignPlan, Point
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.measure import Manner, measure
+from abbe.drivers.errors import DriverError
+from abbe.models.arrays import F1, F2
+from abbe.service.devices.session import Session
+from abbe.service.errors import AbbeError, MeasurementFault, PushNotBegun, TableRefused
+from abbe.service.events import ProgressSink
+from abbe.service.runs.columns import load_run
+from abbe.service.sequences.bar_recipes import HelixPoints
+from abbe.service.sequences.campaigns import hemisphere
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.steps import CampaignPlan, Point
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measure import Manner, measure
 
 TURNS = 3.0
 SAMPLES = 50

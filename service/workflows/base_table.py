@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.api import CompStatus, Controller
-from drivers.cnc.tables import crc32
-from models.compensation.tables import NineTables
-from service.errors import TableMismatch
-from service.workflows.tables import tables_from_image
+from abbe.drivers.api import CompStatus, Controller
+from abbe.drivers.cnc.tables import crc32
+from abbe.models.compensation.tables import NineTables
+from abbe.service.errors import TableMismatch
+from abbe.service.workflows.tables import tables_from_image
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from drivers.api import Controller
-from drivers.errors import DriverError
-from service.clock import Clock
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls, open_session
-from service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.pending import LIMIT_S, finish_when_safe
-from service.workflows.push_word import STOPPED, Outcome
-from service.workflows.rollback import Ordered, rollback
-from service.workflows.table_story import offered
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import DriverError
+from abbe.service.clock import Clock
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.pending import LIMIT_S, finish_when_safe
+from abbe.service.workflows.push_word import STOPPED, Outcome
+from abbe.service.workflows.rollback import Ordered, rollback
+from abbe.service.workflows.table_story import offered
 
 
 @dataclass(frozen=True, slots=True)

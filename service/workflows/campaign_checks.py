@@ -1,7 +1,7 @@
 """Is every run of a campaign what it says? Before anything is solved, each mistake is one line: which run, what is wrong, what to do.
 
 First geometry (do the points lie where the set-up says?), then copies, then what the readings say of each other
-(`models.solvers.plausibility`). A finding either refuses the campaign or stands as a flag beside the result.
+(`abbe.models.solvers.plausibility`). A finding either refuses the campaign or stands as a flag beside the result.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machine import Machine
-from models.solvers.observations import RunData
-from models.solvers.plausibility import Suspect, suspects
-from service.errors import CampaignRefused
-from service.workflows.copied_runs import copies
-from service.workflows.finding import Finding
-from service.workflows.run_geometry import geometry
-from service.workflows.run_times import times
+from abbe.models.machine import Machine
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.plausibility import Suspect, suspects
+from abbe.service.errors import CampaignRefused
+from abbe.service.workflows.copied_runs import copies
+from abbe.service.workflows.finding import Finding
+from abbe.service.workflows.run_geometry import geometry
+from abbe.service.workflows.run_times import times
 
 Doc = dict[str, Any]
 LARGEST_MM = 2.0
@@ -164,7 +164,7 @@ def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> 
 
 
 def _too_few(run: Doc, count: int) -> list[Finding]:
-    """Few readings are a flag: fewer than 10 are refused where runs become arrays (`service.runs.observations`)."""
+    """Few readings are a flag: fewer than 10 are refused where runs become arrays (`abbe.service.runs.observations`)."""
     turns = float(run["setup"].get("turns") or 1.0)
     wanted = max(FEWEST_BAR, int(np.ceil(PER_TURN * turns)))
     if not run["test"].startswith("ballbar") or not 10 <= count < wanted:
@@ -176,7 +176,7 @@ def _too_few(run: Doc, count: int) -> list[Finding]:
 
 
 def check_readings(machine: Machine, data: Sequence[RunData]) -> list[Finding]:
-    """Runs whose readings contradict those of the others (`models.solvers.plausibility.suspects`)."""
+    """Runs whose readings contradict those of the others (`abbe.models.solvers.plausibility.suspects`)."""
     found = suspects(machine, data)
     return [_suspect(s, alone=len(found) == 1) for s in found]
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from service.devices.urls import DeviceUrls
-from service.errors import CampaignRefused
-from service.runs.cases import set_once
-from service.runs.columns import load_run
-from service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
-from service.site import Site, machine_from_doc
-from service.storage.store import Store
-from service.workflows.provenance import machine_digest, run_digest
+from abbe.service.devices.urls import DeviceUrls
+from abbe.service.errors import CampaignRefused
+from abbe.service.runs.cases import set_once
+from abbe.service.runs.columns import load_run
+from abbe.service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
+from abbe.service.site import Site, machine_from_doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.provenance import machine_digest, run_digest
 
 
 @dataclass(frozen=True)

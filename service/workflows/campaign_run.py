@@ -8,21 +8,21 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from drivers.api import Point
-from service.devices.session import Session
-from service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
-from service.runs.columns import path_so_far
-from service.runs.pieces import SoFar
-from service.sequences.control import Control
-from service.sequences.interlocks import Watching, check_interlocks
-from service.sequences.journal import DONE, RUN, Journal
-from service.sequences.onward import Onward
-from service.sequences.preconditions import Expected, check_expected
-from service.sequences.rewind import Attempt, Rewind, anew, end_of, remounted, rest_of
-from service.sequences.runner import Runner
-from service.sequences.steps import CampaignPlan, TestPlan
-from service.sequences.waiting import may_suspend, paused, suspended
-from service.storage.store import Store
+from abbe.drivers.api import Point
+from abbe.service.devices.session import Session
+from abbe.service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
+from abbe.service.runs.columns import path_so_far
+from abbe.service.runs.pieces import SoFar
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.interlocks import Watching, check_interlocks
+from abbe.service.sequences.journal import DONE, RUN, Journal
+from abbe.service.sequences.onward import Onward
+from abbe.service.sequences.preconditions import Expected, check_expected
+from abbe.service.sequences.rewind import Attempt, Rewind, anew, end_of, remounted, rest_of
+from abbe.service.sequences.runner import Runner
+from abbe.service.sequences.steps import CampaignPlan, TestPlan
+from abbe.service.sequences.waiting import may_suspend, paused, suspended
+from abbe.service.storage.store import Store
 
 MOST_TRIES = 5
 """So often in a row a test is suspended or mounted anew without a new point; then a person has to look."""

@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from drivers.api import TableFormat
-from drivers.cnc.registers import MAP_VERSION
-from models.compensation.tables import NineTables, Predicted
-from models.machine import AXES
-from service.clock import Clock
-from service.push.book import read_entries
-from service.push.candidate import Candidate, Column, Evidence, Scene, Seal
-from service.push.entries import facts
-from service.push.states import State
-from service.push.validate import content_digest
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.base_table import Base
-from service.workflows.tables import tables_from_image
+from abbe.drivers.api import TableFormat
+from abbe.drivers.cnc.registers import MAP_VERSION
+from abbe.models.compensation.tables import NineTables, Predicted
+from abbe.models.machine import AXES
+from abbe.service.clock import Clock
+from abbe.service.push.book import read_entries
+from abbe.service.push.candidate import Candidate, Column, Evidence, Scene, Seal
+from abbe.service.push.entries import facts
+from abbe.service.push.states import State
+from abbe.service.push.validate import content_digest
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import Base
+from abbe.service.workflows.tables import tables_from_image
 
 Runs = list[dict[str, Any]]
 SIGNER = "metrologist"

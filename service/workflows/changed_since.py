@@ -11,23 +11,23 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from models.compensation.smooth import smooth_of
-from models.discovery.changed import Change, Changed, changed_since
-from models.solvers.in_force import InForce
-from models.uncertainty.known_field import KnownField
-from service.errors import AbbeError, StoreError, TableMismatch, Unusable
-from service.runs.observations import run_data
-from service.storage.records import SolutionRecord
-from service.storage.store import Store
-from service.workflows.campaign_folder import Campaign
-from service.workflows.known_effects import LASTING, applies
-from service.workflows.measured_with import KIND_AT, NO_CORRECTION, images_of, tables_of
-from service.workflows.model_book import name_of, version
-from service.workflows.provenance import machine_digest
-from service.workflows.solution_field import stored_field
-from service.workflows.table_out import NOTHING, Taken, as_left, less, table_then
-from service.workflows.tables import tables_from_image
-from service.workflows.taken_out import less_effects
+from abbe.models.compensation.smooth import smooth_of
+from abbe.models.discovery.changed import Change, Changed, changed_since
+from abbe.models.solvers.in_force import InForce
+from abbe.models.uncertainty.known_field import KnownField
+from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
+from abbe.service.runs.observations import run_data
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import Campaign
+from abbe.service.workflows.known_effects import LASTING, applies
+from abbe.service.workflows.measured_with import KIND_AT, NO_CORRECTION, images_of, tables_of
+from abbe.service.workflows.model_book import name_of, version
+from abbe.service.workflows.provenance import machine_digest
+from abbe.service.workflows.solution_field import stored_field
+from abbe.service.workflows.table_out import NOTHING, Taken, as_left, less, table_then
+from abbe.service.workflows.tables import tables_from_image
+from abbe.service.workflows.taken_out import less_effects
 
 Doc = dict[str, Any]
 LOST_MOTION = "backlash"

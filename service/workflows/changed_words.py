@@ -1,12 +1,12 @@
-"""What has changed since a solution (`service.workflows.changed_since`), in words."""
+"""What has changed since a solution (`abbe.service.workflows.changed_since`), in words."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from service.report.numbers import COVERAGE, plain, with_uncertainty
-from service.workflows.discovery_states import CLOSED, NEAR, VISIBLE, closed
-from service.workflows.linear_change import NAMES
+from abbe.service.report.numbers import COVERAGE, plain, with_uncertainty
+from abbe.service.workflows.discovery_states import CLOSED, NEAR, VISIBLE, closed
+from abbe.service.workflows.linear_change import NAMES
 
 LEFT = 1.5
 """What is left after the changes is told as more than noise from this factor on: the solution is known to a part of the noise only."""

@@ -8,22 +8,22 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from service.capture.live import LiveFeed
-from service.clock import Clock, SystemClock
-from service.config_schema import MachineFile
-from service.devices.alone import alone
-from service.events import ProgressSink
-from service.runs.columns import load_run
-from service.sequences.control import Control
-from service.sequences.needed import BALLBAR, LASER
-from service.sequences.steps import CampaignPlan
-from service.site import site_of
-from service.storage.store import Store
-from service.workflows.measure import Manner, measure
-from service.workflows.plausible import INSTRUMENTS, ended_certificates
-from service.workflows.recovered import recovered_session
-from service.workflows.shipped import recipe_plan
-from service.workflows.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
+from abbe.service.capture.live import LiveFeed
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.config_schema import MachineFile
+from abbe.service.devices.alone import alone
+from abbe.service.events import ProgressSink
+from abbe.service.runs.columns import load_run
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.needed import BALLBAR, LASER
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import site_of
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.plausible import INSTRUMENTS, ended_certificates
+from abbe.service.workflows.recovered import recovered_session
+from abbe.service.workflows.shipped import recipe_plan
+from abbe.service.workflows.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
 
 MEASURED_WITH = {"body_diagonal_um": LASER, "helix_rms_um": BALLBAR}
 MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}

@@ -13,24 +13,24 @@ from typing import Any
 
 import numpy as np
 
-from drivers.api import Controller
-from models.arrays import F2
-from models.compensation.sign_proof import Shift, SignProof, bar_shift, sign_proof, step_tables
-from models.compensation.tables import NineTables, grid_positions, quantise
-from models.machine import AXES
-from service.devices.session import Session
-from service.errors import TableMismatch, TableRefused
-from service.events import ProgressSink
-from service.push.operations import Verdict
-from service.sequences.interlocks import Suspending
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.bar_places import BarPlaces, Readings
-from service.workflows.base_table import Base, read_base
-from service.workflows.proved_levels import identity
-from service.workflows.pushing import Pushing, Questions, Wanted
-from service.workflows.recover import recover
-from service.workflows.tables import check_limits
+from abbe.drivers.api import Controller
+from abbe.models.arrays import F2
+from abbe.models.compensation.sign_proof import Shift, SignProof, bar_shift, sign_proof, step_tables
+from abbe.models.compensation.tables import NineTables, grid_positions, quantise
+from abbe.models.machine import AXES
+from abbe.service.devices.session import Session
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.events import ProgressSink
+from abbe.service.push.operations import Verdict
+from abbe.service.sequences.interlocks import Suspending
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.bar_places import BarPlaces, Readings
+from abbe.service.workflows.base_table import Base, read_base
+from abbe.service.workflows.proved_levels import identity
+from abbe.service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.service.workflows.recover import recover
+from abbe.service.workflows.tables import check_limits
 
 KIND = "sign-proof"
 STEP_MM, FIRST_MM = 0.010, 0.0005

@@ -11,21 +11,21 @@ import secrets
 from contextlib import suppress
 from dataclasses import dataclass, fields
 
-from drivers.api import Controller
-from drivers.errors import Refused
-from drivers.links.shielded import run_to_end
-from service.clock import Clock, SystemClock
-from service.errors import TableMismatch, UnsafeToMove
-from service.push.book import read_entries
-from service.push.levels import Capabilities
-from service.site import Site
-from service.storage.records import Doc
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.level_trial import ID_WORD, SEALED, Shown, Trial
-from service.workflows.level_trial_motion import while_moving
-from service.workflows.proved_levels import KIND, flags_of, identity, last_proof
-from service.workflows.recover import recover
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import Refused
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.errors import TableMismatch, UnsafeToMove
+from abbe.service.push.book import read_entries
+from abbe.service.push.levels import Capabilities
+from abbe.service.site import Site
+from abbe.service.storage.records import Doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.level_trial import ID_WORD, SEALED, Shown, Trial
+from abbe.service.workflows.level_trial_motion import while_moving
+from abbe.service.workflows.proved_levels import KIND, flags_of, identity, last_proof
+from abbe.service.workflows.recover import recover
 
 RESTART = "that a restart changes the boot id, and what it leaves in the banks: nobody restarted the controller"
 NOT_SHOWN = (

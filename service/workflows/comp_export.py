@@ -15,20 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from models.machine import AXES, Machine
-from service.errors import FileFormatError, FormatRefused, TableFileError
-from service.files import NotPlainError, read_plain
-from service.formats.choice import Choice, best_of, choices, rounded
-from service.formats.controls import CONTROLS, Control
-from service.formats.identified import Identified
-from service.formats.model import Compensation
-from service.formats.registry import FORMATS, format_of
-from service.formats.settings import Settings
-from service.formats.text import TextFile
-from service.report.page_file import write_page
-from service.site import machine_from_doc
-from service.workflows.stored_prediction import stored_prediction
+from abbe.models.arrays import F1
+from abbe.models.machine import AXES, Machine
+from abbe.service.errors import FileFormatError, FormatRefused, TableFileError
+from abbe.service.files import NotPlainError, read_plain
+from abbe.service.formats.choice import Choice, best_of, choices, rounded
+from abbe.service.formats.controls import CONTROLS, Control
+from abbe.service.formats.identified import Identified
+from abbe.service.formats.model import Compensation
+from abbe.service.formats.registry import FORMATS, format_of
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.text import TextFile
+from abbe.service.report.page_file import write_page
+from abbe.service.site import machine_from_doc
+from abbe.service.workflows.stored_prediction import stored_prediction
 
 LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
 ONLY_FRESH = "the tables hold for a machine that was measured without any: what was active while measuring has to be added"
@@ -140,7 +140,7 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
     reference_mm : array, shape (3,), optional
         Where the tables are zero; default: start of every stroke.
     fresh : bool
-        It is known that no correction was in force while the machine was measured (`service.workflows.measured_with`).
+        It is known that no correction was in force while the machine was measured (`abbe.service.workflows.measured_with`).
 
     Raises
     ------

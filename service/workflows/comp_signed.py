@@ -9,15 +9,15 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from service.config_schema import MachineFile
-from service.errors import FileFormatError, SignatureRefused
-from service.files import NotPlainError, read_plain
-from service.formats.text import TextFile
-from service.report.page_file import write_page
-from service.signed.container import LARGEST, NO_BASE, Claims, Expected, check, claims_of, sign
-from service.signed.keys import read_key
-from service.site import site_of
-from service.workflows.comp_export import LARGEST_FILE
+from abbe.service.config_schema import MachineFile
+from abbe.service.errors import FileFormatError, SignatureRefused
+from abbe.service.files import NotPlainError, read_plain
+from abbe.service.formats.text import TextFile
+from abbe.service.report.page_file import write_page
+from abbe.service.signed.container import LARGEST, NO_BASE, Claims, Expected, check, claims_of, sign
+from abbe.service.signed.keys import read_key
+from abbe.service.site import site_of
+from abbe.service.workflows.comp_export import LARGEST_FILE
 
 LONGEST_DAYS = 366.0
 

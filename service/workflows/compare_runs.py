@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from models.arrays import F1, F2
-from models.machine import AXES
-from models.solvers.observations import RunData
-from models.solvers.priors import U_WAVELENGTH
-from models.verification import U_REPEAT_MM, helix_figure
-from service.report.document import Figure
-from service.report.numbers import COVERAGE, finite
-from service.runs.coverage import not_judged
-from service.runs.helix_axis import about_axis, helix_axis, path_axis
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import U_WAVELENGTH
+from abbe.models.verification import U_REPEAT_MM, helix_figure
+from abbe.service.report.document import Figure
+from abbe.service.report.numbers import COVERAGE, finite
+from abbe.service.runs.coverage import not_judged
+from abbe.service.runs.helix_axis import about_axis, helix_axis, path_axis
 
 MOST = 4
 NEAR_RAD = 0.05

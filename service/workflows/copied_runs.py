@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from service.workflows.finding import Finding
+from abbe.models.arrays import F1
+from abbe.service.workflows.finding import Finding
 
 Doc = dict[str, Any]
 COPIED_SHARE = 0.98

@@ -11,26 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from models.compensation.sign_probe import expected_changes, probe
-from models.compensation.tables import NineTables, Predicted
-from service.clock import Clock, SystemClock
-from service.devices.session import Session
-from service.errors import AbbeError, TableRefused, TakenBack
-from service.events import Progress, ProgressSink
-from service.push.operations import Verdict
-from service.sequences.campaigns import verification
-from service.sequences.check import paced
-from service.sequences.control import Control
-from service.sequences.interlocks import Suspending
-from service.sequences.needed import check_devices
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.bar_places import BarPlaces, Readings
-from service.workflows.commission import check_commissioned
-from service.workflows.measure import Manner, measure
-from service.workflows.proposal_checks import Held, hold
-from service.workflows.proposal_doc import load
-from service.workflows.proposals import (
+from abbe.models.compensation.sign_probe import expected_changes, probe
+from abbe.models.compensation.tables import NineTables, Predicted
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.devices.session import Session
+from abbe.service.errors import AbbeError, TableRefused, TakenBack
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.push.operations import Verdict
+from abbe.service.sequences.campaigns import verification
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.interlocks import Suspending
+from abbe.service.sequences.needed import check_devices
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.bar_places import BarPlaces, Readings
+from abbe.service.workflows.commission import check_commissioned
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.proposal_checks import Held, hold
+from abbe.service.workflows.proposal_doc import load
+from abbe.service.workflows.proposals import (
     Made,
     check_before_runs,
     check_same_table,
@@ -40,13 +40,13 @@ from service.workflows.proposals import (
     make,
     solved_again,
 )
-from service.workflows.proved_levels import check_level
-from service.workflows.pushing import Pushed, Pushing, Questions, Wanted
-from service.workflows.recover import recover
-from service.workflows.solve import Solved, helix_misfit
-from service.workflows.table_out import less, taken
-from service.workflows.tables import check_limits
-from service.workflows.verify import Decision, Figures, check_before, decide, figure_rows, figures
+from abbe.service.workflows.proved_levels import check_level
+from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.workflows.recover import recover
+from abbe.service.workflows.solve import Solved, helix_misfit
+from abbe.service.workflows.table_out import less, taken
+from abbe.service.workflows.tables import check_limits
+from abbe.service.workflows.verify import Decision, Figures, check_before, decide, figure_rows, figures
 
 UNSEEN = "DRIFT: no ball-bar run that the solution has not seen shows whether the machine still is what was measured"
 VERIFY, SIGN = "verify-after-push-", "sign-check"

@@ -12,19 +12,19 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from service.clock import Clock, SystemClock
-from service.devices.session import DeviceUrls, Session, open_session
-from service.events import Progress, ProgressSink
-from service.push.limits import PushLimits
-from service.sequences.campaigns import identification, verification
-from service.site import Site, machine_doc, machine_from_doc
-from service.storage.store import Store
-from service.workflows.commission import commission
-from service.workflows.commission_levels import commission_levels
-from service.workflows.correct import Correction, correct
-from service.workflows.measure import measure
-from service.workflows.proposals import load_runs
-from service.workflows.world import running_world, sealed_truth
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.push.limits import PushLimits
+from abbe.service.sequences.campaigns import identification, verification
+from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.commission import commission
+from abbe.service.workflows.commission_levels import commission_levels
+from abbe.service.workflows.correct import Correction, correct
+from abbe.service.workflows.measure import measure
+from abbe.service.workflows.proposals import load_runs
+from abbe.service.workflows.world import running_world, sealed_truth
 
 MAX_SAMPLES_PER_S = 6000
 """Ball-bar samples per wall second that the demonstration asks for at most, so that a small PC follows at high speed."""

@@ -11,26 +11,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from service.clock import Clock, SystemClock
-from service.devices.session import Session, open_session
-from service.errors import NotObservable, TableRefused
-from service.events import Progress, ProgressSink
-from service.sequences.discovery_campaign import BACK, discovery_campaign, new_measurement
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.campaign_folder import from_store
-from service.workflows.commission import commission
-from service.workflows.correct import Correction, correct
-from service.workflows.demo import bar_rate_hz, demo_site, write_machine_file
-from service.workflows.discover import Job, Journal, discover, prepare
-from service.workflows.discovery_engine import catalogue, search
-from service.workflows.discovery_store import journal_of
-from service.workflows.measure import measure
-from service.workflows.model_book import current
-from service.workflows.new_measurement import NewMeasurement, judged_anew
-from service.workflows.proposals import load_runs
-from service.workflows.thinned import picked
-from service.workflows.world import running_world, sealed_truth
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.devices.session import Session, open_session
+from abbe.service.errors import NotObservable, TableRefused
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.sequences.discovery_campaign import BACK, discovery_campaign, new_measurement
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import from_store
+from abbe.service.workflows.commission import commission
+from abbe.service.workflows.correct import Correction, correct
+from abbe.service.workflows.demo import bar_rate_hz, demo_site, write_machine_file
+from abbe.service.workflows.discover import Job, Journal, discover, prepare
+from abbe.service.workflows.discovery_engine import catalogue, search
+from abbe.service.workflows.discovery_store import journal_of
+from abbe.service.workflows.measure import measure
+from abbe.service.workflows.model_book import current
+from abbe.service.workflows.new_measurement import NewMeasurement, judged_anew
+from abbe.service.workflows.proposals import load_runs
+from abbe.service.workflows.thinned import picked
+from abbe.service.workflows.world import running_world, sealed_truth
 
 MOST = 5000
 """Readings that are searched one by one: a point every 2 to 6 mm, and the search takes a quarter of the time."""

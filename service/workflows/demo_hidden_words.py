@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from service.report.numbers import plain
-from service.workflows.demo_hidden import HiddenDemo
-from service.workflows.discovery_engine import catalogue
-from service.workflows.discovery_words import book_lines, effect_lines, next_of, verdict_of
-from service.workflows.new_measurement import NewGap
+from abbe.service.report.numbers import plain
+from abbe.service.workflows.demo_hidden import HiddenDemo
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.discovery_words import book_lines, effect_lines, next_of, verdict_of
+from abbe.service.workflows.new_measurement import NewGap
 
 FORMAT = "abbe-hidden-demo/1"
 

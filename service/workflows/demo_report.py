@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from models.compensation.summary import SCALE_NOTE, mean_linear
-from models.compensation.tables import NineTables
-from models.solvers.joint import JointSolution
-from models.solvers.observability import observability_of
-from service.report.model import (
+from abbe.models.compensation.summary import SCALE_NOTE, mean_linear
+from abbe.models.compensation.tables import NineTables
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability import observability_of
+from abbe.service.report.model import (
     ArrowField,
     Contribution,
     DemoReport,
@@ -22,9 +22,9 @@ from service.report.model import (
     SummaryRow,
     TableCurve,
 )
-from service.workflows.correct import Correction
-from service.workflows.demo import DemoResult
-from service.workflows.verify import Figures, figure_rows
+from abbe.service.workflows.correct import Correction
+from abbe.service.workflows.demo import DemoResult
+from abbe.service.workflows.verify import Figures, figure_rows
 
 TRUTH = "sealed truth of the simulator"
 TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")

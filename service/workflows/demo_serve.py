@@ -17,28 +17,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from drivers.links.shielded import run_to_end
-from service.children import python_words
-from service.clock import Clock, SystemClock
-from service.devices.session import Session, open_session
-from service.errors import AbbeError, StoreError
-from service.events import ignore_progress
-from service.sequences.campaigns import identification, verification
-from service.sequences.check import paced
-from service.site import Site
-from service.storage.store import Store
-from service.users.people import People
-from service.workflows.alarm_states import Kind
-from service.workflows.alarms import alarms_of
-from service.workflows.commission import commission
-from service.workflows.commission_levels import commission_levels
-from service.workflows.demo import bar_rate_hz, demo_site, write_machine_file
-from service.workflows.measure import measure
-from service.workflows.proposals import load_runs
-from service.workflows.solve import solve_runs
-from service.workflows.solve_report import solution_doc
-from service.workflows.verify import COVERAGE, figure_rows, figures
-from service.workflows.world import World, running_world
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.children import python_words
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.devices.session import Session, open_session
+from abbe.service.errors import AbbeError, StoreError
+from abbe.service.events import ignore_progress
+from abbe.service.sequences.campaigns import identification, verification
+from abbe.service.sequences.check import paced
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.users.people import People
+from abbe.service.workflows.alarm_states import Kind
+from abbe.service.workflows.alarms import alarms_of
+from abbe.service.workflows.commission import commission
+from abbe.service.workflows.commission_levels import commission_levels
+from abbe.service.workflows.demo import bar_rate_hz, demo_site, write_machine_file
+from abbe.service.workflows.measure import measure
+from abbe.service.workflows.proposals import load_runs
+from abbe.service.workflows.solve import solve_runs
+from abbe.service.workflows.solve_report import solution_doc
+from abbe.service.workflows.verify import COVERAGE, figure_rows, figures
+from abbe.service.workflows.world import World, running_world
 
 T = TypeVar("T")
 
@@ -167,7 +167,7 @@ async def served(
     log = machine_file.with_name("service.log")
     with log.open("wb") as out_log:
         process = await asyncio.create_subprocess_exec(
-            *python_words("service.cli", "serve", machine_file),
+            *python_words("abbe.service.cli", "serve", machine_file),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=out_log,
             stderr=out_log,

@@ -10,20 +10,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from models.arrays import F1, F2, F3
-from models.functions.motions import REVERSE, ErrorMotions
-from models.geometry.chain import deviation_mm, exact_deviation_mm
-from models.geometry.propagation import Points, deviation_covariance
-from models.machine import AXES, Machine
-from service.config import load_machine, read_toml
-from service.config_schema import MachineFile
-from service.errors import ConfigError, FileFormatError
-from service.explain import nearest
-from service.runs.checks import check, read_json
-from service.runs.errors_file import KnownErrors, read_errors
-from service.runs.machine_object import MachineObject
-from service.runs.points import POSITION, TOOL, PointsFile, read_points
-from service.site import machine_from_doc
+from abbe.models.arrays import F1, F2, F3
+from abbe.models.functions.motions import REVERSE, ErrorMotions
+from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.geometry.propagation import Points, deviation_covariance
+from abbe.models.machine import AXES, Machine
+from abbe.service.config import load_machine, read_toml
+from abbe.service.config_schema import MachineFile
+from abbe.service.errors import ConfigError, FileFormatError
+from abbe.service.explain import nearest
+from abbe.service.runs.checks import check, read_json
+from abbe.service.runs.errors_file import KnownErrors, read_errors
+from abbe.service.runs.machine_object import MachineObject
+from abbe.service.runs.points import POSITION, TOOL, PointsFile, read_points
+from abbe.service.site import machine_from_doc
 
 FORMAT = "abbe-deviations/1"
 MEANING = "actual minus nominal, tool relative to workpiece; rigid motion not removed; squareness counts from axis zero"
@@ -113,7 +113,7 @@ def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exac
     errors_path : Path
         ``abbe-errors/1``.
     points_path : Path
-        CSV, see `service.runs.points.read_points`.
+        CSV, see `abbe.service.runs.points.read_points`.
     exact : bool
         Finite rotations (docs/conventions.md) in place of rule G.
 

@@ -1,7 +1,7 @@
 """The discovery workflow: fit, suspect, propose, test, explain or say that nothing explains. Persistent: killed anywhere, it goes on there.
 
-The search itself is one pure computation of seconds (`models.discovery.discover`). Its finding is written together with the first state
-that follows from it, so that nothing is computed twice; the version of the model that it brings, together with the last.
+The search itself is one pure computation of seconds (`abbe.models.discovery.discover`). Its finding is written together with the first
+state that follows from it, so that nothing is computed twice; the version of the model that it brings, together with the last.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.answer import Discovery
-from models.discovery.case import Case
-from models.effects.effect import Effect
-from service.errors import NotObservable
-from service.events import ProgressSink
-from service.runs.cases import case_of
-from service.runs.observations import run_data
-from service.storage.records import ModelRecord
-from service.workflows.axis_test import SLOW_DRIFT
-from service.workflows.campaign_checks import check_files, check_readings, refuse
-from service.workflows.campaign_folder import Campaign
-from service.workflows.changed_since import Since
-from service.workflows.copied_runs import copies
-from service.workflows.discovery_doc import finding_doc
-from service.workflows.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering, taken_back
-from service.workflows.known_effects import applies, readings_of, without
-from service.workflows.model_book import grown
-from service.workflows.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
-from service.workflows.solve import ALL_READINGS
-from service.workflows.table_out import NO_TABLE, TABLE_OUT, TableThen, as_left, table_line
-from service.workflows.thinned import Thinning, thinned, thinning
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Discovery
+from abbe.models.discovery.case import Case
+from abbe.models.effects.effect import Effect
+from abbe.service.errors import NotObservable
+from abbe.service.events import ProgressSink
+from abbe.service.runs.cases import case_of
+from abbe.service.runs.observations import run_data
+from abbe.service.storage.records import ModelRecord
+from abbe.service.workflows.axis_test import SLOW_DRIFT
+from abbe.service.workflows.campaign_checks import check_files, check_readings, refuse
+from abbe.service.workflows.campaign_folder import Campaign
+from abbe.service.workflows.changed_since import Since
+from abbe.service.workflows.copied_runs import copies
+from abbe.service.workflows.discovery_doc import finding_doc
+from abbe.service.workflows.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering, taken_back
+from abbe.service.workflows.known_effects import applies, readings_of, without
+from abbe.service.workflows.model_book import grown
+from abbe.service.workflows.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
+from abbe.service.workflows.solve import ALL_READINGS
+from abbe.service.workflows.table_out import NO_TABLE, TABLE_OUT, TableThen, as_left, table_line
+from abbe.service.workflows.thinned import Thinning, thinned, thinning
 
 Search = Callable[[Case, tuple[Effect, ...], ProgressSink], Discovery]
 """The computation: case, catalogue, whom to tell how far it is."""
@@ -48,7 +48,7 @@ Thin = Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
 class Job:
     """What a discovery works on.
 
-    ``campaign``: as measured; ``runs``: its runs, long ones as means (`service.workflows.thinned`), less what a table in force did;
+    ``campaign``: as measured; ``runs``: its runs, long ones as means (`abbe.service.workflows.thinned`), less what a table in force did;
     ``case``: the same with effects that the model book knows taken out of the readings; ``known_mm``: these, per run; ``known``: their
     labels; ``base``: the version of the book they are from; ``flags``: what is odd about single runs, and what thinning hides;
     ``thinning``: that in figures, None where nothing was thinned; ``seen``: the version that has to be the current one when a new one is
@@ -198,7 +198,7 @@ def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink)
     Returns
     -------
     dict
-        The finding (`service.workflows.discovery_doc`).
+        The finding (`abbe.service.workflows.discovery_doc`).
 
     Raises
     ------

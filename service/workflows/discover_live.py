@@ -11,21 +11,21 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
-from service.devices.session import Session
-from service.errors import CampaignRefused, UnsafeToMove
-from service.events import ProgressSink
-from service.sequences.interlocks import MOVING
-from service.sequences.needed import check_devices
-from service.sequences.steps import CampaignPlan, TestPlan, Unmount
-from service.site import Site
-from service.storage.records import RUNNING, CampaignRecord
-from service.storage.store import Store
-from service.workflows.campaign_folder import Campaign, from_store
-from service.workflows.discover import Job, prepare
-from service.workflows.discovery_store import StoredJournal, journal_of
-from service.workflows.measure import measure, start_campaign
-from service.workflows.model_book import version
-from service.workflows.table_out import table_then
+from abbe.service.devices.session import Session
+from abbe.service.errors import CampaignRefused, UnsafeToMove
+from abbe.service.events import ProgressSink
+from abbe.service.sequences.interlocks import MOVING
+from abbe.service.sequences.needed import check_devices
+from abbe.service.sequences.steps import CampaignPlan, TestPlan, Unmount
+from abbe.service.site import Site
+from abbe.service.storage.records import RUNNING, CampaignRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import Campaign, from_store
+from abbe.service.workflows.discover import Job, prepare
+from abbe.service.workflows.discovery_store import StoredJournal, journal_of
+from abbe.service.workflows.measure import measure, start_campaign
+from abbe.service.workflows.model_book import version
+from abbe.service.workflows.table_out import table_then
 
 ROUNDS = 3
 """So many proposals are measured before a person has to look."""

@@ -6,9 +6,9 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from models.discovery.answer import Discovery, NamedEffect, Where
-from models.discovery.case import Case
-from service.workflows.thinned import Thinning
+from abbe.models.discovery.answer import Discovery, NamedEffect, Where
+from abbe.models.discovery.case import Case
+from abbe.service.workflows.thinned import Thinning
 
 FORMAT = "abbe-discovery/1"
 

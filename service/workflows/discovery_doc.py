@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Where
-from models.discovery.case import Case, CaseRun
-from models.effects.effect import Effect
-from service.workflows.discovery_answer import answer_doc
-from service.workflows.discovery_states import taken_back
-from service.workflows.packed import packed, packed_covariance
-from service.workflows.thinned import Thinning
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Where
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.effects.effect import Effect
+from abbe.service.workflows.discovery_answer import answer_doc
+from abbe.service.workflows.discovery_states import taken_back
+from abbe.service.workflows.packed import packed, packed_covariance
+from abbe.service.workflows.thinned import Thinning
 
 FORMAT = "abbe-finding/1"
 INSTRUMENT = {"bar": "ball-bar", "laser": "laser"}

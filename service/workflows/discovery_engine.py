@@ -5,15 +5,15 @@ from __future__ import annotations
 from difflib import get_close_matches
 from functools import cache
 
-from models.discovery.answer import Discovery
-from models.discovery.case import Case
-from models.effects.catalogue import CATALOGUE
-from models.effects.effect import Effect
-from service.clock import SystemClock
-from service.errors import EffectUnknown
-from service.events import Progress, ProgressSink
-from service.workflows.axis_test import SLOW_DRIFT, is_axis_test
-from service.workflows.effect_plugins import Plugins, installed
+from abbe.models.discovery.answer import Discovery
+from abbe.models.discovery.case import Case
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.effect import Effect
+from abbe.service.clock import SystemClock
+from abbe.service.errors import EffectUnknown
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.workflows.axis_test import SLOW_DRIFT, is_axis_test
+from abbe.service.workflows.effect_plugins import Plugins, installed
 
 
 def catalogue() -> tuple[Effect, ...]:
@@ -45,12 +45,12 @@ def effect_named(name: str) -> Effect:
 
 
 def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:
-    """Find what a case's present model lacks (`models.discovery.discover`), and tell how far it is and how long it will take.
+    """Find what a case's present model lacks (`abbe.models.discovery.discover`), and tell how far it is and how long it will take.
 
-    In a positioning test of one axis alone repeats are asked for a drift first (`service.workflows.axis_search`).
+    In a positioning test of one axis alone repeats are asked for a drift first (`abbe.service.workflows.axis_search`).
     """
-    from models.discovery.discover import discover
-    from service.workflows.axis_search import axis_discovery
+    from abbe.models.discovery.discover import discover
+    from abbe.service.workflows.axis_search import axis_discovery
 
     clock = SystemClock()
     begun = clock.monotonic_s()

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from service.report.discovery_model import DiscoveryPage, EffectCard, GapRow, Place, RunGap, Trace
-from service.report.numbers import plain
-from service.workflows.changed_words import changed_lines, changed_words
-from service.workflows.discover import Job, Journal
-from service.workflows.discovery_states import closed, entering
-from service.workflows.discovery_words import (
+from abbe.models.arrays import F1
+from abbe.service.report.discovery_model import DiscoveryPage, EffectCard, GapRow, Place, RunGap, Trace
+from abbe.service.report.numbers import plain
+from abbe.service.workflows.changed_words import changed_lines, changed_words
+from abbe.service.workflows.discover import Job, Journal
+from abbe.service.workflows.discovery_states import closed, entering
+from abbe.service.workflows.discovery_words import (
     ROLES,
     next_of,
     parameter_text,
@@ -21,8 +21,8 @@ from service.workflows.discovery_words import (
     verdict_of,
     where_lines,
 )
-from service.workflows.model_book import REMEDIES, name_of
-from service.workflows.packed import unpacked
+from abbe.service.workflows.model_book import REMEDIES, name_of
+from abbe.service.workflows.packed import unpacked
 
 AXES = "XYZ"
 CELLS = 24
@@ -53,7 +53,7 @@ def discovery_page(finding: dict[str, Any], runs: list[dict[str, Any]], facts: d
     Parameters
     ----------
     finding : dict
-        `service.workflows.discovery_doc.finding_doc`.
+        `abbe.service.workflows.discovery_doc.finding_doc`.
     runs : list of dict
         ``abbe-run/1`` objects of the campaign.
     facts : dict

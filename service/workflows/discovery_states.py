@@ -1,6 +1,7 @@
 """States of a discovery and how one follows from the other: FITTED, SUSPICIOUS, PROPOSED, TESTING, EXPLAINED or UNEXPLAINED.
 
-Pure: from a finding (`service.workflows.discovery_doc`) to the documents of its states. Every document says who decided and by which rule.
+Pure: from a finding (`abbe.service.workflows.discovery_doc`) to the documents of its states. Every document says who decided and by which
+rule.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Literal
 
-from service.workflows.never_fitted import told_missing
+from abbe.service.workflows.never_fitted import told_missing
 
 State = Literal["FITTED", "SUSPICIOUS", "PROPOSED", "TESTING", "EXPLAINED", "UNEXPLAINED"]
 FOLLOWS: dict[str | None, frozenset[str]] = {

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.errors import ModelMovedOn
-from service.storage.records import DiscoveryRecord, NewVersion
-from service.storage.store import Store
-from service.workflows.campaign_folder import ensure_stored
-from service.workflows.discover import Job, Journal
+from abbe.service.errors import ModelMovedOn
+from abbe.service.storage.records import DiscoveryRecord, NewVersion
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import ensure_stored
+from abbe.service.workflows.discover import Job, Journal
 
 
 class StoredJournal(Journal):

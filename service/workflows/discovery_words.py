@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from service.report.numbers import NOT_AVAILABLE, plain, with_uncertainty
-from service.workflows.changed_words import changed_lines
-from service.workflows.discovery_states import LEFT, closed, entering, judge, not_entered
-from service.workflows.model_book import REMEDIES, name_of
-from service.workflows.never_fitted import disagreeing, told_missing
+from abbe.service.report.numbers import NOT_AVAILABLE, plain, with_uncertainty
+from abbe.service.workflows.changed_words import changed_lines
+from abbe.service.workflows.discovery_states import LEFT, closed, entering, judge, not_entered
+from abbe.service.workflows.model_book import REMEDIES, name_of
+from abbe.service.workflows.never_fitted import disagreeing, told_missing
 
 UNITS = {"um": "µm", "urad": "µrad", "": "", "1": "", "um/m": "µm/m"}
 ADDS = {

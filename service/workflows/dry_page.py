@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.machine import AXES, Machine
-from service.report.dry_page import DryPage, render_dry
-from service.report.numbers import MM, Unit
-from service.report.plots.views import DrawnTest, three_views
-from service.sequences.check import DryRun
-from service.sequences.steps import CampaignPlan, MountBar, MoveTo, Point, ReadBar, ReadLaser, RecordPath, TestPlan
+from abbe.models.machine import AXES, Machine
+from abbe.service.report.dry_page import DryPage, render_dry
+from abbe.service.report.numbers import MM, Unit
+from abbe.service.report.plots.views import DrawnTest, three_views
+from abbe.service.sequences.check import DryRun
+from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, Point, ReadBar, ReadLaser, RecordPath, TestPlan
 
 NAMES = {
     "ballbar_helix": "ball-bar helix",

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from models.effects.effect import Effect
-from service.report.numbers import plain
-from service.workflows.discovery_words import ADDS, unit
-from service.workflows.model_book import REMEDIES
+from abbe.models.effects.effect import Effect
+from abbe.service.report.numbers import plain
+from abbe.service.workflows.discovery_words import ADDS, unit
+from abbe.service.workflows.model_book import REMEDIES
 
 HEADINGS = ("name", "what it is", "sits at", "usual size", "taken out by")
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from models.effects.effect import Effect
-from models.effects.probe_paths import probe_paths
-from models.effects.self_test import declaration_faults, signal_faults
-from service.errors import EffectPluginBroken
+from abbe.models.effects.effect import Effect
+from abbe.models.effects.probe_paths import probe_paths
+from abbe.models.effects.self_test import declaration_faults, signal_faults
+from abbe.service.errors import EffectPluginBroken
 
 GROUP = "abbe.effects"
 
@@ -36,7 +36,7 @@ def installed(known: Iterable[str]) -> Plugins:
     -------
     Plugins
         Never raises for what a plug-in does: one that cannot be imported, is no effect, has a name that is taken or fails the self-test of
-        the catalogue (`models.effects.self_test`) is left out, with one error that names it.
+        the catalogue (`abbe.models.effects.self_test`) is left out, with one error that names it.
     """
     taken, effects, broken = set(known), [], []
     for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value)):

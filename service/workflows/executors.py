@@ -8,8 +8,8 @@ from contextlib import closing
 from multiprocessing import get_context
 from typing import Any, Protocol, TypeVar
 
-from service.children import started_safely
-from service.errors import ConfigError
+from abbe.service.children import started_safely
+from abbe.service.errors import ConfigError
 
 J = TypeVar("J")
 R = TypeVar("R")

@@ -1,6 +1,6 @@
 """Which table a controller should have in force, as the push journals tell it: what somebody else has put there is seen against that.
 
-The look is the one of the gate (`service.workflows.table_gate`): what is refused before motion is what the service alarms.
+The look is the one of the gate (`abbe.service.workflows.table_gate`): what is refused before motion is what the service alarms.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from drivers.api import Controller
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls, open_session
-from service.errors import TableMismatch
-from service.push.book import read_entries
-from service.site import Site
-from service.storage.store import Store
-from service.workflows import table_gate
-from service.workflows.push_history import wanted_by
-from service.workflows.table_gate import InForceNow
-from service.workflows.unverified import Known, known_tables
+from abbe.drivers.api import Controller
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.errors import TableMismatch
+from abbe.service.push.book import read_entries
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows import table_gate
+from abbe.service.workflows.push_history import wanted_by
+from abbe.service.workflows.table_gate import InForceNow
+from abbe.service.workflows.unverified import Known, known_tables
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,35 +13,35 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from models.compensation.tables import Predicted
-from service.capture.live import LiveFeed
-from service.clock import Clock
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls
-from service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
-from service.events import Progress, ProgressSink
-from service.sequences.check import paced
-from service.sequences.control import Control, State
-from service.sequences.steps import CampaignPlan
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.alarm_states import TRIES, Alarm, Doc, Kind, next_step
-from service.workflows.campaign_folder import from_store
-from service.workflows.changed_since import since_of
-from service.workflows.changed_words import changed_words
-from service.workflows.correct import check_promise
-from service.workflows.discover import discover, prepare
-from service.workflows.discovery_engine import catalogue, search
-from service.workflows.discovery_states import entering
-from service.workflows.discovery_store import journal_of
-from service.workflows.discovery_words import size_text, verdict_of
-from service.workflows.linear_change import linear_words
-from service.workflows.measure import Manner, measure
-from service.workflows.model_book import REMEDIES, current, name_of
-from service.workflows.proposal_diff import compare, largest
-from service.workflows.proposals import Made, check_temperature, gather, make
-from service.workflows.recovered import recovered_session
-from service.workflows.table_out import table_then
+from abbe.models.compensation.tables import Predicted
+from abbe.service.capture.live import LiveFeed
+from abbe.service.clock import Clock
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.alarm_states import TRIES, Alarm, Doc, Kind, next_step
+from abbe.service.workflows.campaign_folder import from_store
+from abbe.service.workflows.changed_since import since_of
+from abbe.service.workflows.changed_words import changed_words
+from abbe.service.workflows.correct import check_promise
+from abbe.service.workflows.discover import discover, prepare
+from abbe.service.workflows.discovery_engine import catalogue, search
+from abbe.service.workflows.discovery_states import entering
+from abbe.service.workflows.discovery_store import journal_of
+from abbe.service.workflows.discovery_words import size_text, verdict_of
+from abbe.service.workflows.linear_change import linear_words
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.model_book import REMEDIES, current, name_of
+from abbe.service.workflows.proposal_diff import compare, largest
+from abbe.service.workflows.proposals import Made, check_temperature, gather, make
+from abbe.service.workflows.recovered import recovered_session
+from abbe.service.workflows.table_out import table_then
 
 BESIDE = 0.5
 """What is left for another remedy than a table may be at most this share of what tables promise; above it that remedy comes first."""

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from models.evaluation.iso230_2 import Approaches
-from models.evaluation.iso230_4 import Circle
-from models.machine import AXES
-from models.solvers.observations import nominal_reading
-from service.errors import AbbeError, MeasurementFault
-from service.runs.observations import run_data
+from abbe.models.arrays import F1
+from abbe.models.evaluation.iso230_2 import Approaches
+from abbe.models.evaluation.iso230_4 import Circle
+from abbe.models.machine import AXES
+from abbe.models.solvers.observations import nominal_reading
+from abbe.service.errors import AbbeError, MeasurementFault
+from abbe.service.runs.observations import run_data
 
 NEAR_MM = 0.05
-"""Positions closer than this are the same one, approached again (the same as for discoveries: `service.workflows.axis_test`)."""
+"""Positions closer than this are the same one, approached again (the same as for discoveries: `abbe.service.workflows.axis_test`)."""
 ALL = 10**9
 
 Run = dict[str, Any]

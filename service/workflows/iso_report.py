@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from models.evaluation.iso230_2 import Positioning, ScaleBudget, Value, positioning
-from models.evaluation.iso230_4 import OnePath, both_ways, centred, circular
-from models.evaluation.iso230_6 import BODY, FACE, diagonals
-from models.uncertainty.inputs import Inputs
-from models.verification import U_REPEAT_MM
-from service.report.document import Figure, Picture
-from service.report.model import PolarTrace
-from service.report.numbers import plain
-from service.report.plots.polar import polar_plot
-from service.report.plots.positioning import PositioningCurves, positioning_plot
-from service.runs.coverage import not_judged
-from service.workflows.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
+from abbe.models.evaluation.iso230_2 import Positioning, ScaleBudget, Value, positioning
+from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circular
+from abbe.models.evaluation.iso230_6 import BODY, FACE, diagonals
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.verification import U_REPEAT_MM
+from abbe.service.report.document import Figure, Picture
+from abbe.service.report.model import PolarTrace
+from abbe.service.report.numbers import plain
+from abbe.service.report.plots.polar import polar_plot
+from abbe.service.report.plots.positioning import PositioningCurves, positioning_plot
+from abbe.service.runs.coverage import not_judged
+from abbe.service.workflows.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
 
 UM = 1e3
 POLAR_POINTS = 720

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.case import Case
-from models.effects.effect import Effect
-from models.effects.path import Path
-from service.errors import ModelUnknown
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.case import Case
+from abbe.models.effects.effect import Effect
+from abbe.models.effects.path import Path
+from abbe.service.errors import ModelUnknown
 
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 LASTING = ("drive", "structure", "geometry")

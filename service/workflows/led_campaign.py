@@ -10,26 +10,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from models.compensation.tables import Predicted
-from models.machine import Machine
-from service.devices.alone import alone
-from service.devices.session import Session
-from service.errors import TableMismatch, TableRefused
-from service.sequences.campaigns import identification
-from service.sequences.check import paced
-from service.sequences.control import Control, State
-from service.sequences.interlocks import COMPENSATION_ON
-from service.sequences.needed import check_devices, needed_by
-from service.sequences.recipe_file import parse_recipe, recipe_source
-from service.sequences.steps import CampaignPlan
-from service.workflows.base_table import read_base
-from service.workflows.correct import check_promise
-from service.workflows.investigate import NO, Bench, made_of, promise_words
-from service.workflows.measure import Manner, measure, start_campaign
-from service.workflows.plausible import certificates
-from service.workflows.proposals import check_certificates
-from service.workflows.recovered import recovered_session
-from service.workflows.shipped import IDENTIFICATION, USUAL_HZ, parted
+from abbe.models.compensation.tables import Predicted
+from abbe.models.machine import Machine
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import Session
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.sequences.campaigns import identification
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import COMPENSATION_ON
+from abbe.service.sequences.needed import check_devices, needed_by
+from abbe.service.sequences.recipe_file import parse_recipe, recipe_source
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.correct import check_promise
+from abbe.service.workflows.investigate import NO, Bench, made_of, promise_words
+from abbe.service.workflows.measure import Manner, measure, start_campaign
+from abbe.service.workflows.plausible import certificates
+from abbe.service.workflows.proposals import check_certificates
+from abbe.service.workflows.recovered import recovered_session
+from abbe.service.workflows.shipped import IDENTIFICATION, USUAL_HZ, parted
 
 SOLVING = "all is measured, and nothing moves while it is solved"
 

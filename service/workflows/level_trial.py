@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
 
-from drivers.api import CompStatus, Controller
-from drivers.errors import DeviceFault, Refused
-from service.clock import Clock
-from service.workflows.base_table import Base
+from abbe.drivers.api import CompStatus, Controller
+from abbe.drivers.errors import DeviceFault, Refused
+from abbe.service.clock import Clock
+from abbe.service.workflows.base_table import Base
 
 SEALED = 2
 LEASE_MS = 60_000

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.api import ControllerStatus, Point
-from drivers.errors import DeviceFault, Refused
-from drivers.links.shielded import run_to_end
-from models.machine import AXES
-from service.sequences.interlocks import MOVING, tripped
-from service.site import Site
-from service.workflows.level_trial import Trial
+from abbe.drivers.api import ControllerStatus, Point
+from abbe.drivers.errors import DeviceFault, Refused
+from abbe.drivers.links.shielded import run_to_end
+from abbe.models.machine import AXES
+from abbe.service.sequences.interlocks import MOVING, tripped
+from abbe.service.site import Site
+from abbe.service.workflows.level_trial import Trial
 
 MOVE_MM, FEED_MM_MIN = 3.0, 60.0
 TRIES = 6

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from service.storage.records import SolutionRecord
-from service.storage.store import Store
-from service.workflows.proposals import Made
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.proposals import Made
 
 NAMES = {
     "EXX": "scale of X",

@@ -14,20 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from drivers.api import ControllerStatus, LaserReading, Point
-from models.alignment.clock import ClockFit, fit_clock
-from models.alignment.dwell import DwellReading, Dwells, Planned, detect, merged, named
-from models.alignment.lag import Lag, fit_lag
-from models.arrays import F1, F2
-from models.machine import AXES
-from service.devices.session import Session
-from service.errors import MeasurementFault
-from service.runs.laser_columns import MM_PER_COUNT
-from service.runs.recorder import Recorder
-from service.sequences.interlocks import PROGRAM
-from service.sequences.nc.blocks import LASER_DWELL_S
-from service.sequences.runner import COMPENSATED
-from service.sequences.steps import MountLaser, MoveTo, ReadLaser, TestPlan
+from abbe.drivers.api import ControllerStatus, LaserReading, Point
+from abbe.models.alignment.clock import ClockFit, fit_clock
+from abbe.models.alignment.dwell import DwellReading, Dwells, Planned, detect, merged, named
+from abbe.models.alignment.lag import Lag, fit_lag
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.service.devices.session import Session
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.laser_columns import MM_PER_COUNT
+from abbe.service.runs.recorder import Recorder
+from abbe.service.sequences.interlocks import PROGRAM
+from abbe.service.sequences.nc.blocks import LASER_DWELL_S
+from abbe.service.sequences.runner import COMPENSATED
+from abbe.service.sequences.steps import MountLaser, MoveTo, ReadLaser, TestPlan
 
 Say = Callable[[str], None]
 STATUS_EVERY = 3

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-from drivers.errors import DriverError
-from drivers.links.shielded import run_to_end
-from service.capture.recorder import CaptureRecorder, close_run, recording
-from service.clock import Clock, SystemClock
-from service.devices.session import Session
-from service.errors import AbbeError
-from service.sequences.check import dry_run_campaign
-from service.sequences.needed import check_devices
-from service.sequences.steps import CampaignPlan, Unmount
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.listen import Say, listen_to, wanted
-from service.workflows.measure import OpenCampaign, start_campaign, start_document
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.devices.session import Session
+from abbe.service.errors import AbbeError
+from abbe.service.sequences.check import dry_run_campaign
+from abbe.service.sequences.needed import check_devices
+from abbe.service.sequences.steps import CampaignPlan, Unmount
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.listen import Say, listen_to, wanted
+from abbe.service.workflows.measure import OpenCampaign, start_campaign, start_document
 
 
 async def listen(session: Session, store: Store, site: Site, plan: CampaignPlan, say: Say, clock: Clock | None = None) -> list[int]:

@@ -10,33 +10,33 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
-from drivers.errors import DriverError
-from drivers.links.shielded import run_to_end
-from service.capture.live import LiveFeed
-from service.capture.recorder import CaptureRecorder, close_run, recording
-from service.clock import Clock, SystemClock
-from service.devices.clock_notes import notes_since
-from service.devices.session import Session
-from service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
-from service.events import ProgressSink, ignore_progress
-from service.sequences.check import dry_run_campaign, step_seconds
-from service.sequences.control import Control, State
-from service.sequences.guard import warnings_of
-from service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
-from service.sequences.interlocks import COMPENSATION_ON
-from service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
-from service.sequences.needed import check_devices
-from service.sequences.preconditions import Expected
-from service.sequences.rewind import Attempt
-from service.sequences.runner import Runner, Tick
-from service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
-from service.site import Site
-from service.storage.owner import this_process
-from service.storage.records import DISK_FULL
-from service.storage.store import Store
-from service.workflows.bar_link import BarBreaks, bar_ready
-from service.workflows.campaign_run import Conduct, Confirm, Resumed, in_mounting, items, nobody, plan_hash, read_path
-from service.workflows.meter import Meter
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.capture.live import LiveFeed
+from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.devices.clock_notes import notes_since
+from abbe.service.devices.session import Session
+from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
+from abbe.service.events import ProgressSink, ignore_progress
+from abbe.service.sequences.check import dry_run_campaign, step_seconds
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.guard import warnings_of
+from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
+from abbe.service.sequences.interlocks import COMPENSATION_ON
+from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
+from abbe.service.sequences.needed import check_devices
+from abbe.service.sequences.preconditions import Expected
+from abbe.service.sequences.rewind import Attempt
+from abbe.service.sequences.runner import Runner, Tick
+from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
+from abbe.service.site import Site
+from abbe.service.storage.owner import this_process
+from abbe.service.storage.records import DISK_FULL
+from abbe.service.storage.store import Store
+from abbe.service.workflows.bar_link import BarBreaks, bar_ready
+from abbe.service.workflows.campaign_run import Conduct, Confirm, Resumed, in_mounting, items, nobody, plan_hash, read_path
+from abbe.service.workflows.meter import Meter
 
 RUN_STATUS: dict[type[Exception], str] = {Stopped: "stopped", Aborted: "aborted", RunInterrupted: "aborted"}
 """How a run is closed that a person has ended, or that is gone on with; everything else has failed."""

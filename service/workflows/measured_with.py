@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from service.errors import FormatRefused
-from service.push.book import read_entries
-from service.storage.records import Doc
-from service.storage.store import Store
+from abbe.service.errors import FormatRefused
+from abbe.service.push.book import read_entries
+from abbe.service.storage.records import Doc
+from abbe.service.storage.store import Store
 
 KIND_AT, NO_CORRECTION = slice(4, 6), 0
 """Bytes of an image that say its kind (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""

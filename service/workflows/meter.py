@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from service.clock import Clock
-from service.events import Place, Progress, ProgressSink
-from service.sequences.control import Control, Situation, State
+from abbe.service.clock import Clock
+from abbe.service.events import Place, Progress, ProgressSink
+from abbe.service.sequences.control import Control, Situation, State
 
 WAITING = (State.PAUSED, State.SUSPENDED)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from models.effects.effect import Effect
-from service.errors import ModelUnknown
-from service.storage.records import ModelRecord, NewVersion
-from service.storage.store import Store
-from service.workflows.known_effects import applies
-from service.workflows.model_sums import cancels, total
+from abbe.models.effects.effect import Effect
+from abbe.service.errors import ModelUnknown
+from abbe.service.storage.records import ModelRecord, NewVersion
+from abbe.service.storage.store import Store
+from abbe.service.workflows.known_effects import applies
+from abbe.service.workflows.model_sums import cancels, total
 
 FORMAT = "abbe-model/1"
 LOOK = "`abbe model list MACHINE` shows what there is"
@@ -55,7 +55,7 @@ def grown(base: ModelRecord | None, finding: dict[str, Any], source: dict[str, A
     source : dict
         ``campaign``, ``machine_digest``, ``runs`` (digests), ``versions``, ``discovery``.
     effects : tuple of Effect
-        The catalogue: how large the sum of two findings of one label is (`service.workflows.model_sums`).
+        The catalogue: how large the sum of two findings of one label is (`abbe.service.workflows.model_sums`).
     """
     origin = {k: source[k] for k in ("campaign", "discovery")}
     new = [_entry(e, origin) for e in finding["effects"]]

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from models.effects.effect import Effect
-from service.workflows.packed import unpacked_covariance
+from abbe.models.arrays import F1
+from abbe.models.effects.effect import Effect
+from abbe.service.workflows.packed import unpacked_covariance
 
 ALIKE = 2.0
 """Non-linear values that differ by less than so many standard uncertainties are the same: their columns are."""

@@ -11,7 +11,7 @@ SHOWN = 4
 
 
 def disagreeing(finding: dict[str, Any]) -> list[dict[str, Any]]:
-    """Runs that were never fitted and are farther off than noise and prediction allow, the worst first (`models.discovery.agreement`)."""
+    """Never fitted runs that are farther off than noise and prediction allow, the worst first (`abbe.models.discovery.agreement`)."""
     return [a for a in finding.get("agreement", []) if a["p"] < ALARM]
 
 

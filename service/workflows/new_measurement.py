@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.effects.effect import Effect
-from service.storage.records import ModelRecord
-from service.workflows.campaign_folder import Campaign
-from service.workflows.discover import Thin, prepare
-from service.workflows.discover_live import joined
-from service.workflows.discovery_doc import noise_mm_of
-from service.workflows.simulate import Simulation, simulate
-from service.workflows.thinned import thinned
+from abbe.models.effects.effect import Effect
+from abbe.service.storage.records import ModelRecord
+from abbe.service.workflows.campaign_folder import Campaign
+from abbe.service.workflows.discover import Thin, prepare
+from abbe.service.workflows.discover_live import joined
+from abbe.service.workflows.discovery_doc import noise_mm_of
+from abbe.service.workflows.simulate import Simulation, simulate
+from abbe.service.workflows.thinned import thinned
 
 
 @dataclass(frozen=True, slots=True)

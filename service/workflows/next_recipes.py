@@ -9,14 +9,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from models.discovery.unseen import LATE_S
-from models.machine import AXES, Machine
-from models.paths.lines import DIAGONALS
-from service.errors import StrokeError
-from service.sequences.campaigns import verification_helix
-from service.sequences.check import dry_run_campaign, paced
-from service.sequences.recipes import MIN_TURNS, Diagonal, Helix, Linear, Recipe, as_point
-from service.sequences.steps import CampaignPlan, TestPlan
+from abbe.models.discovery.unseen import LATE_S
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.lines import DIAGONALS
+from abbe.service.errors import StrokeError
+from abbe.service.sequences.campaigns import verification_helix
+from abbe.service.sequences.check import dry_run_campaign, paced
+from abbe.service.sequences.recipes import MIN_TURNS, Diagonal, Helix, Linear, Recipe, as_point
+from abbe.service.sequences.steps import CampaignPlan, TestPlan
 
 Maker = Callable[[Helix, str], list[Recipe]]
 """From a helix that was measured, and what labels begin with, to recipes."""

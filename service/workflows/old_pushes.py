@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.api import Controller
-from drivers.links.shielded import run_to_end
-from service.errors import MachineInUse, StillActive, TableMismatch
-from service.site import Site
-from service.storage.owner import Owner
-from service.storage.store import Store
-from service.workflows.takeback import take_back
+from abbe.drivers.api import Controller
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.errors import MachineInUse, StillActive, TableMismatch
+from abbe.service.site import Site
+from abbe.service.storage.owner import Owner
+from abbe.service.storage.store import Store
+from abbe.service.workflows.takeback import take_back
 
 OPEN = ("STAGING", "ACTIVATING", "PROBATION")
 UNFINISHED = (*OPEN, "ROLLBACK_PENDING", "OPERATOR")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 READINGS = "base64 of float32, little endian, mm"
 MATRIX = "base64 of float64, little endian, lower triangle by rows"

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.api import Controller
-from service.clock import Clock
-from service.errors import StillActive
-from service.push.adapter import ControllerPort, nobody
-from service.push.book import StoreBook
-from service.push.operations import Done, Doubt, Kind, Op, Outcome, Truth
-from service.push.states import TERMINAL, State
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.recover import READY, finish_push
+from abbe.drivers.api import Controller
+from abbe.service.clock import Clock
+from abbe.service.errors import StillActive
+from abbe.service.push.adapter import ControllerPort, nobody
+from abbe.service.push.book import StoreBook
+from abbe.service.push.operations import Done, Doubt, Kind, Op, Outcome, Truth
+from abbe.service.push.states import TERMINAL, State
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.recover import READY, finish_push
 
 LIMIT_S = 600.0
 """How long a command waits if nobody says otherwise."""

@@ -7,23 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.machine import AXES
-from models.planning.goal import COVERAGE
-from models.planning.instruments import Instruments
-from models.planning.measurements import DiagonalTest, HelixTest, Measurement, feed_mm_min
-from models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, Step, plan_campaign
-from service.errors import ConfigError
-from service.events import Progress, ProgressSink, ignore_progress
-from service.report.plan_page import PlanPage, render_plan
-from service.report.plots.setups import SetupPath, setups_picture
-from service.sequences.check import DryRun, dry_run_campaign, paced
-from service.sequences.recipe_file import recipe_text
-from service.sequences.recipes import Diagonal, Helix, Linear, Recipe
-from service.sequences.setups import shared_setups
-from service.sequences.steps import CampaignPlan
-from service.site import Site
-from service.workflows.plan_instruments import at_this_machine
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.models.planning.goal import COVERAGE
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, feed_mm_min
+from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, Step, plan_campaign
+from abbe.service.errors import ConfigError
+from abbe.service.events import Progress, ProgressSink, ignore_progress
+from abbe.service.report.plan_page import PlanPage, render_plan
+from abbe.service.report.plots.setups import SetupPath, setups_picture
+from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
+from abbe.service.sequences.recipe_file import recipe_text
+from abbe.service.sequences.recipes import Diagonal, Helix, Linear, Recipe
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site
+from abbe.service.workflows.plan_instruments import at_this_machine
 
 BOUND_NOTE = (
     "U is the posterior (Bayesian Cramer-Rao) bound of these readings over the inner 80 % of the volume, rigid motion taken out, and the "

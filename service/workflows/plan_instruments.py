@@ -9,11 +9,11 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from models.planning.instruments import BAR_LENGTHS_MM, Instruments, SetupMinutes
-from service.config import read_toml
-from service.errors import ConfigError
-from service.explain import expected, nearest, where
-from service.site import Site
+from abbe.models.planning.instruments import BAR_LENGTHS_MM, Instruments, SetupMinutes
+from abbe.service.config import read_toml
+from abbe.service.errors import ConfigError
+from abbe.service.explain import expected, nearest, where
+from abbe.service.site import Site
 
 USUAL = SetupMinutes()
 Micrometres = Annotated[float, Field(gt=0.0, le=1000.0)]

@@ -1,6 +1,6 @@
 """What of a machine file cannot work, and what is probably not meant: said before a machine is asked to move, not at night by a schedule.
 
-What no machine can be (a stroke of 1e9 mm, 68 degrees C) is refused where the file is read (`service.config_schema`).
+What no machine can be (a stroke of 1e9 mm, 68 degrees C) is refused where the file is read (`abbe.service.config_schema`).
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
-from drivers.links.urls import FixtureConsoleUrl, parse_url
-from service.config_schema import MachineFile
-from service.config_timetable import ScheduleEntry
-from service.errors import AbbeError, ConfigError
-from service.sequences.check import dry_run_campaign, paced
-from service.sequences.needed import BALLBAR, LASER, check_configured, needed_by
-from service.sequences.steps import CampaignPlan
-from service.site import Site, site_of
-from service.workflows.shipped import campaign_plan, recipe_plan
+from abbe.drivers.links.urls import FixtureConsoleUrl, parse_url
+from abbe.service.config_schema import MachineFile
+from abbe.service.config_timetable import ScheduleEntry
+from abbe.service.errors import AbbeError, ConfigError
+from abbe.service.sequences.check import dry_run_campaign, paced
+from abbe.service.sequences.needed import BALLBAR, LASER, check_configured, needed_by
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, site_of
+from abbe.service.workflows.shipped import campaign_plan, recipe_plan
 
 SMALL_MM, LARGE_MM = 200.0, 20_000.0
 """A machine whose longest axis is shorter, or that has a longer one, is possible and rare."""

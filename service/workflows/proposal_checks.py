@@ -8,21 +8,21 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
 
-from drivers.api import Controller
-from service.clock import Clock
-from service.errors import TableRefused
-from service.push.candidate import Candidate, Scene, Seal
-from service.push.operations import Approval
-from service.push.validate import content_digest, reasons_against
-from service.site import Site
-from service.storage.base import utc_text
-from service.storage.records import ApprovalRecord
-from service.storage.store import Store
-from service.storage.store_decisions import RejectionRecord
-from service.workflows.base_table import Base, read_base
-from service.workflows.candidates import scene_of, until_s
-from service.workflows.proposal_doc import Proposed
-from service.workflows.proposals import by_whom, login
+from abbe.drivers.api import Controller
+from abbe.service.clock import Clock
+from abbe.service.errors import TableRefused
+from abbe.service.push.candidate import Candidate, Scene, Seal
+from abbe.service.push.operations import Approval
+from abbe.service.push.validate import content_digest, reasons_against
+from abbe.service.site import Site
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.records import ApprovalRecord
+from abbe.service.storage.store import Store
+from abbe.service.storage.store_decisions import RejectionRecord
+from abbe.service.workflows.base_table import Base, read_base
+from abbe.service.workflows.candidates import scene_of, until_s
+from abbe.service.workflows.proposal_doc import Proposed
+from abbe.service.workflows.proposals import by_whom, login
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from models.compensation.tables import NineTables
-from models.machine import AXES
-from service.errors import TableRefused
-from service.report.diff_page import DiffCurve, DiffPage, render_diff
-from service.storage.store import Store
-from service.workflows.proposal_doc import Proposed, load
+from abbe.models.arrays import F1
+from abbe.models.compensation.tables import NineTables
+from abbe.models.machine import AXES
+from abbe.service.errors import TableRefused
+from abbe.service.report.diff_page import DiffCurve, DiffPage, render_diff
+from abbe.service.storage.store import Store
+from abbe.service.workflows.proposal_doc import Proposed, load
 
 ACTIVE = "ACTIVE"
 HEADINGS = ("table", "old max (µm)", "new max (µm)", "largest change (µm)", "U (µm)", "at (mm)", "rms change (µm)")

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from drivers.cnc.tables import encode
-from models.arrays import F2
-from models.compensation.tables import NineTables, Predicted
-from models.machine import AXES
-from service.errors import StoreError
-from service.push.approval import approval_digest
-from service.push.candidate import Candidate, Column, Evidence, Seal
-from service.push.entries import Doc, canonical
-from service.push.limits import PushLimits
-from service.storage.store import Store
-from service.workflows.tables import table_image, tables_from_image
+from abbe.drivers.cnc.tables import encode
+from abbe.models.arrays import F2
+from abbe.models.compensation.tables import NineTables, Predicted
+from abbe.models.machine import AXES
+from abbe.service.errors import StoreError
+from abbe.service.push.approval import approval_digest
+from abbe.service.push.candidate import Candidate, Column, Evidence, Seal
+from abbe.service.push.entries import Doc, canonical
+from abbe.service.push.limits import PushLimits
+from abbe.service.storage.store import Store
+from abbe.service.workflows.tables import table_image, tables_from_image
 
 FORMAT = "abbe-proposal/1"
 

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.errors import TableRefused
-from service.push.book import read_entries
-from service.push.entries import Entry, Journal, facts
-from service.push.states import TERMINAL, State
-from service.storage.records import ApprovalRecord
-from service.storage.store import Store
-from service.storage.store_decisions import RejectionRecord
-from service.workflows.proposal_checks import valid_approval
-from service.workflows.proposal_doc import Proposed
-from service.workflows.push_history import KIND, pushes_of
+from abbe.service.errors import TableRefused
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import Entry, Journal, facts
+from abbe.service.push.states import TERMINAL, State
+from abbe.service.storage.records import ApprovalRecord
+from abbe.service.storage.store import Store
+from abbe.service.storage.store_decisions import RejectionRecord
+from abbe.service.workflows.proposal_checks import valid_approval
+from abbe.service.workflows.proposal_doc import Proposed
+from abbe.service.workflows.push_history import KIND, pushes_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,26 +15,26 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from drivers.api import Controller, TableFormat
-from models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
-from service.clock import Clock, SystemClock
-from service.errors import TableMismatch, TableRefused
-from service.events import Progress, ProgressSink
-from service.push.validate import reasons_against
-from service.runs.columns import load_run
-from service.site import Site
-from service.storage.base import utc_text
-from service.storage.records import CampaignRecord, RunRecord
-from service.storage.store import Store
-from service.workflows.base_table import Base, read_base
-from service.workflows.campaign_folder import from_store
-from service.workflows.candidates import Promise, candidate_of, scene_of
-from service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
-from service.workflows.solve import Solved, solve_runs
-from service.workflows.solve_report import solution_doc
-from service.workflows.table_out import TableThen
-from service.workflows.tables import added
-from service.workflows.taken_out import TakenOut, taken_out
+from abbe.drivers.api import Controller, TableFormat
+from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.push.validate import reasons_against
+from abbe.service.runs.columns import load_run
+from abbe.service.site import Site
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.records import CampaignRecord, RunRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import Base, read_base
+from abbe.service.workflows.campaign_folder import from_store
+from abbe.service.workflows.candidates import Promise, candidate_of, scene_of
+from abbe.service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from abbe.service.workflows.solve import Solved, solve_runs
+from abbe.service.workflows.solve_report import solution_doc
+from abbe.service.workflows.table_out import TableThen
+from abbe.service.workflows.tables import added
+from abbe.service.workflows.taken_out import TakenOut, taken_out
 
 GRID = (25, 21, 19)
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import asyncio
 from dataclasses import asdict, dataclass, fields
 
-from drivers.api import Controller, DeviceInfo
-from service.errors import TableRefused
-from service.push.levels import Capabilities, objection
-from service.site import Site
-from service.storage.records import Doc
-from service.storage.store import Store
+from abbe.drivers.api import Controller, DeviceInfo
+from abbe.service.errors import TableRefused
+from abbe.service.push.levels import Capabilities, objection
+from abbe.service.site import Site
+from abbe.service.storage.records import Doc
+from abbe.service.storage.store import Store
 
 KIND = "levels"
 HINT = "what this controller does for a safe push was never proved{}: abbe comp commission does that, until then a person has to attend"
@@ -29,7 +29,7 @@ class Standing:
 
     @property
     def level(self) -> int:
-        """Capability level (`service.push.levels`)."""
+        """Capability level (`abbe.service.push.levels`)."""
         return self.capabilities.level
 
 

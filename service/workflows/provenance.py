@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from models.machine import Machine
+from abbe.models.machine import Machine
 
 SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
 
@@ -113,7 +113,7 @@ def _changed(tree: Path) -> bool:
     git = shutil.which("git")
     if git is None:
         return False
-    words = [git, "--no-optional-locks", "-C", str(tree), "status", "--porcelain", "--", "models", "service"]
+    words = [git, "--no-optional-locks", "-C", str(tree), "status", "--porcelain", "--", "abbe", "models", "service"]
     try:
         found = subprocess.run(words, capture_output=True, timeout=20, check=False)  # noqa: S603 - fixed words, no shell
     except (OSError, subprocess.TimeoutExpired):

@@ -11,30 +11,30 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.errors import DriverError
-from service.clock import Clock
-from service.devices.alone import alone
-from service.devices.session import Session
-from service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
-from service.events import ProgressSink
-from service.sequences.campaigns import verification
-from service.sequences.check import paced
-from service.sequences.control import Control, State
-from service.site import Site
-from service.storage.records import AlarmEntryRecord
-from service.storage.store import Store
-from service.workflows.alarm_states import NO_ALARM, Kind
-from service.workflows.commission import check_commissioned
-from service.workflows.correct import push
-from service.workflows.measure import Manner, measure
-from service.workflows.pending import finish_when_safe
-from service.workflows.proposal_checks import hold
-from service.workflows.proposal_doc import load
-from service.workflows.proposal_states import standing
-from service.workflows.proposals import load_runs
-from service.workflows.proved_levels import check_level
-from service.workflows.push_word import STOPPED, Outcome
-from service.workflows.recovered import recovered_session
+from abbe.drivers.errors import DriverError
+from abbe.service.clock import Clock
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import Session
+from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
+from abbe.service.events import ProgressSink
+from abbe.service.sequences.campaigns import verification
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control, State
+from abbe.service.site import Site
+from abbe.service.storage.records import AlarmEntryRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.alarm_states import NO_ALARM, Kind
+from abbe.service.workflows.commission import check_commissioned
+from abbe.service.workflows.correct import push
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.pending import finish_when_safe
+from abbe.service.workflows.proposal_checks import hold
+from abbe.service.workflows.proposal_doc import load
+from abbe.service.workflows.proposal_states import standing
+from abbe.service.workflows.proposals import load_runs
+from abbe.service.workflows.proved_levels import check_level
+from abbe.service.workflows.push_word import STOPPED, Outcome
+from abbe.service.workflows.recovered import recovered_session
 
 WAIT_S = 600.0
 """So long a machine that does not let the old table back at once is watched; after that the service tries again and again, and says so."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from service.errors import StoreError, TableMismatch, TableRefused
-from service.push.entries import WORD, Entry, Journal, JournalBroken, check_chain, facts
-from service.push.states import TERMINAL, State
+from abbe.service.errors import StoreError, TableMismatch, TableRefused
+from abbe.service.push.entries import WORD, Entry, Journal, JournalBroken, check_chain, facts
+from abbe.service.push.states import TERMINAL, State
 
 KIND = "rollback"
 """Kind of a table that a person ordered back."""

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from service.push.book import read_entries
-from service.push.entries import Journal, facts
-from service.push.states import BEFORE_ACTIVATION, State
-from service.storage.store import Store
-from service.workflows.push_history import operator_needed, pushes_of
-from service.workflows.unverified import Pushed, known_tables
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import Journal, facts
+from abbe.service.push.states import BEFORE_ACTIVATION, State
+from abbe.service.storage.store import Store
+from abbe.service.workflows.push_history import operator_needed, pushes_of
+from abbe.service.workflows.unverified import Pushed, known_tables
 
 OPEN, STOPPED = "open", "stopped"
 

@@ -1,4 +1,4 @@
-"""One table's way into a controller, as a job asks for it: the push machine (`service.push`) with this job's questions and errors.
+"""One table's way into a controller, as a job asks for it: the push machine (`abbe.service.push`) with this job's questions and errors.
 
 The machine runs in a task of its own: whoever is cancelled meanwhile waits until nothing unverified is in force, and is cancelled then.
 """
@@ -12,31 +12,31 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 
-from drivers.api import Controller
-from drivers.cnc.tables import crc32, encode
-from drivers.errors import DriverError
-from drivers.links.shielded import run_to_end
-from models.compensation.tables import NineTables
-from service.clock import Clock, SystemClock
-from service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
-from service.push import conduct
-from service.push.adapter import ControllerPort, People
-from service.push.approval import approval_digest
-from service.push.book import StoreBook
-from service.push.conduct import Ended
-from service.push.entries import Doc, Journal, facts
-from service.push.meaning import meaning_of_tables
-from service.push.operations import Approval, Verdict
-from service.push.order import Order
-from service.push.states import State
-from service.sequences.control import Control
-from service.site import Site
-from service.storage.owner import this_process
-from service.storage.store import Store
-from service.workflows.base_table import Base
-from service.workflows.proved_levels import standing
-from service.workflows.push_history import STILL_ACTIVE, operator_needed, push_log
-from service.workflows.tables import table_image
+from abbe.drivers.api import Controller
+from abbe.drivers.cnc.tables import crc32, encode
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.models.compensation.tables import NineTables
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
+from abbe.service.push import conduct
+from abbe.service.push.adapter import ControllerPort, People
+from abbe.service.push.approval import approval_digest
+from abbe.service.push.book import StoreBook
+from abbe.service.push.conduct import Ended
+from abbe.service.push.entries import Doc, Journal, facts
+from abbe.service.push.meaning import meaning_of_tables
+from abbe.service.push.operations import Approval, Verdict
+from abbe.service.push.order import Order
+from abbe.service.push.states import State
+from abbe.service.sequences.control import Control
+from abbe.service.site import Site
+from abbe.service.storage.owner import this_process
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import Base
+from abbe.service.workflows.proved_levels import standing
+from abbe.service.workflows.push_history import STILL_ACTIVE, operator_needed, push_log
+from abbe.service.workflows.tables import table_image
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"
 NOT_TO_BE_TRUSTED = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 
-from models.solvers.joint import Model
-from service.errors import AbbeError
-from service.storage.store import Store
-from service.workflows.campaign_folder import from_store, keep
-from service.workflows.executors import Executor
-from service.workflows.solve import solve_runs
-from service.workflows.solve_report import account, solution_doc
-from service.workflows.table_out import table_then
-from service.workflows.taken_out import taken_out
+from abbe.models.solvers.joint import Model
+from abbe.service.errors import AbbeError
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import from_store, keep
+from abbe.service.workflows.executors import Executor
+from abbe.service.workflows.solve import solve_runs
+from abbe.service.workflows.solve_report import account, solution_doc
+from abbe.service.workflows.table_out import table_then
+from abbe.service.workflows.taken_out import taken_out
 
 HEADINGS = ("campaign", "runs", "verdict", "what")
 

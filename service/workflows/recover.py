@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.api import Controller
-from drivers.errors import DriverError
-from drivers.links.shielded import run_to_end
-from service.capture.recovery import recover_segments
-from service.clock import Clock, SystemClock
-from service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
-from service.push import conduct
-from service.push.adapter import ControllerPort, nobody
-from service.push.book import StoreBook
-from service.push.entries import WORD, Journal, facts
-from service.push.staging import LAID_ASIDE
-from service.push.states import BEFORE_ACTIVATION, TERMINAL, State
-from service.site import Site
-from service.storage.owner import Owner, this_process
-from service.storage.store import Store
-from service.workflows.old_pushes import finish_old_push
-from service.workflows.push_history import operator_needed
-from service.workflows.pushing import pushes_here
-from service.workflows.table_gate import accept_strange, check_in_force, said, vouch
-from service.workflows.unverified import Known, known_tables
-from service.workflows.whose_push import check_own, is_own
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.capture.recovery import recover_segments
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
+from abbe.service.push import conduct
+from abbe.service.push.adapter import ControllerPort, nobody
+from abbe.service.push.book import StoreBook
+from abbe.service.push.entries import WORD, Journal, facts
+from abbe.service.push.staging import LAID_ASIDE
+from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, State
+from abbe.service.site import Site
+from abbe.service.storage.owner import Owner, this_process
+from abbe.service.storage.store import Store
+from abbe.service.workflows.old_pushes import finish_old_push
+from abbe.service.workflows.push_history import operator_needed
+from abbe.service.workflows.pushing import pushes_here
+from abbe.service.workflows.table_gate import accept_strange, check_in_force, said, vouch
+from abbe.service.workflows.unverified import Known, known_tables
+from abbe.service.workflows.whose_push import check_own, is_own
 
 READY = "make the machine ready (interlocks, link), then start again"
 

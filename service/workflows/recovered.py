@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from drivers.api import Controller
-from service.devices.session import Ask, DeviceUrls, Session, no_console, open_session
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.recover import recover
+from abbe.drivers.api import Controller
+from abbe.service.devices.session import Ask, DeviceUrls, Session, no_console, open_session
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.recover import recover
 
 
 @asynccontextmanager

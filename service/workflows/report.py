@@ -6,22 +6,22 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from service.config_schema import MachineFile
-from service.errors import FileFormatError, StoreError
-from service.report.document import Document
-from service.report.document_data import document_csv, document_json
-from service.report.document_page import document_html, document_pdf
-from service.report.page_file import write_page
-from service.runs.columns import load_run
-from service.storage.records import CampaignRecord, RunRecord
-from service.storage.store import Store
-from service.workflows.campaign_folder import Campaign, from_folder, from_store
-from service.workflows.report_discovery import discovery_report
-from service.workflows.report_done import push_report, verification_report
-from service.workflows.report_measured import Measured, campaign_report, run_report
-from service.workflows.report_parts import Rules
-from service.workflows.report_table import table_said
-from service.workflows.report_then import of_then
+from abbe.service.config_schema import MachineFile
+from abbe.service.errors import FileFormatError, StoreError
+from abbe.service.report.document import Document
+from abbe.service.report.document_data import document_csv, document_json
+from abbe.service.report.document_page import document_html, document_pdf
+from abbe.service.report.page_file import write_page
+from abbe.service.runs.columns import load_run
+from abbe.service.storage.records import CampaignRecord, RunRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import Campaign, from_folder, from_store
+from abbe.service.workflows.report_discovery import discovery_report
+from abbe.service.workflows.report_done import push_report, verification_report
+from abbe.service.workflows.report_measured import Measured, campaign_report, run_report
+from abbe.service.workflows.report_parts import Rules
+from abbe.service.workflows.report_table import table_said
+from abbe.service.workflows.report_then import of_then
 
 FORMS: dict[str, Callable[[Document], str | bytes]] = {
     ".pdf": document_pdf,

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.errors import StoreError
-from service.report.discovery_model import DiscoveryPage
-from service.report.document import Document, Figure, Picture, Sign, TextTable
-from service.report.numbers import NOT_AVAILABLE, plain
-from service.report.plots.gap import gap_bars, place_plot, trace_plot
-from service.storage.store import Store
-from service.workflows import report_parts as parts
-from service.workflows.campaign_folder import from_store
-from service.workflows.discovery_pages import discovery_page
-from service.workflows.discovery_states import taken_back
-from service.workflows.discovery_words import book_lines, rival_lines, unit
-from service.workflows.model_book import name_of
-from service.workflows.report_parts import Rules
-from service.workflows.thinned import thinned
+from abbe.service.errors import StoreError
+from abbe.service.report.discovery_model import DiscoveryPage
+from abbe.service.report.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.report.numbers import NOT_AVAILABLE, plain
+from abbe.service.report.plots.gap import gap_bars, place_plot, trace_plot
+from abbe.service.storage.store import Store
+from abbe.service.workflows import report_parts as parts
+from abbe.service.workflows.campaign_folder import from_store
+from abbe.service.workflows.discovery_pages import discovery_page
+from abbe.service.workflows.discovery_states import taken_back
+from abbe.service.workflows.discovery_words import book_lines, rival_lines, unit
+from abbe.service.workflows.model_book import name_of
+from abbe.service.workflows.report_parts import Rules
+from abbe.service.workflows.thinned import thinned
 
 SIGNS: dict[str, Sign] = {"ok": "ok", "open": "open", "bad": "bad"}
 

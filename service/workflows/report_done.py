@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from models.compensation.tables import NineTables
-from service.errors import StoreError, TableMismatch
-from service.push.book import read_entries
-from service.push.entries import WORD, Entry, JournalBroken, check_chain, facts
-from service.push.states import TERMINAL, State
-from service.report.document import Document, Figure, Picture, Sign, TextTable
-from service.report.model import TableCurve
-from service.report.plots.tables import table_plot
-from service.storage.records import VerificationRecord
-from service.storage.store import Store
-from service.workflows import report_parts as parts
-from service.workflows.campaign_folder import Campaign, from_store
-from service.workflows.iso_report import Evaluated, evaluate
-from service.workflows.push_history import push_log
-from service.workflows.report_parts import Doc, Rules
-from service.workflows.report_table import table_said
-from service.workflows.report_then import of_then
-from service.workflows.tables import tables_from_image
-from service.workflows.verify import COVERAGE
+from abbe.models.compensation.tables import NineTables
+from abbe.service.errors import StoreError, TableMismatch
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import WORD, Entry, JournalBroken, check_chain, facts
+from abbe.service.push.states import TERMINAL, State
+from abbe.service.report.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.report.model import TableCurve
+from abbe.service.report.plots.tables import table_plot
+from abbe.service.storage.records import VerificationRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows import report_parts as parts
+from abbe.service.workflows.campaign_folder import Campaign, from_store
+from abbe.service.workflows.iso_report import Evaluated, evaluate
+from abbe.service.workflows.push_history import push_log
+from abbe.service.workflows.report_parts import Doc, Rules
+from abbe.service.workflows.report_table import table_said
+from abbe.service.workflows.report_then import of_then
+from abbe.service.workflows.tables import tables_from_image
+from abbe.service.workflows.verify import COVERAGE
 
 MANY = 10**6
 AXES = "XYZ"

@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from models.machine import AXES
-from models.solvers.observations import nominal_reading
-from models.verification import helix_figure
-from service.errors import AbbeError, MeasurementFault
-from service.report.document import Document, Figure, Picture, Sign, TextTable
-from service.report.model import ParameterRow, PolarTrace, ResidualSeries
-from service.report.numbers import plain
-from service.report.plots.bars import uncertainty_bars
-from service.report.plots.polar import polar_plot
-from service.report.plots.residuals import residual_plot
-from service.runs.coverage import not_judged
-from service.runs.helix_axis import about_axis, path_axis
-from service.runs.observations import run_data
-from service.workflows import report_parts as parts
-from service.workflows.campaign_folder import Campaign
-from service.workflows.iso_report import Evaluated, evaluate
-from service.workflows.report_parts import Doc, Rules
-from service.workflows.report_table import NOTHING_SAID, TableSaid
-from service.workflows.verify import DIAGONALS, Verdict, figure_rows, figures
+from abbe.models.machine import AXES
+from abbe.models.solvers.observations import nominal_reading
+from abbe.models.verification import helix_figure
+from abbe.service.errors import AbbeError, MeasurementFault
+from abbe.service.report.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.report.model import ParameterRow, PolarTrace, ResidualSeries
+from abbe.service.report.numbers import plain
+from abbe.service.report.plots.bars import uncertainty_bars
+from abbe.service.report.plots.polar import polar_plot
+from abbe.service.report.plots.residuals import residual_plot
+from abbe.service.runs.coverage import not_judged
+from abbe.service.runs.helix_axis import about_axis, path_axis
+from abbe.service.runs.observations import run_data
+from abbe.service.workflows import report_parts as parts
+from abbe.service.workflows.campaign_folder import Campaign
+from abbe.service.workflows.iso_report import Evaluated, evaluate
+from abbe.service.workflows.report_parts import Doc, Rules
+from abbe.service.workflows.report_table import NOTHING_SAID, TableSaid
+from abbe.service.workflows.verify import DIAGONALS, Verdict, figure_rows, figures
 
 SOLUTION_SIGNS: dict[str, Sign] = {"good": "ok", "usable with care": "open", "mostly assumption": "bad"}
 NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine) states limits."

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from service.report.document import Figure, Instrument, Sign
-from service.report.numbers import finite, plain, tidy
-from service.workflows.provenance import run_digest, versions
-from service.workflows.verify import Verdict, judge, overall
+from abbe.service.report.document import Figure, Instrument, Sign
+from abbe.service.report.numbers import finite, plain, tidy
+from abbe.service.workflows.provenance import run_digest, versions
+from abbe.service.workflows.verify import Verdict, judge, overall
 
 Doc = dict[str, Any]
 NAMES = {"ballbar": "telescoping ball-bar", "laser": "laser displacement meter"}
@@ -134,7 +134,7 @@ def provenance(digest: str, made: Mapping[str, str] | None = None) -> dict[str, 
 
 
 def judged(rows: Mapping[str, tuple[float, float]], rules: Rules, group: str) -> tuple[list[Figure], Verdict | None]:
-    """Figures of a verification (`service.workflows.verify.figure_rows`) with their limits, and the verdict on all that have one."""
+    """Figures of a verification (`abbe.service.workflows.verify.figure_rows`) with their limits, and the verdict on all that have one."""
     figures, verdicts = [], []
     for key, (value, u) in rows.items():
         limit = rules.limits_um.get(key)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.report.document import Sign
-from service.storage.store import Store
-from service.workflows.measured_with import KIND_AT, NO_CORRECTION, Images, images_of
-from service.workflows.report_parts import Doc
-from service.workflows.table_gate import STRANGE
-from service.workflows.unverified import Known, known_tables
+from abbe.service.report.document import Sign
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measured_with import KIND_AT, NO_CORRECTION, Images, images_of
+from abbe.service.workflows.report_parts import Doc
+from abbe.service.workflows.table_gate import STRANGE
+from abbe.service.workflows.unverified import Known, known_tables
 
 WORD = "Unverified table"
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
-from service.report.document import Document
-from service.storage.store import Store
-from service.workflows.verified_by import VerifiedBy, verified_by
+from abbe.service.report.document import Document
+from abbe.service.storage.store import Store
+from abbe.service.workflows.verified_by import VerifiedBy, verified_by
 
 NOT_JUDGED = "Not judged"
 

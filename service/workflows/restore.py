@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from service.audit.book import AuditBook, files_of, sqlite_base, this_account
-from service.audit.chain import Event
-from service.capture.settings import segment_folder
-from service.errors import BackupRefused
-from service.storage.copying import is_locked, prove_copy, sync_file, users_of
-from service.storage.migrate import known_revisions
-from service.storage.store import Store
-from service.workflows.backup import Source, sqlite_file
-from service.workflows.backup_files import CAPTURE, DATABASE, HEADS, KEY, Backup, audit_faults, read_backup
+from abbe.service.audit.book import AuditBook, files_of, sqlite_base, this_account
+from abbe.service.audit.chain import Event
+from abbe.service.capture.settings import segment_folder
+from abbe.service.errors import BackupRefused
+from abbe.service.storage.copying import is_locked, prove_copy, sync_file, users_of
+from abbe.service.storage.migrate import known_revisions
+from abbe.service.storage.store import Store
+from abbe.service.workflows.backup import Source, sqlite_file
+from abbe.service.workflows.backup_files import CAPTURE, DATABASE, HEADS, KEY, Backup, audit_faults, read_backup
 
 BESIDE = ("", "-journal", "-wal", "-shm")
 """A SQLite file and what belongs to it: without its journal a database that was cut off is damaged."""

@@ -8,21 +8,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.errors import DriverError
-from service.devices.session import Session
-from service.errors import UnsafeToMove, WorldChanged
-from service.runs.codec import decode_json
-from service.runs.columns import LASER_CHANNEL
-from service.sequences.interlocks import BEAM_BITS, MOVING, check_interlocks, check_ours
-from service.sequences.journal import BEGUN, ENDED, HAND, RUN
-from service.sequences.preconditions import Expected, check_expected
-from service.sequences.rewind import anew, remounted
-from service.sequences.steps import CampaignPlan
-from service.site import Site
-from service.storage.owner import Owner
-from service.storage.records import RUNNING, CampaignRecord, CheckpointRecord, Doc
-from service.storage.store import Store
-from service.workflows.campaign_run import (
+from abbe.drivers.errors import DriverError
+from abbe.service.devices.session import Session
+from abbe.service.errors import UnsafeToMove, WorldChanged
+from abbe.service.runs.codec import decode_json
+from abbe.service.runs.columns import LASER_CHANNEL
+from abbe.service.sequences.interlocks import BEAM_BITS, MOVING, check_interlocks, check_ours
+from abbe.service.sequences.journal import BEGUN, ENDED, HAND, RUN
+from abbe.service.sequences.preconditions import Expected, check_expected
+from abbe.service.sequences.rewind import anew, remounted
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site
+from abbe.service.storage.owner import Owner
+from abbe.service.storage.records import RUNNING, CampaignRecord, CheckpointRecord, Doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_run import (
     Confirm,
     Item,
     Resumed,

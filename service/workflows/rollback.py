@@ -10,23 +10,23 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 
-from drivers.api import Controller
-from drivers.cnc.tables import crc32
-from service.errors import TableMismatch, TableRefused
-from service.push.book import read_entries
-from service.push.entries import Entry, Journal, facts
-from service.push.operations import Verdict
-from service.push.states import TERMINAL, State
-from service.sequences.control import Control
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.base_table import Base, read_base
-from service.workflows.commission import check_commissioned
-from service.workflows.proposals import by_whom
-from service.workflows.push_history import KIND, ended_as, last_kept, pushes_of
-from service.workflows.pushing import Pushed, Pushing, Questions, WantedAgain
-from service.workflows.recover import recover
-from service.workflows.unverified import unverified_crcs
+from abbe.drivers.api import Controller
+from abbe.drivers.cnc.tables import crc32
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import Entry, Journal, facts
+from abbe.service.push.operations import Verdict
+from abbe.service.push.states import TERMINAL, State
+from abbe.service.sequences.control import Control
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import Base, read_base
+from abbe.service.workflows.commission import check_commissioned
+from abbe.service.workflows.proposals import by_whom
+from abbe.service.workflows.push_history import KIND, ended_as, last_kept, pushes_of
+from abbe.service.workflows.pushing import Pushed, Pushing, Questions, WantedAgain
+from abbe.service.workflows.recover import recover
+from abbe.service.workflows.unverified import unverified_crcs
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
+from abbe.models.arrays import F1, F2
 
 Doc = dict[str, Any]
 Distance = Callable[[F2], float]

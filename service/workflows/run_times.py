@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.workflows.finding import Finding
+from abbe.service.workflows.finding import Finding
 
 Doc = dict[str, Any]
 FASTEST = 0.2
@@ -27,7 +27,7 @@ def times(runs: Sequence[Doc]) -> list[Finding]:
 
 
 def _clocks(run: Doc) -> list[Finding]:
-    """What the clocks of a run that was measured here contradict each other in (service.runs.clocks)."""
+    """What the clocks of a run that was measured here contradict each other in (abbe.service.runs.clocks)."""
     trouble = (run.get("timing") or {}).get("trouble")
     return [Finding(run["run_id"], str(trouble), "look at the sync cable and the links, then measure it again", False)] if trouble else []
 

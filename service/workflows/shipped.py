@@ -7,11 +7,11 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Protocol
 
-from models.machine import Machine
-from service.errors import ConfigError
-from service.sequences.campaigns import identification, quick_check, verification
-from service.sequences.recipe_file import read_recipe
-from service.sequences.steps import CampaignPlan
+from abbe.models.machine import Machine
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.campaigns import identification, quick_check, verification
+from abbe.service.sequences.recipe_file import read_recipe
+from abbe.service.sequences.steps import CampaignPlan
 
 IDENTIFICATION = "identification"
 """The full campaign: no check, and only with somebody who mounts its set-ups."""

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
-from models.discovery.baseline import baseline_of
-from models.discovery.case import CaseRun, Role
-from models.discovery.prediction import left_together, predictions, solve
-from models.discovery.scene import scene_of
-from service.workflows.discover import Job
-from service.workflows.discovery_doc import noise_mm_of
-from service.workflows.packed import packed
+from abbe.models.arrays import F1
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.case import CaseRun, Role
+from abbe.models.discovery.prediction import left_together, predictions, solve
+from abbe.models.discovery.scene import scene_of
+from abbe.service.workflows.discover import Job
+from abbe.service.workflows.discovery_doc import noise_mm_of
+from abbe.service.workflows.packed import packed
 
 FORMAT = "abbe-simulation/1"
 ROLES: tuple[Role, ...] = ("identify", "holdout")

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import F1, F2
-from models.uncertainty.coverage import apart_from_zero
-from models.uncertainty.known_field import KnownField, field_map
-from models.volumetric import volume_grid
-from service.errors import NotObservable, Unusable
-from service.site import machine_from_doc
-from service.storage.records import SolutionRecord
-from service.storage.store import Store
-from service.workflows.deviations import standard_uncertainty_mm
-from service.workflows.stored_prediction import stored_prediction
+from abbe.models.arrays import F1, F2
+from abbe.models.uncertainty.coverage import apart_from_zero
+from abbe.models.uncertainty.known_field import KnownField, field_map
+from abbe.models.volumetric import volume_grid
+from abbe.service.errors import NotObservable, Unusable
+from abbe.service.site import machine_from_doc
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.deviations import standard_uncertainty_mm
+from abbe.service.workflows.stored_prediction import stored_prediction
 
 HIDDEN = "not observable"
 UM = 1e3

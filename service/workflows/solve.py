@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.paths.lines import DIAGONALS, step_diagonal
-from models.solvers.helix import HelixSolution, fit_run
-from models.solvers.joint import JointSolution, Model, implausible, solve_joint
-from models.solvers.observations import RunData, nominal_reading
-from models.solvers.observe import bar_normals, setup_unknowns
-from models.solvers.priors import U_WAVELENGTH, Priors
-from models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
-from service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
-from service.runs.observations import bar_noise_mm, run_data
-from service.site import Site
-from service.workflows.campaign_checks import check_files, check_readings, refuse
-from service.workflows.copied_runs import copies
-from service.workflows.finding import Finding
-from service.workflows.provenance import measured_digest, taken_from
+from abbe.models.paths.lines import DIAGONALS, step_diagonal
+from abbe.models.solvers.helix import HelixSolution, fit_run
+from abbe.models.solvers.joint import JointSolution, Model, implausible, solve_joint
+from abbe.models.solvers.observations import RunData, nominal_reading
+from abbe.models.solvers.observe import bar_normals, setup_unknowns
+from abbe.models.solvers.priors import U_WAVELENGTH, Priors
+from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
+from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
+from abbe.service.runs.observations import bar_noise_mm, run_data
+from abbe.service.site import Site
+from abbe.service.workflows.campaign_checks import check_files, check_readings, refuse
+from abbe.service.workflows.copied_runs import copies
+from abbe.service.workflows.finding import Finding
+from abbe.service.workflows.provenance import measured_digest, taken_from
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from models.geometry.bases import term_values
-from models.machine import AXES
-from models.solvers.joint import JointSolution
-from service.report.model import SETUP_NOTE, ParameterRow, ResidualSeries, RunRow
-from service.report.solution_model import BudgetRow, Correlations, MotionCurve, MotionShare, Slice, SolutionPage, TableLine
-from service.site import Site
-from service.workflows.demo_report import contributions, parameter_rows
-from service.workflows.solve_report import HIDDEN_NOTE, Account, judged, noise_lines, outlier_lines, residual_lines, worst_line
-from service.workflows.solve_verdict import layout_line
+from abbe.models.geometry.bases import term_values
+from abbe.models.machine import AXES
+from abbe.models.solvers.joint import JointSolution
+from abbe.service.report.model import SETUP_NOTE, ParameterRow, ResidualSeries, RunRow
+from abbe.service.report.solution_model import BudgetRow, Correlations, MotionCurve, MotionShare, Slice, SolutionPage, TableLine
+from abbe.service.site import Site
+from abbe.service.workflows.demo_report import contributions, parameter_rows
+from abbe.service.workflows.solve_report import HIDDEN_NOTE, Account, judged, noise_lines, outlier_lines, residual_lines, worst_line
+from abbe.service.workflows.solve_verdict import layout_line
 
 CURVE_NODES = 61
 SLICE_NODES = 15
@@ -31,7 +31,7 @@ def solution_page(told: Account, doc: dict[str, Any], site: Site, made: str) -> 
     ----------
     told : Account
     doc : dict
-        `service.workflows.solve_report.solution_doc` of it, with the campaign's name.
+        `abbe.service.workflows.solve_report.solution_doc` of it, with the campaign's name.
     site : Site
     made : str
         When, as text.

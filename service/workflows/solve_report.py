@@ -7,22 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F2
-from models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
-from models.solvers.joint import JointSolution
-from models.solvers.observability import Observability, observability_of
-from models.solvers.robust import Outlier
-from models.uncertainty.budget import Budget, BudgetLine, budget_over, worst_point
-from models.uncertainty.frame import volume_frame
-from models.uncertainty.mask import CompensableMask, compensable_mask
-from models.uncertainty.prediction import Prediction, predict_deviation
-from models.uncertainty.sources import ErrorSources, error_sources
-from models.volumetric import volume_grid
-from service.workflows.measured_with import distinct
-from service.workflows.provenance import campaign_digest, machine_digest, versions
-from service.workflows.solve import HELIX_NOTE, STEP_NOTE, Solved
-from service.workflows.solve_verdict import Verdict, layout_line, verdict
-from service.workflows.stored_prediction import prediction_doc
+from abbe.models.arrays import F2
+from abbe.models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability import Observability, observability_of
+from abbe.models.solvers.robust import Outlier
+from abbe.models.uncertainty.budget import Budget, BudgetLine, budget_over, worst_point
+from abbe.models.uncertainty.frame import volume_frame
+from abbe.models.uncertainty.mask import CompensableMask, compensable_mask
+from abbe.models.uncertainty.prediction import Prediction, predict_deviation
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.volumetric import volume_grid
+from abbe.service.workflows.measured_with import distinct
+from abbe.service.workflows.provenance import campaign_digest, machine_digest, versions
+from abbe.service.workflows.solve import HELIX_NOTE, STEP_NOTE, Solved
+from abbe.service.workflows.solve_verdict import Verdict, layout_line, verdict
+from abbe.service.workflows.stored_prediction import prediction_doc
 
 FORMAT = "abbe-solution/1"
 HIDDEN_NOTE = "not observable by itself: for this tool only"
@@ -111,7 +111,7 @@ def solution_doc(solved: Solved | Account) -> dict[str, Any]:
 
 
 def judged(found: Account) -> Verdict:
-    """The verdict on a solution (`service.workflows.solve_verdict`)."""
+    """The verdict on a solution (`abbe.service.workflows.solve_verdict`)."""
     flagged = len({t.run for t in found.joint.residual_tests if t.flagged})
     return verdict(found.observability.number, found.prediction, found.mask.share, flags=len(found.solved.flags), not_noise=flagged)
 

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F2
-from models.compensation.achievable import achievable
-from models.compensation.grid import GridTable, compensable_nodes, grid_table, nodes_mm, quantise_grid
-from models.uncertainty.budget import worst_point
-from models.uncertainty.campaign_trials import LIMITS, campaign_trials
-from models.uncertainty.frame import volume_frame
-from models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
-from service.errors import TableRefused
-from service.workflows.solve_report import Account, judged
+from abbe.models.arrays import F2
+from abbe.models.compensation.achievable import achievable
+from abbe.models.compensation.grid import GridTable, compensable_nodes, grid_table, nodes_mm, quantise_grid
+from abbe.models.uncertainty.budget import worst_point
+from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
+from abbe.models.uncertainty.frame import volume_frame
+from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
+from abbe.service.errors import TableRefused
+from abbe.service.workflows.solve_report import Account, judged
 
 Say = Callable[[str], None]
 GRID_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,u_dx_um,u_dy_um,u_dz_um,compensated"

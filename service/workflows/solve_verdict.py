@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.solvers.observability_volume import GOOD, USABLE, Number
-from models.uncertainty.prediction import Prediction
+from abbe.models.solvers.observability_volume import GOOD, USABLE, Number
+from abbe.models.uncertainty.prediction import Prediction
 
 WORDS = ("mostly assumption", "usable with care", "good")
 ENOUGH, HALF = 0.8, 0.5

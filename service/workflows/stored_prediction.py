@@ -1,7 +1,7 @@
 """The coefficients of a solution with all their uncertainty, as stored: its predictions can be made again from them.
 
 Deviation at points = field @ coefficients, covariance = field @ covariance @ field^T, where field holds the deviation per unit of each term
-(`models.uncertainty.frame.field`, with the machine's tool and the frame asked for).
+(`abbe.models.uncertainty.frame.field`, with the machine's tool and the frame asked for).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.bases import Term
-from models.uncertainty.sources import ErrorSources
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term
+from abbe.models.uncertainty.sources import ErrorSources
 
 ENCODING = "base64 of float64, little endian, lower triangle by rows"
 

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.api import CompStatus, Controller
-from service.clock import SystemClock
-from service.errors import TableMismatch
-from service.push.book import StoreBook
-from service.push.entries import Doc
-from service.push.staging import SEALED
-from service.push.states import State
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.unverified import Fine, Known, Pushed, known_tables
+from abbe.drivers.api import CompStatus, Controller
+from abbe.service.clock import SystemClock
+from abbe.service.errors import TableMismatch
+from abbe.service.push.book import StoreBook
+from abbe.service.push.entries import Doc
+from abbe.service.push.staging import SEALED
+from abbe.service.push.states import State
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.unverified import Fine, Known, Pushed, known_tables
 
 LOOK = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
 STRANGE = "a table that this database did not push"

@@ -12,20 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.compensation.smooth import smooth_of
-from models.compensation.tables import NineTables
-from models.solvers.in_force import InForce
-from models.solvers.joint import solve_joint
-from service.errors import TableMismatch
-from service.runs.observations import beam_of, run_data
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.campaign_checks import check_files, refuse
-from service.workflows.campaign_folder import Campaign
-from service.workflows.measured_with import images_of
-from service.workflows.provenance import changed
-from service.workflows.tables import tables_from_image
+from abbe.models.arrays import F1, F2
+from abbe.models.compensation.smooth import smooth_of
+from abbe.models.compensation.tables import NineTables
+from abbe.models.solvers.in_force import InForce
+from abbe.models.solvers.joint import solve_joint
+from abbe.service.errors import TableMismatch
+from abbe.service.runs.observations import beam_of, run_data
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_checks import check_files, refuse
+from abbe.service.workflows.campaign_folder import Campaign
+from abbe.service.workflows.measured_with import images_of
+from abbe.service.workflows.provenance import changed
+from abbe.service.workflows.tables import tables_from_image
 
 Runs = list[dict[str, Any]]
 NOTHING = InForce(np.zeros_like)

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from service.errors import TableRefused
-from service.push.book import read_entries
-from service.push.entries import WORD, Entry, Journal, facts
-from service.push.states import State
-from service.storage.store import Store
-from service.workflows.push_history import KIND, last_kept, pushes_of, wanted_by
-from service.workflows.push_word import BACK, Names, outcome_of
+from abbe.service.errors import TableRefused
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import WORD, Entry, Journal, facts
+from abbe.service.push.states import State
+from abbe.service.storage.store import Store
+from abbe.service.workflows.push_history import KIND, last_kept, pushes_of, wanted_by
+from abbe.service.workflows.push_word import BACK, Names, outcome_of
 
 Doc = dict[str, Any]
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
-from drivers.cnc.tables import TableImage
-from models.compensation.tables import NineTables
-from models.machine import AXES
-from service.errors import TableMismatch, TableRefused
-from service.push.limits import PushLimits
+from abbe.drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
+from abbe.drivers.cnc.tables import TableImage
+from abbe.models.compensation.tables import NineTables
+from abbe.models.machine import AXES
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.push.limits import PushLimits
 
 KIND_NINE = 1
 

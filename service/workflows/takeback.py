@@ -9,11 +9,11 @@ import asyncio
 import secrets
 from typing import Literal
 
-from drivers.api import Controller
-from drivers.errors import DriverError
-from service.errors import TableMismatch
-from service.storage.records import Doc
-from service.storage.store import Store
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import DriverError
+from abbe.service.errors import TableMismatch
+from abbe.service.storage.records import Doc
+from abbe.service.storage.store import Store
 
 LEASE_MS = 60_000
 BACK_S = 10.0

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from models.effects.effect import Effect
-from service.runs.cases import case_of
-from service.storage.store import Store
-from service.workflows.campaign_folder import Campaign
-from service.workflows.discovery_engine import catalogue
-from service.workflows.known_effects import applies, readings_of
-from service.workflows.model_book import current, no_table_lines
-from service.workflows.provenance import changed, machine_digest
-from service.workflows.table_out import TABLE_OUT, TableThen, as_left
+from abbe.models.effects.effect import Effect
+from abbe.service.runs.cases import case_of
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import Campaign
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.known_effects import applies, readings_of
+from abbe.service.workflows.model_book import current, no_table_lines
+from abbe.service.workflows.provenance import changed, machine_digest
+from abbe.service.workflows.table_out import TABLE_OUT, TableThen, as_left
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class TakenOut:
 
     ``labels``: the effects that were taken out of the readings; ``lines``: every effect that a table cannot take out, with its remedy, or
     why the book was not used; ``version``: of the model, None without a book; ``in_force``: the table whose side effects were taken out
-    (`service.workflows.table_out.as_left`), None for none; ``not_taken``: why those of a table are still in the readings, empty if they are
-    not.
+    (`abbe.service.workflows.table_out.as_left`), None for none; ``not_taken``: why those of a table are still in the readings, empty if
+    they are not.
     """
 
     campaign: Campaign

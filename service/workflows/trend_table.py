@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from models.trend import CUSUM_H, CUSUM_K, Forecast, Trend, average_run_length, trend
-from service.storage.records import VerificationRecord
+from abbe.models.trend import CUSUM_H, CUSUM_K, Forecast, Trend, average_run_length, trend
+from abbe.service.storage.records import VerificationRecord
 
 DAY_S = 86400.0
 COVERAGE = 2.0

@@ -1,8 +1,8 @@
 """Which tables the journals of a database know, and which of them nothing has verified, whatever a machine is called.
 
-A control is known by its address alone (`service.devices.urls.control_of`), and a table carries a number drawn by lot: so the CRC in force
-is held against all journals, and nothing is built on a table that a push brought and that was neither kept nor vouched for. What is kept
-or vouched for on one control is so there only: the errors of another machine are others.
+A control is known by its address alone (`abbe.service.devices.urls.control_of`), and a table carries a number drawn by lot: so the CRC in
+force is held against all journals, and nothing is built on a table that a push brought and that was neither kept nor vouched for. What is
+kept or vouched for on one control is so there only: the errors of another machine are others.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from service.push.entries import Entry
-from service.push.states import BEFORE_ACTIVATION, TERMINAL, State
-from service.storage.records import Doc, PushEntryRecord
-from service.storage.store import Store
+from abbe.service.push.entries import Entry
+from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, State
+from abbe.service.storage.records import Doc, PushEntryRecord
+from abbe.service.storage.store import Store
 
 How = Literal["verified", "accepted", "found in force"]
 Row = tuple[Hashable, str, Doc]

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 
-from service.errors import StoreError
-from service.push.book import read_entries
-from service.push.entries import Entry, JournalBroken, check_chain, facts
-from service.push.states import State
-from service.storage.records import Doc, VerificationRecord
-from service.storage.store import Store
-from service.workflows.push_history import KIND, wanted_by
+from abbe.service.errors import StoreError
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import Entry, JournalBroken, check_chain, facts
+from abbe.service.push.states import State
+from abbe.service.storage.records import Doc, VerificationRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.push_history import KIND, wanted_by
 
 LOOKED = 20
 """So many of the latest checks are looked at for one that measured something."""

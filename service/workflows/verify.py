@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from models.verification import Figure, diagonal_figure, helix_figure
-from service.errors import MeasurementFault, TableRefused
-from service.runs.coverage import check_judged
-from service.runs.observations import run_data
+from abbe.models.verification import Figure, diagonal_figure, helix_figure
+from abbe.service.errors import MeasurementFault, TableRefused
+from abbe.service.runs.coverage import check_judged
+from abbe.service.runs.observations import run_data
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
@@ -57,7 +57,7 @@ def figures(runs: list[dict[str, Any]]) -> Figures:
     Raises
     ------
     MeasurementFault
-        Not all four body diagonals are there, or a run is not judged (`service.runs.coverage`) or has too few valid readings.
+        Not all four body diagonals are there, or a run is not judged (`abbe.service.runs.coverage`) or has too few valid readings.
     """
     diagonals, helix = {}, None
     for run in runs:

@@ -4,10 +4,10 @@ another machine's by now.
 
 from __future__ import annotations
 
-from drivers.api import Controller
-from service.errors import TableMismatch
-from service.push.entries import Journal, facts
-from service.site import Site
+from abbe.drivers.api import Controller
+from abbe.service.errors import TableMismatch
+from abbe.service.push.entries import Journal, facts
+from abbe.service.site import Site
 
 
 async def is_own(controller: Controller, site: Site, journal: Journal) -> bool:

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.links.shielded import run_to_end
-from service.children import python_words
-from service.errors import AbbeError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.children import python_words
+from abbe.service.errors import AbbeError
 
 READY_S = 30.0
 STOP_S = 3.0
@@ -48,7 +48,7 @@ async def running_world(args: list[str]) -> AsyncIterator[World]:
         It did not start; the child's own line says why.
     """
     process = await asyncio.create_subprocess_exec(
-        *python_words("simulators", *args, "--watch-stdin"),
+        *python_words("abbe.simulators", *args, "--watch-stdin"),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
@@ -101,7 +101,7 @@ async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
     WorldError
         It failed; the child's own line says why.
     """
-    words = python_words("simulators", "truth", *args, "--arrows")
+    words = python_words("abbe.simulators", "truth", *args, "--arrows")
     if bank is not None:
         words += ["--bank", str(bank)]
     process = await asyncio.create_subprocess_exec(

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import I64, B, F
-from simulators.scenario import Magnitudes
-from simulators.truth.draws import STREAM_BAR_NOISE, STREAM_CUP, Draws, generator
+from abbe.simulators.arrays import I64, B, F
+from abbe.simulators.scenario import Magnitudes
+from abbe.simulators.truth.draws import STREAM_BAR_NOISE, STREAM_CUP, Draws, generator
 
 RANGE_MM = 1.0
 MAX_RATE_HZ = 1000

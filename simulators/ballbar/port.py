@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from simulators.pseudo_serial import PseudoSerial
+from abbe.simulators.pseudo_serial import PseudoSerial
 
 BUFFER_BYTES = 65536
 BAUD = 460800

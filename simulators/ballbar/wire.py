@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.ballbar.device import MAX_RATE_HZ, OVERRUN, BallbarDevice, Samples, Settings
-from simulators.ballbar.ledger import CORRUPTED, SENT, SUPPRESSED, BoxLedger
-from simulators.ballbar.port import BytePort
+from abbe.simulators.ballbar.device import MAX_RATE_HZ, OVERRUN, BallbarDevice, Samples, Settings
+from abbe.simulators.ballbar.ledger import CORRUPTED, SENT, SUPPRESSED, BoxLedger
+from abbe.simulators.ballbar.port import BytePort
 
 SYNC_BYTES = b"\xa5\x5a"
 SAMPLE, INFO, ACK, SETTINGS = 0x01, 0x02, 0x03, 0x04

@@ -1,19 +1,19 @@
 """What a ball-bar and a laser would read on the true machine, run after run, without device protocols: for statistics over many machines.
 
-The formulas are those of `simulators.ballbar.device` and `simulators.laser.device`; the machine is `simulators.truth`.
+The formulas are those of `abbe.simulators.ballbar.device` and `abbe.simulators.laser.device`; the machine is `abbe.simulators.truth`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.laser.device import Mount
-from simulators.scenario import Scenario
-from simulators.truth.draws import UM, URAD, Draws, draw_machine, generator
-from simulators.truth.machine import Geometry, Machine
-from simulators.truth.play import Play
-from simulators.truth.surroundings import drift
+from abbe.simulators.arrays import F
+from abbe.simulators.laser.device import Mount
+from abbe.simulators.scenario import Scenario
+from abbe.simulators.truth.draws import UM, URAD, Draws, draw_machine, generator
+from abbe.simulators.truth.machine import Geometry, Machine
+from abbe.simulators.truth.play import Play
+from abbe.simulators.truth.surroundings import drift
 
 STREAM_SETUP, STREAM_NOISE, STREAM_LENGTH, STREAM_SCALE = range(20, 24)
 LEAD_IN_MM = 1.0

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from simulators.arrays import I64, F
+from abbe.simulators.arrays import I64, F
 
 BANK_WORDS = 4800
 HEADER_WORDS = 24

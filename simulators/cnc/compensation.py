@@ -2,7 +2,7 @@
 
 from enum import IntEnum
 
-from simulators.cnc import bank
+from abbe.simulators.cnc import bank
 
 
 class CompResult(IntEnum):

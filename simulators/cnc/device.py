@@ -5,11 +5,11 @@ from enum import IntEnum
 
 import numpy as np
 
-from simulators.arrays import B, F
-from simulators.cnc.compensation import Compensation
-from simulators.cnc.motion import Motion
-from simulators.cnc.timetable import Timetable
-from simulators.truth.machine import Geometry
+from abbe.simulators.arrays import B, F
+from abbe.simulators.cnc.compensation import Compensation
+from abbe.simulators.cnc.motion import Motion
+from abbe.simulators.cnc.timetable import Timetable
+from abbe.simulators.truth.machine import Geometry
 
 FIFO_SIZE = 8192
 _TOLERANCE_MM = 1e-9

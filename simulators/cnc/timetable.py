@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from simulators.arrays import F
+from abbe.simulators.arrays import F
 
 
 class Timetable:

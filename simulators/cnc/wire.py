@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from simulators.cnc.bank import BANK_WORDS, LSB_NM
-from simulators.cnc.compensation import CompResult
-from simulators.cnc.device import FIFO_SIZE, Controller, Hold, Result
-from simulators.cnc.log import HOLDS, Command, TableAccess
+from abbe.simulators.cnc.bank import BANK_WORDS, LSB_NM
+from abbe.simulators.cnc.compensation import CompResult
+from abbe.simulators.cnc.device import FIFO_SIZE, Controller, Hold, Result
+from abbe.simulators.cnc.log import HOLDS, Command, TableAccess
 
 MAP_VERSION = 1
 UNIT_MM = 1e-5  # positions count 10 nm

@@ -3,7 +3,7 @@
 import struct
 from dataclasses import dataclass
 
-from simulators.modbus_wire import RegisterMap
+from abbe.simulators.modbus_wire import RegisterMap
 
 MBAP, RTU = "mbap", "rtu"
 READS, WRITES = (1, 2, 3, 4), (5, 6, 15, 16)

@@ -10,9 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from simulators.faults.modbus_frames import MBAP, RTU, Cutter
-from simulators.faults.modbus_toxics import Act, Toxics
-from simulators.faults.scenario import Fault, FaultScenario, load
+from abbe.simulators.faults.modbus_frames import MBAP, RTU, Cutter
+from abbe.simulators.faults.modbus_toxics import Act, Toxics
+from abbe.simulators.faults.scenario import Fault, FaultScenario, load
 
 _CONNECTION_KINDS = ("accept_then_close", "one_socket", "kick_oldest")
 _RESET = struct.pack("ii", 1, 0)  # linger for 0 s: closing sends RST
@@ -178,7 +178,7 @@ def refusing(times: int = 0) -> FaultScenario:
 
 
 def main() -> None:
-    """Run a proxy until it is interrupted: ``python -m simulators.faults.modbus_proxy 127.0.0.1:15020 faults.toml``."""
+    """Run a proxy until it is interrupted: ``python -m abbe.simulators.faults.modbus_proxy 127.0.0.1:15020 faults.toml``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("device", help="host:port of the Modbus device")
     parser.add_argument("scenario", type=Path, help="faults as TOML, see simulators/faults/scenario.py")

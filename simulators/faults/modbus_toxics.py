@@ -35,8 +35,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from simulators.faults.modbus_frames import READS, Frame, parts
-from simulators.faults.scenario import Fault, FaultScenario
+from abbe.simulators.faults.modbus_frames import READS, Frame, parts
+from abbe.simulators.faults.scenario import Fault, FaultScenario
 
 SORTS = ("any", "read", "write")
 _BEFORE = ("drop_request", "exception", "fin_before", "rst_before", "black_hole")

@@ -3,11 +3,11 @@
 import asyncio
 from pathlib import Path
 
-from simulators.faults.modbus_frames import RTU, Cutter, Frame, answer, parts
-from simulators.faults.modbus_toxics import Act, Toxics
-from simulators.faults.scenario import FaultScenario
-from simulators.modbus_wire import RegisterMap
-from simulators.pseudo_serial import PseudoSerial
+from abbe.simulators.faults.modbus_frames import RTU, Cutter, Frame, answer, parts
+from abbe.simulators.faults.modbus_toxics import Act, Toxics
+from abbe.simulators.faults.scenario import FaultScenario
+from abbe.simulators.modbus_wire import RegisterMap
+from abbe.simulators.pseudo_serial import PseudoSerial
 
 BAUD = 115200
 

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from simulators.ballbar.wire import SAMPLE, SYNC_BYTES, encode
+from abbe.simulators.ballbar.wire import SAMPLE, SYNC_BYTES, encode
 
 GARBAGE = ("random", "ones", "sync", "header")
 _SAMPLE = struct.Struct("<IQiH")

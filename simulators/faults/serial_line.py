@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from simulators.ballbar.port import BUFFER_BYTES, Received
-from simulators.faults.serial_uart import Uart, heard
-from simulators.pseudo_serial import PseudoSerial
+from abbe.simulators.ballbar.port import BUFFER_BYTES, Received
+from abbe.simulators.faults.serial_uart import Uart, heard
+from abbe.simulators.pseudo_serial import PseudoSerial
 
 Spoil = Callable[[bytes], Iterable[bytes]]
 """Honest bytes to the pieces that arrive, in order; every piece is written by itself."""

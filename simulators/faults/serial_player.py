@@ -1,4 +1,5 @@
-"""Plays a scenario of faults (see `simulators.faults.scenario`) on a serial line; events are the frames that the box sends, counted from 0.
+"""Plays a scenario of faults (see `abbe.simulators.faults.scenario`) on a serial line; events are the frames that the box sends, counted
+from 0.
 
 ==========  ==========================================================================================
 kind        what happens at the frames that it hits
@@ -18,9 +19,9 @@ import asyncio
 import random
 from collections.abc import Callable, Iterator
 
-from simulators.faults.scenario import Fault, FaultScenario
-from simulators.faults.serial_bytes import burst, cut, flipped, garbage
-from simulators.faults.serial_line import FaultyLine
+from abbe.simulators.faults.scenario import Fault, FaultScenario
+from abbe.simulators.faults.serial_bytes import burst, cut, flipped, garbage
+from abbe.simulators.faults.serial_line import FaultyLine
 
 Change = Callable[[bytes, Fault, random.Random], bytes]
 _CHANGES: dict[str, Change] = {

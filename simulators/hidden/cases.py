@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden import drive, instrument, outside, structure, thermal
-from simulators.hidden.draws import CATALOGUE, GEOMETRY, OUTSIDE, RANDOM, TERMS, Setting, draw_hidden, draw_setting
-from simulators.hidden.effect import Hidden
-from simulators.hidden.plans import Run, runs_of
-from simulators.hidden.projection import Projector, projector
-from simulators.hidden.rig import BentMachine, PerfectMachine, Rig
-from simulators.hidden.rivals import Scene, indistinct
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden import drive, instrument, outside, structure, thermal
+from abbe.simulators.hidden.draws import CATALOGUE, GEOMETRY, OUTSIDE, RANDOM, TERMS, Setting, draw_hidden, draw_setting
+from abbe.simulators.hidden.effect import Hidden
+from abbe.simulators.hidden.plans import Run, runs_of
+from abbe.simulators.hidden.projection import Projector, projector
+from abbe.simulators.hidden.rig import BentMachine, PerfectMachine, Rig
+from abbe.simulators.hidden.rivals import Scene, indistinct
 
 ALL_EFFECTS = (drive, instrument, outside, structure, thermal)
 """Imported so that they stand in the book."""

@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simulators.hidden.effect import AXES, Hidden
-from simulators.hidden.plans import Machinery
-from simulators.hidden.projection import Model
-from simulators.hidden.rig import Noise
-from simulators.scenario import MachineConfig, Magnitudes, Pair, Pivots, Scenario, Strokes
-from simulators.truth.draws import draw_machine
-from simulators.truth.machine import Geometry, Machine
+from abbe.simulators.hidden.effect import AXES, Hidden
+from abbe.simulators.hidden.plans import Machinery
+from abbe.simulators.hidden.projection import Model
+from abbe.simulators.hidden.rig import Noise
+from abbe.simulators.scenario import MachineConfig, Magnitudes, Pair, Pivots, Scenario, Strokes
+from abbe.simulators.truth.draws import draw_machine
+from abbe.simulators.truth.machine import Geometry, Machine
 
 KINDS = {"single": 75, "double": 30, "null": 50, "unknown": 18}
 PLAN_WEIGHTS = {"full": 88, "one_way": 20, "minimal": 18, "one_radius": 16, "ballbar": 12, "one_feed": 11, "laser": 8}

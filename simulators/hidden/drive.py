@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import MS, UM, Bend, Hidden, effect, middle
-from simulators.hidden.track import Track, carriage_mm
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import MS, UM, Bend, Hidden, effect, middle
+from abbe.simulators.hidden.track import Track, carriage_mm
 
 
 @effect("backlash")

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.track import Track
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.track import Track
 
 AXES = "XYZ"
 UM, URAD, MS, MRAD, PPM = 1e-3, 1e-6, 1e-3, 1e-3, 1e-6

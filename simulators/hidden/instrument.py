@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import MRAD, PPM, UM, URAD, Bend, Hidden, effect
-from simulators.hidden.track import Track
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import MRAD, PPM, UM, URAD, Bend, Hidden, effect
+from abbe.simulators.hidden.track import Track
 
 AIR_PPM_PER_K = -0.93
 """Warmer air is thinner: the light is longer in it than the laser was told, and it counts fewer waves on the same way."""

@@ -4,12 +4,12 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden import drive, outside, structure, thermal
-from simulators.hidden.effect import UM, Hidden, effect_names
-from simulators.hidden.instrument import AIR_PPM_PER_K, DEAD_PATH_MM, air_rise
-from simulators.hidden.track import NEVER_MM, Track
-from simulators.scenario import HiddenConfig, ScenarioError
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden import drive, outside, structure, thermal
+from abbe.simulators.hidden.effect import UM, Hidden, effect_names
+from abbe.simulators.hidden.instrument import AIR_PPM_PER_K, DEAD_PATH_MM, air_rise
+from abbe.simulators.hidden.track import NEVER_MM, Track
+from abbe.simulators.scenario import HiddenConfig, ScenarioError
 
 MOVES = frozenset({
     "backlash_position_dependent", "reversal_spike", "cyclic_error", "stick_slip", "vibration", "lateral_play", "nonrigid_bed",

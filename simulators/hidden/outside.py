@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from simulators.hidden.effect import UM, URAD, Bend, Hidden, effect
-from simulators.hidden.track import Track
+from abbe.simulators.hidden.effect import UM, URAD, Bend, Hidden, effect
+from abbe.simulators.hidden.track import Track
 
 
 @effect("clamp_slip")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simulators.scenario import DEFAULT_PATH, Scenario, load
+from abbe.simulators.scenario import DEFAULT_PATH, Scenario, load
 
 STREAM_PICK = 61
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.track import RUN_IN_MM, Track, dense_times, history
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.track import RUN_IN_MM, Track, dense_times, history
 
 PLANS = ("full", "one_way", "one_feed", "one_radius", "ballbar", "laser", "minimal")
 HELIX_N, CIRCLE_N, TURNS, TILT = 540, 420, 4.0, 0.95

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import Bend
-from simulators.hidden.plans import Run
-from simulators.hidden.rig import PerfectMachine, across
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import Bend
+from abbe.simulators.hidden.plans import Run
+from abbe.simulators.hidden.rig import PerfectMachine, across
 
 SPLINES = 12
 STEP = 1e-6

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import Bend, Hidden
-from simulators.hidden.plans import Run, standing
-from simulators.hidden.track import Track
-from simulators.truth.machine import Machine, rotate
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import Bend, Hidden
+from abbe.simulators.hidden.plans import Run, standing
+from abbe.simulators.hidden.track import Track
+from abbe.simulators.truth.machine import Machine, rotate
 
 STREAM_NOISE = 45
 

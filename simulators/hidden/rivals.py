@@ -6,12 +6,12 @@ from functools import partial
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import AXES
-from simulators.hidden.plans import Run
-from simulators.hidden.projection import Model, Projector, motion_columns, reference_mm, tilt_columns
-from simulators.hidden.rig import PerfectMachine
-from simulators.hidden.track import Track
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import AXES
+from abbe.simulators.hidden.plans import Run
+from abbe.simulators.hidden.projection import Model, Projector, motion_columns, reference_mm, tilt_columns
+from abbe.simulators.hidden.rig import PerfectMachine
+from abbe.simulators.hidden.track import Track
 
 INDISTINCT = 20.0
 """Chi-square by which the best trace of a rival falls short, below which nobody can tell it from the effect."""

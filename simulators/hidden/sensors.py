@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import Hidden
-from simulators.hidden.instrument import air_rise
-from simulators.hidden.thermal import rise, warmth
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import Hidden
+from abbe.simulators.hidden.instrument import air_rise
+from abbe.simulators.hidden.thermal import rise, warmth
 
 ROOM_C = 20.0
 SENSORS = ("x", "y", "z", "spindle", "air")

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import UM, URAD, Bend, Hidden, effect, middle
-from simulators.hidden.track import Track
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import UM, URAD, Bend, Hidden, effect, middle
+from abbe.simulators.hidden.track import Track
 
 
 @effect("lateral_play")

@@ -1,4 +1,4 @@
-"""``python -m simulators hidden-suite``: many sealed cases in the exchange format."""
+"""``python -m abbe.simulators hidden-suite``: many sealed cases in the exchange format."""
 
 import argparse
 import json
@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.cases import Case, make_case
-from simulators.hidden.draws import KINDS
-from simulators.hidden.effect import Hidden
-from simulators.hidden.instrument import DEAD_PATH_MM
-from simulators.hidden.plans import Run
-from simulators.hidden.sensors import temperatures
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.cases import Case, make_case
+from abbe.simulators.hidden.draws import KINDS
+from abbe.simulators.hidden.effect import Hidden
+from abbe.simulators.hidden.instrument import DEAD_PATH_MM
+from abbe.simulators.hidden.plans import Run
+from abbe.simulators.hidden.sensors import temperatures
 
 SENSOR_NOISE_C = 0.03
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.hidden.effect import PPM, UM, URAD, Bend, Hidden, effect, middle
-from simulators.hidden.track import Track
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden.effect import PPM, UM, URAD, Bend, Hidden, effect, middle
+from abbe.simulators.hidden.track import Track
 
 STEEL_PPM = 11.5
 

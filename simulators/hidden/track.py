@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
+from abbe.simulators.arrays import F
 
 Course = Callable[[F], F]
 """Campaign clock (n,) s to commanded positions (n, 3) mm; also a little before the start and after the end."""

@@ -6,10 +6,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.scenario import Magnitudes
-from simulators.truth.draws import STREAM_LASER_NOISE, STREAM_MIRROR, Draws, generator
-from simulators.truth.surroundings import Air, AirState
+from abbe.simulators.arrays import F
+from abbe.simulators.scenario import Magnitudes
+from abbe.simulators.truth.draws import STREAM_LASER_NOISE, STREAM_MIRROR, Draws, generator
+from abbe.simulators.truth.surroundings import Air, AirState
 
 RATE_HZ = 20
 

@@ -3,8 +3,8 @@
 import struct
 from collections.abc import Callable
 
-from simulators.arrays import F
-from simulators.laser.device import LaserDevice, LaserResult
+from abbe.simulators.arrays import F
+from abbe.simulators.laser.device import LaserDevice, LaserResult
 
 MAP_VERSION = 1
 _IDENTITY = struct.Struct(">ifHIIH")  # 0..9

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.scenario import AXES, Magnitudes, Pair, Scenario
-from simulators.truth.functions import FunctionSet, draw
+from abbe.simulators.arrays import F
+from abbe.simulators.scenario import AXES, Magnitudes, Pair, Scenario
+from abbe.simulators.truth.functions import FunctionSet, draw
 
 UM = 1e-3  # mm
 URAD = 1e-6  # rad

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.truth.machine import Machine
+from abbe.simulators.arrays import F
+from abbe.simulators.truth.machine import Machine
 
 Correction = Callable[[F], F]
 """Commanded positions (n, 3) mm to what is added to them (n, 3) mm."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
+from abbe.simulators.arrays import F
 
 FEATURES = 8
 BUMPS = 3

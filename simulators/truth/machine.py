@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.scenario import AXES, MachineConfig, parse_chain
-from simulators.truth.draws import Draws
+from abbe.simulators.arrays import F
+from abbe.simulators.scenario import AXES, MachineConfig, parse_chain
+from abbe.simulators.truth.draws import Draws
 
 
 class Geometry:

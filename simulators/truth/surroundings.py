@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulators.arrays import F
-from simulators.truth.draws import STREAM_AIR, Draws, generator
+from abbe.simulators.arrays import F
+from abbe.simulators.truth.draws import STREAM_AIR, Draws, generator
 
 
 def drift(draws: Draws, time_s: F) -> F:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
 from tests.bench import capture, discovery, discovery_case, history, parsers, reanalysis, report
 from tests.bench.case import CASES, make
 from tests.bench.contestants import EXTRA, FLOORS, OURS, PEERS, contestants

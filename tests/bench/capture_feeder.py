@@ -8,8 +8,8 @@ import tty
 
 import numpy as np
 
-from simulators.ballbar.device import Samples
-from simulators.ballbar.wire import IDENTIFY, START, Parser, encode_ack, encode_info, encode_samples
+from abbe.simulators.ballbar.device import Samples
+from abbe.simulators.ballbar.wire import IDENTIFY, START, Parser, encode_ack, encode_info, encode_samples
 from tests.bench.capture_case import device_us, reading_nm
 
 BLOCK = 1000

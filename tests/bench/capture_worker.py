@@ -14,16 +14,16 @@ from pathlib import Path
 import serial
 from sqlalchemy import BigInteger, Column, Integer, MetaData, Table, create_engine, insert, select
 
-from drivers.ballbar import driver
-from drivers.ballbar.driver import SerialBallBar
-from drivers.ballbar.frames import start_command
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import parse_url
-from service.capture.recorder import recording
-from service.capture.settings import CaptureSettings
-from service.clock import SystemClock
-from service.runs.codec import decode_bar
-from service.storage.store import Store
+from abbe.drivers.ballbar import driver
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.ballbar.frames import start_command
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import parse_url
+from abbe.service.capture.recorder import recording
+from abbe.service.capture.settings import CaptureSettings
+from abbe.service.clock import SystemClock
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage.store import Store
 from tests.bench.capture_case import SAMPLES, device_us, reading_nm
 
 COMMIT_S = 0.05

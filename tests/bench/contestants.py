@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from models.arrays import F2
-from models.geometry import fast, kernel
+from abbe.models.arrays import F2
+from abbe.models.geometry import fast, kernel
 from tests.bench import peers
 from tests.bench.case import Case
 

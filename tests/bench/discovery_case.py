@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from itertools import cycle, islice
 from pathlib import Path
 
-from models.discovery.case import Case
-from service.runs.cases import case_of
-from service.runs.exchange import read_folder
-from service.site import machine_from_doc
-from simulators.hidden import plans
-from simulators.hidden.cases import make_case
-from simulators.hidden.suite import write_case
+from abbe.models.discovery.case import Case
+from abbe.service.runs.cases import case_of
+from abbe.service.runs.exchange import read_folder
+from abbe.service.site import machine_from_doc
+from abbe.simulators.hidden import plans
+from abbe.simulators.hidden.cases import make_case
+from abbe.simulators.hidden.suite import write_case
 
 FIRST_SEED = 5_200_000
 """Chosen before anything was run, and used for nothing else: nobody tunes on the bench's cases."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models.effects.catalogue import CATALOGUE
+from abbe.models.effects.catalogue import CATALOGUE
 from tests.campaigns.discovery_judge import Tally, judge
 
 SCATTER = frozenset(e.name for e in CATALOGUE if e.kind != "mean")

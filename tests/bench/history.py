@@ -14,10 +14,10 @@ from pathlib import Path
 
 from sqlalchemy import func, select
 
-from service.scheduler.fleet import fleet
-from service.scheduler.store import ServiceStore
-from service.storage.tables import chunks, runs
-from service.workflows.trend_table import as_doc, trends
+from abbe.service.scheduler.fleet import fleet
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.tables import chunks, runs
+from abbe.service.workflows.trend_table import as_doc, trends
 from tests.bench.history_case import MONTH, START, History, build
 from tests.system.serve_bench import abbe
 

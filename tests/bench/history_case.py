@@ -14,8 +14,8 @@ from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import Connection, insert
 
-from service.scheduler.store import ServiceStore
-from service.storage.tables import campaigns, chunks, machines, runs, slots, verifications
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.tables import campaigns, chunks, machines, runs, slots, verifications
 
 START = datetime(2026, 10, 1, tzinfo=UTC)
 FIGURES = ("diagonal_ppp_um", "diagonal_npp_um", "diagonal_pnp_um", "diagonal_ppn_um", "body_diagonal_um", "helix_rms_um")

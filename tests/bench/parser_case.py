@@ -6,8 +6,8 @@ import struct
 import time
 from binascii import crc_hqx
 
-from drivers.api import BarSample
-from drivers.ballbar.frames import Bad, FrameDecoder
+from abbe.drivers.api import BarSample
+from abbe.drivers.ballbar.frames import Bad, FrameDecoder
 
 BLOCK = 4096
 """Bytes per read, as a pty gives them."""

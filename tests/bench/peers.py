@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.arrays import F2, F3
+from abbe.models.arrays import F2, F3
 from tests.bench.case import SIDE, Case
 
 

@@ -7,16 +7,16 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.geometry.bases import smooth_terms
-from models.geometry.chain import design, exact_deviation_mm, travel_sign
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
-from models.solvers.observations import RunData
-from models.solvers.observe import perpendicular, run_design, setup_unknowns, with_tool
-from models.solvers.priors import Priors, term_prior_sd
-from models.uncertainty.helix_trials import HelixTask
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.chain import design, exact_deviation_mm, travel_sign
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import perpendicular, run_design, setup_unknowns, with_tool
+from abbe.models.solvers.priors import Priors, term_prior_sd
+from abbe.models.uncertainty.helix_trials import HelixTask
 
 TRIALS = 100_000
 COMMON = 100

@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.solvers.helix import linear_field
-from models.solvers.joint import solve_joint
-from models.uncertainty.helix_trials import fit_trials, helix_trials
-from models.uncertainty.linear_trials import linear_estimator, linear_trials
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.helix import linear_field
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.uncertainty.helix_trials import fit_trials, helix_trials
+from abbe.models.uncertainty.linear_trials import linear_estimator, linear_trials
 from tests.bench import trials_case as cases
 from tests.bench.trials_case import COMMON, TRIALS, HelixCase, LinearCase
 
@@ -152,7 +152,7 @@ def helix_lmfit(case: HelixCase, timed: int = 40, counted: int = 400) -> Contest
 
 def propagation_ours(case: cases.PropagationCase) -> Contestant:
     """The product's own step: influence of a source's factor at the points, then sums of squares."""
-    from models.uncertainty.prediction import propagated_covariance
+    from abbe.models.uncertainty.prediction import propagated_covariance
 
     def run() -> Result:
         covariance = propagated_covariance(case.design, np.linalg.cholesky(case.covariance))

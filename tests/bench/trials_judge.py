@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.volumetric import remove_rigid
+from abbe.models.volumetric import remove_rigid
 from tests.bench import trials_case as cases
 from tests.bench.trials_contestants import TRIAL_CASES, Result
 

@@ -19,14 +19,14 @@ from functools import partial
 
 import numpy as np
 
-from models.compensation.distances import DistanceFigures, Pairs, figures, inner_box_mm, predict_distances, random_pairs
-from models.compensation.grid import grid_table, quantise_grid
-from models.compensation.tables import nine_tables, quantise
-from models.planning.instruments import Instruments
-from models.solvers.joint import JointSolution, solve_joint
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.sources import error_sources
-from simulators.campaign.sampler import Conditions
+from abbe.models.compensation.distances import DistanceFigures, Pairs, figures, inner_box_mm, predict_distances, random_pairs
+from abbe.models.compensation.grid import grid_table, quantise_grid
+from abbe.models.compensation.tables import nine_tables, quantise
+from abbe.models.planning.instruments import Instruments
+from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.sources import error_sources
+from abbe.simulators.campaign.sampler import Conditions
 from tests.campaigns.accuracy_bound import bound_mm
 from tests.campaigns.accuracy_plan import planned_case
 from tests.campaigns.population import CAMPAIGNS, Case, draw_case

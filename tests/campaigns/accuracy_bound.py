@@ -13,12 +13,12 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import legendre
 
-from models.compensation.distances import Pairs
-from models.geometry.bases import Term, smooth_terms
-from models.geometry.chain import design
-from models.solvers.observe import run_design, setup_unknowns
-from models.solvers.priors import Priors
-from simulators.truth.functions import draw
+from abbe.models.compensation.distances import Pairs
+from abbe.models.geometry.bases import Term, smooth_terms
+from abbe.models.geometry.chain import design
+from abbe.models.solvers.observe import run_design, setup_unknowns
+from abbe.models.solvers.priors import Priors
+from abbe.simulators.truth.functions import draw
 from tests.campaigns.population import Case
 
 ORDER = 12

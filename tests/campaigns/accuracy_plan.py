@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.geometry.chain import travel_sign
-from models.machine import Machine
-from models.planning.measurements import HelixTest, helix_path
-from models.planning.plan import Plan, Step, plan_campaign
-from models.solvers.observations import RunData, block_average
-from simulators.campaign.sampler import Conditions, Rig
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import Machine
+from abbe.models.planning.measurements import HelixTest, helix_path
+from abbe.models.planning.plan import Plan, Step, plan_campaign
+from abbe.models.solvers.observations import RunData, block_average
+from abbe.simulators.campaign.sampler import Conditions, Rig
 from tests.campaigns.population import BLOCKS, Case, draw_machine
 from tests.campaigns.truth import Truth
 

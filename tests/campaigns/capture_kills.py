@@ -18,13 +18,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from drivers.api import BarBatch, BarSample
-from service.capture.recorder import recording
-from service.capture.recovery import ledger_of, read_segment, recover_segments
-from service.capture.settings import CaptureSettings, segment_folder, segment_path
-from service.clock import SystemClock
-from service.runs.codec import decode_bar
-from service.storage.store import Store
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.service.capture.recorder import recording
+from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
+from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
+from abbe.service.clock import SystemClock
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage.store import Store
 
 SETTINGS = CaptureSettings(reserve_bytes=65536, keep=True)
 BATCH = 20

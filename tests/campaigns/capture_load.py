@@ -15,17 +15,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.api import BarBatch, BarTap
-from drivers.ballbar import driver
-from drivers.ballbar.driver import SerialBallBar
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import parse_url
-from service.capture.file_io import RealFileIO
-from service.capture.recorder import recording
-from service.capture.recovery import ledger_of
-from service.capture.settings import CaptureSettings
-from service.clock import SystemClock
-from service.storage.store import Store
+from abbe.drivers.api import BarBatch, BarTap
+from abbe.drivers.ballbar import driver
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import parse_url
+from abbe.service.capture.file_io import RealFileIO
+from abbe.service.capture.recorder import recording
+from abbe.service.capture.recovery import ledger_of
+from abbe.service.capture.settings import CaptureSettings
+from abbe.service.clock import SystemClock
+from abbe.service.storage.store import Store
 
 BUSY = "while True: pass"
 LOCK = """
@@ -102,7 +102,7 @@ async def _run(folder: Path, load: Load, progress: Callable[[str], None]) -> dic
     with Store.open(url) as store, ExitStack() as stack:
         campaign = store.add_campaign(store.add_machine("M", {"name": "M"}), "load", {})
         run_id = store.start_run(campaign, "r01", "ballbar_helix", "identify", {})
-        box = _child(stack, "-m", "simulators.box_alone", "--link", str(folder / "box"), "--ledger", str(ledger), "--speed",
+        box = _child(stack, "-m", "abbe.simulators.box_alone", "--link", str(folder / "box"), "--ledger", str(ledger), "--speed",
                      str(load.speed), "--spoil-every", str(load.spoil_every),
                      "--buffer-kib", str(int(64 * max(1.0, load.speed))))  # fmt: skip
         locker = _child(stack, "-c", LOCK, str(folder / "abbe.sqlite3"), str(load.lock_s))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import F1
+from abbe.models.arrays import F1
 
 Doc = dict[str, Any]
 VISIBLE = 10.0

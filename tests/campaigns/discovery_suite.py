@@ -1,4 +1,4 @@
-"""The discovery judged on cases that nobody tuned it on: made by `simulators.hidden`, answered by the product, judged by their truths.
+"""The discovery judged on cases that nobody tuned it on: made by `abbe.simulators.hidden`, answered by the product, judged by their truths.
 
     export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
     python -m tests.campaigns.discovery_suite --first 900001 --cases 60 [--kinds null] [--folder DIR] [--textbook] [--verbose]
@@ -19,9 +19,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from simulators.hidden.cases import make_case
-from simulators.hidden.draws import KINDS
-from simulators.hidden.suite import kinds_of, write_case
+from abbe.simulators.hidden.cases import make_case
+from abbe.simulators.hidden.draws import KINDS
+from abbe.simulators.hidden.suite import kinds_of, write_case
 from tests.campaigns.discovery import answered
 from tests.campaigns.discovery_judge import Tally, judge, label
 

@@ -27,23 +27,23 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DriverError
-from models.machine import Machine
-from service.devices.session import DeviceUrls, open_session
-from service.errors import AbbeError, Interlock
-from service.runs.columns import load_run
-from service.sequences.control import Control, State
-from service.sequences.interlocks import Suspending, Watching
-from service.sequences.recipe_file import parse_recipe
-from service.sequences.steps import CampaignPlan
-from service.site import Site, machine_doc
-from service.storage.store import Store
-from service.workflows.measure import Manner, measure
-from service.workflows.recover import recover
-from service.workflows.resume import resume
-from service.workflows.solve import Solved, solve_runs
-from simulators.faults.modbus_proxy import ModbusProxy
-from simulators.faults.scenario import Fault, FaultScenario
+from abbe.drivers.errors import DriverError
+from abbe.models.machine import Machine
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.errors import AbbeError, Interlock
+from abbe.service.runs.columns import load_run
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.recipe_file import parse_recipe
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, machine_doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.recover import recover
+from abbe.service.workflows.resume import resume
+from abbe.service.workflows.solve import Solved, solve_runs
+from abbe.simulators.faults.modbus_proxy import ModbusProxy
+from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.faults.on_sphere import looked_at
 
 MACHINE = Machine(

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from models.alignment.envelope import LOWEST, _edge, _edge_of_delays
+from abbe.models.alignment.envelope import LOWEST, _edge, _edge_of_delays
 
 EDGES = (0.42, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.5, 3.0, 4.5)
 

@@ -26,16 +26,16 @@ from pymodbus import FramerType
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
-from drivers.errors import DriverError
-from drivers.links.backoff import Backoff
-from drivers.links.modbus_line import Canary
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.modbus_policy import Op
-from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
-from simulators.faults.modbus_frames import MBAP, Cutter, Frame, answer, parts
-from simulators.faults.modbus_proxy import ModbusProxy
-from simulators.faults.rtu_toxic import ToxicRtuLine
-from simulators.faults.scenario import Fault, FaultScenario, scenario
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
+from abbe.simulators.faults.modbus_frames import MBAP, Cutter, Frame, answer, parts
+from abbe.simulators.faults.modbus_proxy import ModbusProxy
+from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
+from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 
 KINDS = ("late", "duplicate", "cancelled")
 FACTORS = (1.05, 2.0, 10.0)

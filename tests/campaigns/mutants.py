@@ -21,7 +21,7 @@ from pathlib import Path
 from tests.campaigns.source_mutants import MUTANTS, Mutant
 
 ROOT = Path(__file__).resolve().parents[2]
-COPIED = ("service", "drivers", "models", "simulators", "tests", "pyproject.toml")
+COPIED = ("abbe", "service", "drivers", "models", "simulators", "tests", "pyproject.toml")
 TEST_S, RUN_S = 400, 3600
 HEAD = """# Mistakes that the tests have to notice
 
@@ -58,7 +58,7 @@ def copied() -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as name:
         for part in COPIED:
             if (ROOT / part).is_dir():
-                shutil.copytree(ROOT / part, Path(name) / part, ignore=shutil.ignore_patterns("__pycache__"))
+                shutil.copytree(ROOT / part, Path(name) / part, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
             else:
                 shutil.copy(ROOT / part, Path(name) / part)
         yield Path(name)

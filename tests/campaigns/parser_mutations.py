@@ -13,13 +13,13 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.ballbar.frames import Bad, FrameDecoder
-from drivers.cnc import registers as cnc
-from drivers.laser import registers as laser
-from drivers.links.words import Block, words_of
-from simulators.ballbar.device import Settings
-from simulators.ballbar.wire import encode_ack, encode_info, encode_settings
-from simulators.faults.serial_bytes import Sample, flipped
+from abbe.drivers.ballbar.frames import Bad, FrameDecoder
+from abbe.drivers.cnc import registers as cnc
+from abbe.drivers.laser import registers as laser
+from abbe.drivers.links.words import Block, words_of
+from abbe.simulators.ballbar.device import Settings
+from abbe.simulators.ballbar.wire import encode_ack, encode_info, encode_settings
+from abbe.simulators.faults.serial_bytes import Sample, flipped
 from tests.faults.modbus_bytes import COUNT, reply, request, taken
 from tests.faults.rows_serial import MBAP_CHECKED
 

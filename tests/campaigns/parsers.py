@@ -6,7 +6,7 @@ import argparse
 import sys
 import time
 
-from simulators.faults.serial_bytes import Sample
+from abbe.simulators.faults.serial_bytes import Sample
 from tests.bench.parser_case import framed, stream
 from tests.campaigns.parser_mutations import SHARES, spoil
 

@@ -14,16 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.geometry.chain import all_chains
-from models.machine import Machine
-from models.paths.lines import DIAGONALS
-from models.planning.candidates import BAR_CLEARANCE_MM, candidates
-from models.planning.information import field_rows, problem
-from models.planning.instruments import Instruments
-from models.planning.measurements import DiagonalTest, HelixTest
-from models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, uncertainty_mm
-from models.planning.search import Chosen, Search
-from models.uncertainty.inputs import Inputs
+from abbe.models.geometry.chain import all_chains
+from abbe.models.machine import Machine
+from abbe.models.paths.lines import DIAGONALS
+from abbe.models.planning.candidates import BAR_CLEARANCE_MM, candidates
+from abbe.models.planning.information import field_rows, problem
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import DiagonalTest, HelixTest
+from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, uncertainty_mm
+from abbe.models.planning.search import Chosen, Search
+from abbe.models.uncertainty.inputs import Inputs
 
 STROKES = ((600.0, 500.0, 450.0), (812.8, 495.0, 508.0), (1000.0, 600.0, 500.0), (400.0, 400.0, 300.0), (1500.0, 800.0, 700.0))
 TRAVEL_MM = np.array([812.8, 495.0, 508.0])

@@ -10,11 +10,11 @@ from typing import Any, get_args
 
 import numpy as np
 
-from models.geometry.chain import travel_sign
-from models.machine import Machine
-from models.solvers.observations import RunData, block_average
-from simulators.campaign.sampler import Conditions, Rig
-from simulators.scenario import MachineConfig, Magnitudes, Pivots, Scenario, Strokes
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import Machine
+from abbe.models.solvers.observations import RunData, block_average
+from abbe.simulators.campaign.sampler import Conditions, Rig
+from abbe.simulators.scenario import MachineConfig, Magnitudes, Pivots, Scenario, Strokes
 from tests.campaigns.plans import Bar, Beam, Kind, plan
 from tests.campaigns.truth import Truth
 

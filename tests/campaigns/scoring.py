@@ -2,8 +2,8 @@
 
 Identifiable: a smooth term or a lost motion that the solution's rank analysis covers (Legendre orders up to ``solution.order``), that takes
 part in no combination it lists as hidden, and of whose prior variance the data took at least half (``data_share``); its interval is
-estimate +- 1.96 u. Predicted deviation: `models.uncertainty.prediction` with its own coverage factor, stated inputs true to the population
-(no temperatures are wrong here), at 100 random points of the volume in the frame without rigid motion over these points.
+estimate +- 1.96 u. Predicted deviation: `abbe.models.uncertainty.prediction` with its own coverage factor, stated inputs true to the
+population (no temperatures are wrong here), at 100 random points of the volume in the frame without rigid motion over these points.
 """
 
 import time
@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from models.compensation.grid import compensable_nodes, grid_table, nodes_mm
-from models.solvers.joint import JointSolution, solve_joint
-from models.uncertainty.frame import RigidFree
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import error_sources
-from models.volumetric import remove_rigid
+from abbe.models.compensation.grid import compensable_nodes, grid_table, nodes_mm
+from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.uncertainty.frame import RigidFree
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.sources import error_sources
+from abbe.models.volumetric import remove_rigid
 from tests.campaigns.population import Case, Kind, draw_case
 from tests.campaigns.traces import Bent, Traces, traces, typical_size
 

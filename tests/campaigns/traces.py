@@ -1,7 +1,7 @@
 """What a campaign can see, judged by the simulated machine itself: bend it along one parameter, and look whether the readings change.
 
-Nothing of the solver is used: readings are recomputed without noise by `simulators.truth` with finite rotations, differences are finite,
-set-ups are refitted with this file's own columns.
+Nothing of the solver is used: readings are recomputed without noise by `abbe.simulators.truth` with finite rotations, differences are
+finite, set-ups are refitted with this file's own columns.
 """
 
 from dataclasses import dataclass, replace
@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import legendre
 
-from models.solvers.observations import RunData
-from simulators.truth.machine import Machine
+from abbe.models.solvers.observations import RunData
+from abbe.simulators.truth.machine import Machine
 from tests.campaigns.population import UNCALIBRATED_SD_MM, Case
 
 COMPONENTS = "XYZABC"

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
-from simulators.campaign.sampler import Rig
+from abbe.simulators.campaign.sampler import Rig
 
 NODES = 120
 COMPONENTS = "XYZABC"

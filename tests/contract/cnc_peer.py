@@ -8,11 +8,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.api import ControllerStatus
-from drivers.cnc.driver import ModbusController
-from drivers.cnc.registers import Bit
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.urls import parse_url
+from abbe.drivers.api import ControllerStatus
+from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.urls import parse_url
 
 READY = Bit.REMOTE | Bit.REFERENCED | Bit.DRIVES_ON | Bit.IN_POSITION
 TARGET = (100.0, -50.0, 25.5)

@@ -6,9 +6,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.links.backoff import Backoff
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 
 TIMEOUT_S = 1.0
 """Of a reply, and of a connection to a peer on a loaded computer."""

@@ -13,15 +13,15 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.ballbar.driver import BarCounters, SerialBallBar
-from drivers.cnc import second_decoder, tables
-from drivers.cnc.driver import ModbusController
-from drivers.cnc.registers import Bit
-from drivers.cnc.tables import TableImage
-from drivers.errors import DeviceFault, LinkDown, Rebooted, Refused
-from drivers.fixture.driver import RemoteFixture
-from drivers.laser.driver import ModbusLaser
-from drivers.registry import open_ballbar, open_controller, open_fixture, open_laser
+from abbe.drivers.ballbar.driver import BarCounters, SerialBallBar
+from abbe.drivers.cnc import second_decoder, tables
+from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.cnc.tables import TableImage
+from abbe.drivers.errors import DeviceFault, LinkDown, Rebooted, Refused
+from abbe.drivers.fixture.driver import RemoteFixture
+from abbe.drivers.laser.driver import ModbusLaser
+from abbe.drivers.registry import open_ballbar, open_controller, open_fixture, open_laser
 
 OWNER = 0xABBE0001
 CENTRE = (300.0, 250.0, 200.0)
@@ -44,7 +44,18 @@ class World:
 async def world(request: pytest.FixtureRequest, tmp_path) -> AsyncIterator[World]:
     marker = request.node.get_closest_marker("speed")
     speed = str(marker.args[0] if marker else 60)
-    command = [sys.executable, "-m", "simulators", "--watch-stdin", "--speed", speed, "--link-dir", str(tmp_path), "--laser", request.param]
+    command = [
+        sys.executable,
+        "-m",
+        "abbe.simulators",
+        "--watch-stdin",
+        "--speed",
+        speed,
+        "--link-dir",
+        str(tmp_path),
+        "--laser",
+        request.param,
+    ]
     process = await asyncio.create_subprocess_exec(*command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdin is not None

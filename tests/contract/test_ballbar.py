@@ -9,12 +9,12 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.ballbar import driver as module
-from drivers.ballbar.driver import SerialBallBar
-from drivers.errors import BadFrame, LinkDown, LossyLine, Rebooted, Refused, ReplyTimeout
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import SocketUrl, parse_url
-from drivers.registry import open_ballbar
+from abbe.drivers.ballbar import driver as module
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.errors import BadFrame, LinkDown, LossyLine, Rebooted, Refused, ReplyTimeout
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import SocketUrl, parse_url
+from abbe.drivers.registry import open_ballbar
 
 STOP, START, IDENTIFY = 0x83, 0x82, 0x81
 

@@ -6,9 +6,9 @@ import asyncio
 
 import pytest
 
-from drivers.cnc.registers import Bit
-from drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
-from drivers.registry import open_controller
+from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
+from abbe.drivers.registry import open_controller
 from tests.contract.cnc_peer import READY, TARGET, hang_up, honest, move, silent
 
 # ---- identity and status

@@ -7,8 +7,8 @@ import zlib
 
 import pytest
 
-from drivers.cnc import banks as banks_module
-from drivers.errors import BadFrame, DeviceFault, LinkDown, Rebooted, Refused, ReplyTimeout
+from abbe.drivers.cnc import banks as banks_module
+from abbe.drivers.errors import BadFrame, DeviceFault, LinkDown, Rebooted, Refused, ReplyTimeout
 from tests.contract.cnc_peer import hang_up, honest, silent
 
 # ---- paths

@@ -8,10 +8,10 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.errors import BadFrame, BadUrl, LinkDown, Refused, ReplyTimeout
-from drivers.fixture.driver import ConsoleFixture, RemoteFixture
-from drivers.links.urls import FixtureTcpUrl
-from drivers.registry import open_ballbar, open_controller, open_fixture, open_laser
+from abbe.drivers.errors import BadFrame, BadUrl, LinkDown, Refused, ReplyTimeout
+from abbe.drivers.fixture.driver import ConsoleFixture, RemoteFixture
+from abbe.drivers.links.urls import FixtureTcpUrl
+from abbe.drivers.registry import open_ballbar, open_controller, open_fixture, open_laser
 
 
 class FixturePeer:

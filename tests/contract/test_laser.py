@@ -7,11 +7,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.errors import DeviceFault, LinkDown, Rebooted, Refused, ReplyTimeout, WrongDevice
-from drivers.laser.driver import ModbusLaser
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.urls import parse_url
-from drivers.registry import open_laser
+from abbe.drivers.errors import DeviceFault, LinkDown, Rebooted, Refused, ReplyTimeout, WrongDevice
+from abbe.drivers.laser.driver import ModbusLaser
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.urls import parse_url
+from abbe.drivers.registry import open_laser
 
 ZEROED = 1 << 2
 

@@ -6,11 +6,11 @@ import asyncio
 
 import pytest
 
-from drivers.errors import BadFrame, DeviceFault, LinkDown, Refused, ReplyTimeout
-from drivers.links import modbus_link
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.modbus_policy import Op
-from drivers.links.urls import parse_url
+from abbe.drivers.errors import BadFrame, DeviceFault, LinkDown, Refused, ReplyTimeout
+from abbe.drivers.links import modbus_link
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.urls import parse_url
 from tests.contract.link_peer import TIMEOUT_S, silent, times
 
 

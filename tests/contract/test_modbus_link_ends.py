@@ -6,9 +6,9 @@ import asyncio
 
 import pytest
 
-from drivers.errors import LinkDown, ReplyTimeout
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.urls import parse_url
+from abbe.drivers.errors import LinkDown, ReplyTimeout
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.urls import parse_url
 from tests.contract.link_peer import TIMEOUT_S, silent
 
 

@@ -7,17 +7,17 @@ import json
 import sys
 from dataclasses import replace
 
-from service.clock import SystemClock
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls
-from service.scheduler.ready import Ready, look_at
-from service.scheduler.slots import Needs, Schedule
+from abbe.service.clock import SystemClock
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.scheduler.ready import Ready, look_at
+from abbe.service.scheduler.slots import Needs, Schedule
 
 SCHEDULE = Schedule("nightly", "0 2 * * *", "UTC", "quick-check", needs=Needs(idle=True, air=True))
 
 
 async def test_the_simulated_machine_is_ready_until_somebody_has_it() -> None:
-    command = [sys.executable, "-m", "simulators", "--watch-stdin", "--speed", "60", "--laser", "tcp"]
+    command = [sys.executable, "-m", "abbe.simulators", "--watch-stdin", "--speed", "60", "--laser", "tcp"]
     process = await asyncio.create_subprocess_exec(*command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdin is not None

@@ -14,17 +14,17 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls, open_session
-from service.sequences.recipes import Circle, Diagonal, Helix, Linear
-from service.sequences.setups import shared_setups
-from service.sequences.steps import CampaignPlan
-from service.site import Site, machine_doc
-from service.storage.store import Store
-from service.workflows.campaign_run import Confirm
-from service.workflows.measure import Manner, measure
-from service.workflows.recover import recover
-from service.workflows.resume import resume
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.sequences.recipes import Circle, Diagonal, Helix, Linear
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, machine_doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_run import Confirm
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.recover import recover
+from abbe.service.workflows.resume import resume
 from tests.faults.sequencer_world import MACHINE
 
 

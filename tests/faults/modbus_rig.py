@@ -13,21 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from drivers.cnc.driver import ModbusController
-from drivers.errors import DriverError
-from drivers.laser.driver import ModbusLaser
-from drivers.links.backoff import Backoff
-from drivers.links.modbus_line import Canary
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
-from simulators.cnc.wire import CncRegisters
-from simulators.faults.modbus_proxy import ModbusProxy
-from simulators.faults.rtu_toxic import ToxicRtuLine
-from simulators.faults.scenario import FaultScenario
-from simulators.laser.wire import LaserRegisters
-from simulators.modbus_wire import ModbusTcp, RegisterMap
-from simulators.scenario import Scenario
-from simulators.world import World
+from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.errors import DriverError
+from abbe.drivers.laser.driver import ModbusLaser
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
+from abbe.simulators.cnc.wire import CncRegisters
+from abbe.simulators.faults.modbus_proxy import ModbusProxy
+from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
+from abbe.simulators.faults.scenario import FaultScenario
+from abbe.simulators.laser.wire import LaserRegisters
+from abbe.simulators.modbus_wire import ModbusTcp, RegisterMap
+from abbe.simulators.scenario import Scenario
+from abbe.simulators.world import World
 from tests.faults.contract import Observed, Record, told_of
 
 SPEED = 60.0

@@ -1,6 +1,6 @@
 """The oracle of all that is said about bars: while one hangs in, the commanded way stays on its sphere.
 
-As a process (``python -m tests.faults.on_sphere FILE ...``) it is ``python -m simulators ...`` that writes into FILE what went wrong.
+As a process (``python -m tests.faults.on_sphere FILE ...``) it is ``python -m abbe.simulators ...`` that writes into FILE what went wrong.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.world import World
+from abbe.simulators.world import World
 
 NEAR_MM = 1.0
 """The bar's stroke."""
@@ -111,7 +111,7 @@ def words(file: Path) -> list[str]:
 
 def main() -> int:
     """Put the oracle into every world that is made, then be the simulators."""
-    from simulators.__main__ import main as serve
+    from abbe.simulators.__main__ import main as serve
 
     file, made = Path(sys.argv[1]), World.__init__
     file.write_text("")

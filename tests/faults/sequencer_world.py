@@ -17,20 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from drivers.api import BarBatch
-from models.machine import Machine
-from service.devices.session import DeviceUrls, Session, open_session
-from service.sequences import recipes
-from service.sequences.check import step_seconds
-from service.sequences.control import Control
-from service.sequences.interlocks import Watching
-from service.sequences.setups import shared_setups
-from service.sequences.steps import CampaignPlan, MoveTo, TestPlan
-from service.site import Site, machine_doc
-from service.storage.store import Store
-from simulators.cnc.log import Command
-from simulators.scenario import Scenario
-from simulators.site import Site as Simulated
+from abbe.drivers.api import BarBatch
+from abbe.models.machine import Machine
+from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.sequences import recipes
+from abbe.service.sequences.check import step_seconds
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import CampaignPlan, MoveTo, TestPlan
+from abbe.service.site import Site, machine_doc
+from abbe.service.storage.store import Store
+from abbe.simulators.cnc.log import Command
+from abbe.simulators.scenario import Scenario
+from abbe.simulators.site import Site as Simulated
 from tests.faults.on_sphere import OnSphere
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]), np.zeros((3, 3)), np.array([0.0, 0.0, -120.0]))

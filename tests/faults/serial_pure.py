@@ -6,15 +6,15 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from drivers.api import BarSample
-from drivers.ballbar.box import Box
-from drivers.ballbar.conversation import Conversation
-from drivers.ballbar.frames import Bad, FrameDecoder
-from drivers.ballbar.framing import BarCounters
-from drivers.ballbar.sequence import Reads, SegmentEnd
-from drivers.ballbar.stream import Stream
-from drivers.errors import DriverError, on_behalf_of
-from simulators.faults.serial_bytes import Sample
+from abbe.drivers.api import BarSample
+from abbe.drivers.ballbar.box import Box
+from abbe.drivers.ballbar.conversation import Conversation
+from abbe.drivers.ballbar.frames import Bad, FrameDecoder
+from abbe.drivers.ballbar.framing import BarCounters
+from abbe.drivers.ballbar.sequence import Reads, SegmentEnd
+from abbe.drivers.ballbar.stream import Stream
+from abbe.drivers.errors import DriverError, on_behalf_of
+from abbe.simulators.faults.serial_bytes import Sample
 from tests.faults.contract import Observed, assert_fault_contract, told_of
 from tests.faults.serial_rig import Tap, accounted
 

@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 
-from drivers.api import BarBatch, BarSample
-from drivers.ballbar import driver as module
-from drivers.ballbar.driver import SerialBallBar
-from drivers.errors import DriverError, on_behalf_of
-from drivers.links.adapters import Adapter
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import parse_url
-from simulators.faults.serial_box import FaultyBox
-from simulators.faults.serial_bytes import Sample
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.drivers.ballbar import driver as module
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.errors import DriverError, on_behalf_of
+from abbe.drivers.links.adapters import Adapter
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import parse_url
+from abbe.simulators.faults.serial_box import FaultyBox
+from abbe.simulators.faults.serial_bytes import Sample
 from tests.faults.contract import Observed, Record, assert_fault_contract, told_of
 
 Script = Callable[[], Awaitable[None]]

@@ -7,14 +7,14 @@ import contextlib
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
-from drivers.errors import DriverError
-from drivers.links.backoff import Backoff
-from drivers.links.modbus_line import Canary
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.modbus_policy import Op
-from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
-from simulators.faults.rtu_toxic import ToxicRtuLine
-from simulators.faults.scenario import Fault, FaultScenario, scenario
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
+from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
+from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.campaigns.late_replies import AddressMap, _tcp_device
 from tests.faults.contract import Observed, told_of
 from tests.faults.modbus_rig import records_of

@@ -11,21 +11,21 @@ from typing import Any
 
 import pytest
 
-from drivers.ballbar.driver import SerialBallBar
-from drivers.errors import DriverError, LinkDown, Rebooted, WrongDevice
-from service.capture.recovery import ledger_of
-from service.errors import RunInterrupted, Stopped
-from service.runs.codec import decode_bar
-from service.sequences.control import Control, State
-from service.sequences.interlocks import Suspending, Watching
-from service.sequences.journal import HAND, INCIDENT, NoJournal
-from service.sequences.runner import Runner
-from service.sequences.steps import CampaignPlan, RecordPath
-from service.storage.store import Store
-from service.workflows.bar_link import MOST_BREAKS, BarBreaks
-from service.workflows.measure import Manner, measure
-from service.workflows.resume import resume
-from simulators.ballbar.wire import WITH_SETTINGS_BCD
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.errors import DriverError, LinkDown, Rebooted, WrongDevice
+from abbe.service.capture.recovery import ledger_of
+from abbe.service.errors import RunInterrupted, Stopped
+from abbe.service.runs.codec import decode_bar
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.journal import HAND, INCIDENT, NoJournal
+from abbe.service.sequences.runner import Runner
+from abbe.service.sequences.steps import CampaignPlan, RecordPath
+from abbe.service.storage.store import Store
+from abbe.service.workflows.bar_link import MOST_BREAKS, BarBreaks
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.resume import resume
+from abbe.simulators.ballbar.wire import WITH_SETTINGS_BCD
 from tests.faults.sequencer_world import AtStep, Bench, bench, number, small
 from tests.faults.serial_rig import stage
 

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DriverError, Refused, ReplyTimeout, SettingsChanged, WrongDevice
-from service.errors import ConfigError
-from service.events import ignore_progress
-from service.sequences.needed import needed_by
-from service.sequences.recipes import HelixPoints
-from service.sequences.steps import CampaignPlan
-from service.storage.store import Store
-from service.workflows.correct import correct, push
-from service.workflows.measure import measure
-from simulators.ballbar import device
-from simulators.ballbar.wire import WITH_SETTINGS_BCD
+from abbe.drivers.errors import DriverError, Refused, ReplyTimeout, SettingsChanged, WrongDevice
+from abbe.service.errors import ConfigError
+from abbe.service.events import ignore_progress
+from abbe.service.sequences.needed import needed_by
+from abbe.service.sequences.recipes import HelixPoints
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.storage.store import Store
+from abbe.service.workflows.correct import correct, push
+from abbe.service.workflows.measure import measure
+from abbe.simulators.ballbar import device
+from abbe.simulators.ballbar.wire import WITH_SETTINGS_BCD
 from tests.faults import modbus_rig
 from tests.faults.sequencer_world import MACHINE, Bench, bench, small
 
@@ -71,7 +71,7 @@ async def test_a_box_whose_range_is_set_to_nothing(place: tuple[Bench, Store]) -
 
 async def test_a_box_that_cannot_send_so_fast(place: tuple[Bench, Store], monkeypatch: pytest.MonkeyPatch) -> None:
     b, store = place
-    monkeypatch.setattr("simulators.ballbar.wire.MAX_RATE_HZ", device.MAX_RATE_HZ // 20)
+    monkeypatch.setattr("abbe.simulators.ballbar.wire.MAX_RATE_HZ", device.MAX_RATE_HZ // 20)
     await refused(b, store, "Helix", Refused, "100 Hz are wanted, the box sends at most 50")
 
 

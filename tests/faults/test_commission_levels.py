@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.compensation.tables import NineTables, grid_positions, quantise
-from service.errors import StillActive, TableRefused, UnsafeToMove
-from service.push.book import read_entries
-from service.push.entries import facts
-from service.push.operations import Verdict
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.commission_levels import RESTART, commission_levels
-from service.workflows.proved_levels import check_level, standing
-from service.workflows.pushing import Pushed, Pushing, Questions, Wanted
-from simulators.cnc import bank
-from simulators.cnc.compensation import BankState, Compensation, CompResult
+from abbe.models.compensation.tables import NineTables, grid_positions, quantise
+from abbe.service.errors import StillActive, TableRefused, UnsafeToMove
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import facts
+from abbe.service.push.operations import Verdict
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.commission_levels import RESTART, commission_levels
+from abbe.service.workflows.proved_levels import check_level, standing
+from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.simulators.cnc import bank
+from abbe.simulators.cnc.compensation import BankState, Compensation, CompResult
 from tests.faults.sequencer_world import bench
 
 STAGED, STAGED_RESULT = 3, 8

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from drivers.errors import ReplyTimeout
+from abbe.drivers.errors import ReplyTimeout
 from tests.faults.catalogue import crossed, rows
 from tests.faults.contract import OBLIGATIONS, Book, Observed, Record, Told, complaints, told_of
 from tests.faults.page import PAGE, page

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import Aborted, DoorOpen, Stopped
-from service.sequences.control import Control, State
-from service.sequences.steps import CampaignPlan, FollowPath, ReadBar, RecordPath, TestPlan
-from service.storage.store import Store
-from service.workflows.measure import Manner, measure
-from simulators.cnc.log import Command
+from abbe.service.errors import Aborted, DoorOpen, Stopped
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.steps import CampaignPlan, FollowPath, ReadBar, RecordPath, TestPlan
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measure import Manner, measure
+from abbe.simulators.cnc.log import Command
 from tests.faults.sequencer_world import AtStep, Bench, bench, kinds, small, step_numbers
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
@@ -217,7 +217,7 @@ async def test_a_point_in_hand_is_finished_before_a_stop(place):
 
 
 async def test_a_path_that_was_interrupted_never_enters_the_solution(place):
-    from service.workflows.campaign_folder import from_store
+    from abbe.service.workflows.campaign_folder import from_store
 
     b, store = place
     plan = replace(small("Helix"), label="helix")

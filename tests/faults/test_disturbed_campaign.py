@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import pytest
 
-from service.sequences.recipes import Diagonal, Helix, Linear
-from service.sequences.setups import shared_setups
-from service.sequences.steps import CampaignPlan
+from abbe.service.sequences.recipes import Diagonal, Helix, Linear
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import CampaignPlan
 from tests.campaigns.disturbed import MACHINE, both, summary
 
 SPEED, EVERY_S, SEED = 60.0, 20.0, 5

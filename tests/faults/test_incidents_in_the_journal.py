@@ -15,18 +15,18 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from drivers.errors import LinkDown
-from service.cli.app import app
-from service.clock import SystemClock
-from service.sequences.control import State
-from service.sequences.incident_account import troubles
-from service.sequences.incident_notes import IncidentNotes, incidents_noted, links_of
-from service.sequences.journal import ENDED, INCIDENT, StoreJournal
-from service.sequences.steps import CampaignPlan
-from service.storage.store import Store
-from service.workflows.measure import Manner, measure
-from simulators.faults.modbus_proxy import ModbusProxy
-from simulators.faults.scenario import Fault, FaultScenario
+from abbe.drivers.errors import LinkDown
+from abbe.service.cli.app import app
+from abbe.service.clock import SystemClock
+from abbe.service.sequences.control import State
+from abbe.service.sequences.incident_account import troubles
+from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, links_of
+from abbe.service.sequences.journal import ENDED, INCIDENT, StoreJournal
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measure import Manner, measure
+from abbe.simulators.faults.modbus_proxy import ModbusProxy
+from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.faults.sequencer_world import AtStep, Bench, bench, small
 
 SPEED = 60.0
@@ -118,7 +118,7 @@ async def test_a_cable_that_is_pulled_is_noted_with_its_run_and_as_not_over(plac
 
 
 async def test_a_locked_database_holds_up_no_link_and_no_end(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.sequences.incident_notes.LAST_LINES_S", 0.2)
+    monkeypatch.setattr("abbe.service.sequences.incident_notes.LAST_LINES_S", 0.2)
     store, session = place.store, place.bench.session
     campaign = store.add_campaign(store.add_machine("m", {}), "c", {})
     notes = IncidentNotes(StoreJournal(store, campaign), SystemClock())
@@ -144,7 +144,7 @@ async def test_a_locked_database_holds_up_no_link_and_no_end(place: Place, monke
 
 
 async def test_more_incidents_than_may_wait_are_counted_at_the_end_of_the_journal(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.sequences.incident_notes.MOST_WAITING", 3)
+    monkeypatch.setattr("abbe.service.sequences.incident_notes.MOST_WAITING", 3)
     control = AtStep(3, lambda: [(link.note(LinkDown("laser", "read", "gone")), link.good()) for _ in range(5)])  # type: ignore[func-returns-value]
     link = links_of(place.bench.session)["laser"]
     await measure(place.bench.session, place.store, place.bench.site, CampaignPlan("c", (small("Helix"),)), manner=Manner(control))

@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from drivers.errors import DriverError
-from drivers.registry import open_controller
-from service.errors import (
+from abbe.drivers.errors import DriverError
+from abbe.drivers.registry import open_controller
+from abbe.service.errors import (
     AbbeError,
     AlarmOn,
     BarOutOfRange,
@@ -34,11 +34,11 @@ from service.errors import (
     SpindleTurns,
     StatusUnknown,
 )
-from service.sequences.rewind import BY_HAND
-from service.sequences.runner import Runner
-from service.sequences.steps import FollowPath, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan, Unmount, ZeroLaser
-from simulators.faults.modbus_proxy import ModbusProxy
-from simulators.faults.scenario import Fault, FaultScenario
+from abbe.service.sequences.rewind import BY_HAND
+from abbe.service.sequences.runner import Runner
+from abbe.service.sequences.steps import FollowPath, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan, Unmount, ZeroLaser
+from abbe.simulators.faults.modbus_proxy import ModbusProxy
+from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.faults.sequencer_world import AtStep, Bench, Keeps, bench, kinds, rng, small, step_numbers
 
 LIMIT_S = 0.100

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from service.storage.store import Store
+from abbe.service.storage.store import Store
 from tests.faults.measuring_child import plan
 from tests.faults.on_sphere import words
 from tests.scenarios.conftest import Sims, simulated

@@ -7,15 +7,15 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from drivers.errors import BadFrame, LinkDown
-from drivers.links.backoff import Backoff
-from drivers.links.modbus_line import Canary
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.modbus_policy import Op
-from drivers.links.urls import ModbusRtuUrl, parse_url
-from simulators.faults.modbus_frames import RTU, Frame, parts
-from simulators.faults.rtu_toxic import ToxicRtuLine
-from simulators.faults.scenario import Fault, FaultScenario, scenario
+from abbe.drivers.errors import BadFrame, LinkDown
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.urls import ModbusRtuUrl, parse_url
+from abbe.simulators.faults.modbus_frames import RTU, Frame, parts
+from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
+from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.campaigns.late_replies import AddressMap
 from tests.faults.patient import patience
 

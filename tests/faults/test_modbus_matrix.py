@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DriverError, WrongDevice, on_behalf_of
-from drivers.links.modbus_policy import Op
-from drivers.registry import open_controller
-from simulators.faults.scenario import Fault, FaultScenario, scenario
+from abbe.drivers.errors import DriverError, WrongDevice, on_behalf_of
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.registry import open_controller
+from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.faults import rows_modbus as rows
 from tests.faults.contract import BOOK, Observed, assert_fault_contract, told_of
 from tests.faults.modbus_rig import KINDS, TARGET, Kind, Rig, observe, opened, records_of

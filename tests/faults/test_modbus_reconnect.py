@@ -7,13 +7,13 @@ import random
 
 import pytest
 
-from drivers.errors import DriverError, LinkDown, on_behalf_of
-from drivers.links.backoff import Backoff
-from drivers.links.modbus_line import Canary
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.urls import ModbusTcpUrl
-from simulators.faults.modbus_proxy import ModbusProxy, refusing
-from simulators.faults.scenario import Fault, FaultScenario, scenario
+from abbe.drivers.errors import DriverError, LinkDown, on_behalf_of
+from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.urls import ModbusTcpUrl
+from abbe.simulators.faults.modbus_proxy import ModbusProxy, refusing
+from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.faults import rows_modbus as rows
 from tests.faults.contract import Observed, assert_fault_contract, told_of
 from tests.faults.modbus_rig import KINDS, observe, opened, records_of

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import Rebooted
-from service.errors import Interlock
-from service.runs.columns import load_run
-from service.runs.exchange import export_folder, import_folder
-from service.sequences.control import State
-from service.sequences.interlocks import Suspending, Watching
-from service.sequences.recipes import Helix
-from service.sequences.steps import CampaignPlan, RecordPath
-from service.storage.records import RunRecord
-from service.storage.store import Store
-from service.workflows.campaign_run import nobody
-from service.workflows.measure import Manner, measure
-from service.workflows.resume import resume
-from service.workflows.run_times import times
+from abbe.drivers.errors import Rebooted
+from abbe.service.errors import Interlock
+from abbe.service.runs.columns import load_run
+from abbe.service.runs.exchange import export_folder, import_folder
+from abbe.service.sequences.control import State
+from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.recipes import Helix
+from abbe.service.sequences.steps import CampaignPlan, RecordPath
+from abbe.service.storage.records import RunRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_run import nobody
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.resume import resume
+from abbe.service.workflows.run_times import times
 from tests.faults.sequencer_world import MACHINE, AtStep, Bench, bench, number
 
 SPEED = 40.0

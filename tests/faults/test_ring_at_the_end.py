@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers.api import BarBatch
-from drivers.ballbar import driver
-from drivers.errors import Backpressure, LinkDown
-from drivers.links.reading import Piece
-from service.capture.recorder import CaptureRecorder, close_run, recording
-from service.capture.recovery import ledger_of
-from service.capture.settings import CaptureSettings
-from service.clock import SystemClock
-from service.runs.codec import decode_bar
-from service.storage.store import Store
+from abbe.drivers.api import BarBatch
+from abbe.drivers.ballbar import driver
+from abbe.drivers.errors import Backpressure, LinkDown
+from abbe.drivers.links.reading import Piece
+from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
+from abbe.service.capture.recovery import ledger_of
+from abbe.service.capture.settings import CaptureSettings
+from abbe.service.clock import SystemClock
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage.store import Store
 from tests.faults.serial_rig import Stage, Tap, stage
 from tests.unit.service_capture.capture_bench import new_run
 
@@ -107,7 +107,7 @@ async def test_and_into_the_runs_account_with_an_open_gap_behind_it(tmp_path: Pa
 
 async def test_a_tap_that_never_takes_it_fails_a_run_that_ended_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "_DRAIN_S", 0.1)
-    monkeypatch.setattr("drivers.ballbar.conversation._DRAIN_S", 0.1)
+    monkeypatch.setattr("abbe.drivers.ballbar.conversation._DRAIN_S", 0.1)
     monkeypatch.setattr(driver, "_ANSWER_S", 0.1)
     async with stage(tmp_path, "ring", "never") as on:
         await on.bar.identify()

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.ballbar.frames import Settings
-from drivers.errors import DeviceFault, Rebooted, SettingsChanged, on_behalf_of
-from drivers.laser.driver import ModbusLaser
-from drivers.laser.registers import SIGNAL_LOW
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.urls import parse_url
-from simulators.ballbar.device import NO_BAR, OUT_OF_RANGE
-from simulators.faults.serial_box import Window
-from simulators.laser.wire import LaserRegisters
-from simulators.modbus_wire import ModbusTcp
-from simulators.scenario import DEFAULT_PATH, load
-from simulators.world import World
+from abbe.drivers.ballbar.frames import Settings
+from abbe.drivers.errors import DeviceFault, Rebooted, SettingsChanged, on_behalf_of
+from abbe.drivers.laser.driver import ModbusLaser
+from abbe.drivers.laser.registers import SIGNAL_LOW
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.urls import parse_url
+from abbe.simulators.ballbar.device import NO_BAR, OUT_OF_RANGE
+from abbe.simulators.faults.serial_box import Window
+from abbe.simulators.laser.wire import LaserRegisters
+from abbe.simulators.modbus_wire import ModbusTcp
+from abbe.simulators.scenario import DEFAULT_PATH, load
+from abbe.simulators.world import World
 from tests.faults.contract import Observed, assert_fault_contract, told_of
 from tests.faults.rows_serial import S6_AFTER, S6_MOMENTS, S7, S8_LASER, S8_LENGTHS, S8_MOMENTS
 from tests.faults.serial_rig import be_patient, stage, together

@@ -6,10 +6,10 @@ import random
 
 import pytest
 
-from drivers.ballbar.frames import Bad, FrameDecoder
-from simulators.ballbar.device import Settings
-from simulators.ballbar.wire import encode_ack, encode_info, encode_settings
-from simulators.faults.serial_bytes import garbage, sliced
+from abbe.drivers.ballbar.frames import Bad, FrameDecoder
+from abbe.simulators.ballbar.device import Settings
+from abbe.simulators.ballbar.wire import encode_ack, encode_info, encode_settings
+from abbe.simulators.faults.serial_bytes import garbage, sliced
 from tests.faults.contract import Observed, assert_fault_contract
 from tests.faults.modbus_bytes import COUNT, reply, request, taken
 from tests.faults.rows_serial import S2_KINDS, S2_SIZES, S2_WHERE, S9_READS, TYPES

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import LinkDown, WrongDevice
-from drivers.links.adapters import Adapter
-from simulators.ballbar.wire import IDENTIFY, START, STOP
-from simulators.faults.serial_box import FaultyBox
+from abbe.drivers.errors import LinkDown, WrongDevice
+from abbe.drivers.links.adapters import Adapter
+from abbe.simulators.ballbar.wire import IDENTIFY, START, STOP
+from abbe.simulators.faults.serial_box import FaultyBox
 from tests.faults.rows_serial import S1_MOMENTS, S1_REPLUG
 from tests.faults.serial_rig import Stage, be_patient, stage, together
 

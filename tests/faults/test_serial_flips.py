@@ -9,8 +9,8 @@ from collections import defaultdict
 
 import pytest
 
-from drivers.ballbar.frames import FrameDecoder
-from simulators.faults.serial_bytes import flipped
+from abbe.drivers.ballbar.frames import FrameDecoder
+from abbe.simulators.faults.serial_bytes import flipped
 from tests.faults.contract import Observed, assert_fault_contract
 from tests.faults.modbus_bytes import request, taken
 from tests.faults.rows_serial import INVISIBLE, INVISIBLE_BLIND, MBAP_CHECKED

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.ballbar.driver import SerialBallBar
-from drivers.errors import BadFrame, DeviceFault, DriverError, LinkDown, ReplyTimeout, SettingsChanged
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import parse_url
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.errors import BadFrame, DeviceFault, DriverError, LinkDown, ReplyTimeout, SettingsChanged
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import parse_url
 from tests.faults.contract import Record
 from tests.faults.rows_serial import S10, S11
 from tests.faults.serial_rig import Stage, be_patient, stage, together

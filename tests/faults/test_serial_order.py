@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.errors import LossyLine, Rebooted
-from simulators.faults.serial_bytes import cut, delayed, every_nth, repeated, swapped
+from abbe.drivers.errors import LossyLine, Rebooted
+from abbe.simulators.faults.serial_bytes import cut, delayed, every_nth, repeated, swapped
 from tests.faults.rows_serial import S5_COUNTS
 from tests.faults.serial_pure import honest, judged
 from tests.faults.serial_rig import stage

@@ -6,12 +6,12 @@ import random
 
 import pytest
 
-from drivers.ballbar.frames import Bad, FrameDecoder
-from drivers.errors import LinkDown, LossyLine
-from simulators.faults.scenario import Fault, FaultScenarioError, load, scenario
-from simulators.faults.serial_bytes import cut, every_nth, sliced
-from simulators.faults.serial_player import KINDS, play
-from simulators.faults.serial_uart import Uart, heard
+from abbe.drivers.ballbar.frames import Bad, FrameDecoder
+from abbe.drivers.errors import LinkDown, LossyLine
+from abbe.simulators.faults.scenario import Fault, FaultScenarioError, load, scenario
+from abbe.simulators.faults.serial_bytes import cut, every_nth, sliced
+from abbe.simulators.faults.serial_player import KINDS, play
+from abbe.simulators.faults.serial_uart import Uart, heard
 from tests.faults.serial_pure import honest
 from tests.faults.serial_rig import be_patient, stage
 

@@ -9,21 +9,21 @@ from pathlib import Path
 
 import pytest
 
-from service.devices.alone import alone
-from service.errors import (
+from abbe.service.devices.alone import alone
+from abbe.service.errors import (
     ProgramRuns,
     SpindleTurns,
     Stopped,
     UnsafeToMove,
 )
-from service.sequences.control import Control, State
-from service.sequences.rewind import end_of, way_back
-from service.sequences.steps import CampaignPlan, ChangeBar, FollowPath, MountBar, RecordPath, TakeBarOut
-from service.storage.store import Store
-from service.workflows.campaign_run import gone_on, items, mounted_anew
-from service.workflows.measure import Manner, measure
-from service.workflows.resume import resume
-from simulators.cnc.device import Hold
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.rewind import end_of, way_back
+from abbe.service.sequences.steps import CampaignPlan, ChangeBar, FollowPath, MountBar, RecordPath, TakeBarOut
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_run import gone_on, items, mounted_anew
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.resume import resume
+from abbe.simulators.cnc.device import Hold
 from tests.faults.sequencer_world import AtStep, InTest, bench, number, on_one_cup, small
 from tests.faults.test_going_on import broken_off, going_on, statuses, step_of, yes
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.api import LaserReading
-from drivers.errors import DeviceFault
-from service.errors import (
+from abbe.drivers.api import LaserReading
+from abbe.drivers.errors import DeviceFault
+from abbe.service.errors import (
     ConfigError,
     DoorOpen,
     EstopPressed,
@@ -24,16 +24,16 @@ from service.errors import (
     Stopped,
     WorldChanged,
 )
-from service.events import Progress
-from service.sequences.control import Control, State
-from service.sequences.interlocks import Suspending, Watching
-from service.sequences.journal import StoreJournal
-from service.sequences.steps import CampaignPlan, MoveTo, ReadBar, RecordPath
-from service.storage.store import Store
-from service.workflows import campaign_run
-from service.workflows.campaign_run import nobody
-from service.workflows.measure import Manner, measure
-from service.workflows.resume import begun_source
+from abbe.service.events import Progress
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.journal import StoreJournal
+from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, RecordPath
+from abbe.service.storage.store import Store
+from abbe.service.workflows import campaign_run
+from abbe.service.workflows.campaign_run import nobody
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.resume import begun_source
 from tests.faults.sequencer_world import AtStep, Bench, InTest, bench, number, small
 from tests.faults.test_going_on import SUSPENDING, broken_off, going_on, statuses, step_of
 
@@ -299,7 +299,7 @@ async def test_a_test_that_is_suspended_again_and_again_ends(place, monkeypatch)
 
 async def test_an_e_stop_is_told_although_the_journal_cannot_be_ended(place, monkeypatch):
     b, store = place
-    monkeypatch.setattr("service.workflows.measure.LAST_LINE_S", 0.0)
+    monkeypatch.setattr("abbe.service.workflows.measure.LAST_LINE_S", 0.0)
     add = store.add_checkpoint
 
     def refuses(campaign: int, kind: str, doc: dict) -> int:
@@ -308,7 +308,7 @@ async def test_an_e_stop_is_told_although_the_journal_cannot_be_ended(place, mon
         return add(campaign, kind, doc)
 
     def store_error() -> Exception:
-        from service.errors import StoreError
+        from abbe.service.errors import StoreError
 
         return StoreError("database is locked")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from service.formats.controls import CONTROLS
-from service.formats.proof import all_proofs
-from service.formats.registry import FORMATS
+from abbe.service.formats.controls import CONTROLS
+from abbe.service.formats.proof import all_proofs
+from abbe.service.formats.registry import FORMATS
 from tests.written_page import run
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.geometry.bases import smooth_terms
-from models.machine import Machine
-from models.volumetric import volume_grid
-from service.cli import run
-from service.formats.choice import Judge, best_of, choices
-from service.formats.controls import CONTROLS
-from service.formats.identified import Identified
-from service.formats.model import AxisTable, Compensation, correction_at
-from service.workflows.comp_export import export, identified
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.machine import Machine
+from abbe.models.volumetric import volume_grid
+from abbe.service.cli import run
+from abbe.service.formats.choice import Judge, best_of, choices
+from abbe.service.formats.controls import CONTROLS
+from abbe.service.formats.identified import Identified
+from abbe.service.formats.model import AxisTable, Compensation, correction_at
+from abbe.service.workflows.comp_export import export, identified
 
 STROKE = np.array([[0.0, 500.0], [-200.0, 200.0], [-300.0, 0.0]])
 MACHINE = Machine("w-X-b-Y-Z-t", STROKE, np.zeros((3, 3)), np.array([0.0, 0.0, -150.0]))
@@ -86,7 +86,7 @@ def test_residual_is_what_a_machine_would_show() -> None:
         left.append(known.deviation_mm(p) - 0.5 * way * lost + correction_at(comp, p, np.full(p.shape, float(way))))
     spread = np.concatenate(left)
     assert np.abs(left[0] - left[1]).max() < 2e-6  # lost motion is gone: moving in + and in − end at one place
-    from models.volumetric import remove_rigid
+    from abbe.models.volumetric import remove_rigid
 
     rms = np.sqrt(np.mean(np.sum(remove_rigid(np.concatenate([p, p]), spread) ** 2, axis=1)))
     assert rms < 0.0005

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.formats.model import AxisTable, Compensation, Curve, ProductTable, correction_at
-from service.formats.proof import all_proofs
-from service.formats.registry import FORMATS
-from service.formats.settings import Settings
-from service.formats.text import TextFile
+from abbe.service.formats.model import AxisTable, Compensation, Curve, ProductTable, correction_at
+from abbe.service.formats.proof import all_proofs
+from abbe.service.formats.registry import FORMATS
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.text import TextFile
 from tests.formats.page import PAGE, page
 
 # controllers.md 5.7, by hand: what +10 µm of error at 100 mm must be in each file.
@@ -209,7 +209,7 @@ X EXX EYX EZX EAX EBX ECX
 
 def test_isg_example_is_read_number_by_number() -> None:
     """Page 296429067. Its numbers have no one way of writing (0.02, 0.00): it comes back equal in value, not in bytes."""
-    from service.formats.proof import SETTINGS
+    from abbe.service.formats.proof import SETTINGS
 
     form = FORMATS["isg"]
     comp = form.read((TextFile("volcomp.csv", ISG),), SETTINGS)

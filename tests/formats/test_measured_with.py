@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from drivers.cnc.tables import TableImage, crc32, encode
-from service.cli import run
-from service.push.entries import GENESIS, follow
-from service.push.states import State
-from service.storage.records import PushEntryRecord
-from service.storage.store import Store
-from service.workflows.measured_with import distinct
+from abbe.drivers.cnc.tables import TableImage, crc32, encode
+from abbe.service.cli import run
+from abbe.service.push.entries import GENESIS, follow
+from abbe.service.push.states import State
+from abbe.service.storage.records import PushEntryRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measured_with import distinct
 from tests.formats.test_choice import _document, _known
 
 ACTING = encode(TableImage(1, 5, 100, (0.0, 0.0, 0.0), (100.0, 100.0, 100.0), (2, 2, 2), tuple(range(18))))

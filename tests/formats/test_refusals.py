@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.errors import FormatRefused, TableContradicts, TableFileError
-from service.formats.compare import check_same
-from service.formats.model import AxisTable, Compensation, Lattice
-from service.formats.registry import FORMATS
-from service.formats.settings import Settings
-from service.formats.text import TextFile
+from abbe.service.errors import FormatRefused, TableContradicts, TableFileError
+from abbe.service.formats.compare import check_same
+from abbe.service.formats.model import AxisTable, Compensation, Lattice
+from abbe.service.formats.registry import FORMATS
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.text import TextFile
 
 P = np.array([0.0, 100.0, 200.0])
 V = np.array([0.0, -0.010, 0.004])
@@ -53,7 +53,7 @@ BAD_FILES = [
 
 @pytest.mark.parametrize(("key", "name", "text", "said"), BAD_FILES)
 def test_bad_file_is_named_with_its_line(key: str, name: str, text: str, said: str) -> None:
-    from service.formats.proof import SETTINGS
+    from abbe.service.formats.proof import SETTINGS
 
     with pytest.raises(TableFileError, match=said):
         FORMATS[key].read((TextFile(name, text),), SETTINGS)

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.functions.motions import PLACES, SQUARENESS
-from models.machine import AXES, Machine
-from service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable
-from service.formats.registry import FORMATS, Format
-from service.formats.settings import Settings
+from abbe.models.functions.motions import PLACES, SQUARENESS
+from abbe.models.machine import AXES, Machine
+from abbe.service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable
+from abbe.service.formats.registry import FORMATS, Format
+from abbe.service.formats.settings import Settings
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [-400.0, 0.0], [-300.0, 100.0]]))
 EXACT_MM = 1e-9

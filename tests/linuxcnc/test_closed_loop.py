@@ -16,19 +16,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.cnc.driver import ModbusController
-from drivers.cnc.registers import Bit
-from drivers.cnc.second_decoder import read_axis_tables
-from drivers.cnc.tables import TableImage, encode
-from drivers.errors import Refused
-from models.compensation.grid import GridTable, grid_table, nodes_mm, quantise_grid
-from models.geometry.chain import travel_sign
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.joint import JointSolution, solve_joint
-from models.solvers.observations import RunData, block_average
-from models.solvers.observe import perpendicular
-from models.volumetric import field_figures
+from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.cnc.second_decoder import read_axis_tables
+from abbe.drivers.cnc.tables import TableImage, encode
+from abbe.drivers.errors import Refused
+from abbe.models.compensation.grid import GridTable, grid_table, nodes_mm, quantise_grid
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.solvers.observations import RunData, block_average
+from abbe.models.solvers.observe import perpendicular
+from abbe.models.volumetric import field_figures
 from tests.linuxcnc.instance import Instance
 from tests.linuxcnc.test_control import OWNER, controller, push, until
 from tests.linuxcnc.test_files import settled

@@ -11,20 +11,20 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.cnc.driver import ModbusController
-from drivers.cnc.registers import Bit
-from drivers.cnc.second_decoder import read_axis_tables
-from drivers.cnc.tables import TableImage, crc32, encode
-from drivers.errors import DeviceFault, Refused
-from drivers.registry import open_controller
-from models.compensation.tables import NineTables
-from service.devices.session import DeviceUrls
-from service.push.operations import Verdict
-from service.site import Site, machine_doc
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.commission_levels import commission_levels
-from service.workflows.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.cnc.second_decoder import read_axis_tables
+from abbe.drivers.cnc.tables import TableImage, crc32, encode
+from abbe.drivers.errors import DeviceFault, Refused
+from abbe.drivers.registry import open_controller
+from abbe.models.compensation.tables import NineTables
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.push.operations import Verdict
+from abbe.service.site import Site, machine_doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.commission_levels import commission_levels
+from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
 from tests.linuxcnc.instance import Instance
 from tests.mbpoll import poll_table
 from tests.physics.truth import MACHINE

@@ -6,12 +6,12 @@ import math
 
 import pytest
 
-from drivers.cnc.second_decoder import read_axis_tables
-from drivers.cnc.tables import TableImage, crc32, encode
-from drivers.errors import Refused
-from service.storage.store import Store
-from service.workflows.commission_levels import commission_levels
-from service.workflows.recover import accept
+from abbe.drivers.cnc.second_decoder import read_axis_tables
+from abbe.drivers.cnc.tables import TableImage, crc32, encode
+from abbe.drivers.errors import Refused
+from abbe.service.storage.store import Store
+from abbe.service.workflows.commission_levels import commission_levels
+from abbe.service.workflows.recover import accept
 from tests.linuxcnc.test_control import FEED, OWNER, controller, nine, push, site_of, until, wanted
 
 POINTS = 121

@@ -12,8 +12,8 @@ import sys
 from datetime import UTC, datetime
 from typing import Any
 
-from service.storage import records
-from service.storage.store import Store
+from abbe.service.storage import records
+from abbe.service.storage.store import Store
 
 NOW = datetime(2026, 11, 21, 3, 34, 5, 123456, tzinfo=UTC)
 DOC: dict[str, Any] = {"µm": 0.1, "list": [None, 1e-7, -0.0], "text": "ü'\"\n\\ 工", "large": 2**53 + 1}
@@ -85,7 +85,7 @@ def proposals(store: Any) -> None:
 
 def people(store: Any) -> None:
     """A user with a session and a token."""
-    from service.storage.store_people import TokenRecord
+    from abbe.service.storage.store_people import TokenRecord
 
     user = store.add_user("anna", "admin", "$argon2id$v=19$m=8,t=1,p=1$c2FsdA$aGFzaA")
     store.add_session(user, "5" * 64)
@@ -94,7 +94,7 @@ def people(store: Any) -> None:
 
 def audit(store: Any) -> None:
     """Two records of the audit, chained."""
-    from service.storage.store_audit import AuditRecord
+    from abbe.service.storage.store_audit import AuditRecord
 
     for number, prev in ((1, ""), (2, "1" * 64)):
         record = AuditRecord(
@@ -105,7 +105,7 @@ def audit(store: Any) -> None:
 
 def decisions(store: Any) -> None:
     """A no to a proposal, and the answer of a request with a key."""
-    from service.storage.store_decisions import RejectionRecord
+    from abbe.service.storage.store_decisions import RejectionRecord
 
     store.add_rejection(RejectionRecord(0, 1, "Bert", "bert", "too large ü", ""))
     store.claim_reply("anna", "order-4711", "7" * 64)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from service.storage.engine import make_engine
-from service.storage.migrate import current_revision, downgrade, head_revision, upgrade
-from service.storage.store import Store
+from abbe.service.storage.engine import make_engine
+from abbe.service.storage.migrate import current_revision, downgrade, head_revision, upgrade
+from abbe.service.storage.store import Store
 from tests.migration.keep_database import BYTES, DOC, MACHINE
 from tests.migration.keep_database import main as make_today
 from tests.migration.test_stored import kept, rows_of

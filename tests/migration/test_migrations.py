@@ -10,12 +10,12 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import Engine, inspect
 
-from service.errors import StoreError
-from service.storage.engine import make_engine
-from service.storage.migrate import current_revision, downgrade, head_revision, upgrade
-from service.storage.records import ApprovalRecord
-from service.storage.store import Store
-from service.storage.tables import metadata
+from abbe.service.errors import StoreError
+from abbe.service.storage.engine import make_engine
+from abbe.service.storage.migrate import current_revision, downgrade, head_revision, upgrade
+from abbe.service.storage.records import ApprovalRecord
+from abbe.service.storage.store import Store
+from abbe.service.storage.tables import metadata
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

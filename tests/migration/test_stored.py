@@ -14,9 +14,9 @@ import pytest
 from sqlalchemy import BigInteger, Engine, Float, Integer, LargeBinary, MetaData, Table, insert, select
 from sqlalchemy.types import JSON
 
-from service.storage.engine import make_engine
-from service.storage.migrate import current_revision, downgrade, head_revision, known_revisions, upgrade
-from service.storage.store import Store
+from abbe.service.storage.engine import make_engine
+from abbe.service.storage.migrate import current_revision, downgrade, head_revision, known_revisions, upgrade
+from abbe.service.storage.store import Store
 
 REVISIONS = sorted(known_revisions())
 Rows = dict[str, list[dict[str, Any]]]

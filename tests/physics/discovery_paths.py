@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrays import F1, F2
-from models.discovery.case import Case, CaseRun
-from models.effects.path import Path, Places, driven, standing
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import diagonal_ends, step_diagonal
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.effects.path import Path, Places, driven, standing
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import diagonal_ends, step_diagonal
 
 MACHINE = Machine("w-X-b-Y-Z-t", np.array([[0.0, 700.0], [0.0, 500.0], [0.0, 450.0]]))
 CENTRE = np.array([350.0, 250.0, 200.0])

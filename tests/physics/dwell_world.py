@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.alignment.dwell import Dwells, Planned, merged
-from models.paths.lines import cycles_of
+from abbe.models.alignment.dwell import Dwells, Planned, merged
+from abbe.models.paths.lines import cycles_of
 
 SETTLE_S = 0.3
 SAMPLE_S = 0.05

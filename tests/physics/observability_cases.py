@@ -6,22 +6,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.functions.monomials import monomials
-from models.geometry.bases import smooth_terms
-from models.geometry.chain import design, travel_sign
-from models.machine import Machine
-from models.notation import wang as wang_notation
-from models.notation import yang as yang_notation
-from models.notation.yang import workpiece_mm
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.observability_rank import Knowledge, Seen, campaign_columns, compressed, perfect_setup, stated_knowledge, what_is_seen
-from models.solvers.observations import RunData
-from models.solvers.observe import perpendicular, setup_unknowns
-from models.solvers.priors import Priors
-from models.volumetric import rigid_design, volume_grid
-from models.yang.complete import monomial_field
-from models.yang.origins import origin_plan
+from abbe.models.functions.monomials import monomials
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.chain import design, travel_sign
+from abbe.models.machine import Machine
+from abbe.models.notation import wang as wang_notation
+from abbe.models.notation import yang as yang_notation
+from abbe.models.notation.yang import workpiece_mm
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.observability_rank import (
+    Knowledge,
+    Seen,
+    campaign_columns,
+    compressed,
+    perfect_setup,
+    stated_knowledge,
+    what_is_seen,
+)
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import perpendicular, setup_unknowns
+from abbe.models.solvers.priors import Priors
+from abbe.models.volumetric import rigid_design, volume_grid
+from abbe.models.yang.complete import monomial_field
+from abbe.models.yang.origins import origin_plan
 
 TRAVEL = np.array([812.8, 495.0, 508.0])
 TOOL = np.array([0.0, 0.0, 150.0])

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.arrays import F1
-from models.effects.catalogue import CATALOGUE
-from models.effects.columns import AIR_PER_K
-from models.effects.probe_paths import DEAD_PATH_MM, probe_paths
-from simulators.hidden.instrument import AIR_PPM_PER_K
-from simulators.scenario import from_dict
-from simulators.truth.surroundings import Air
-from simulators.world import World
+from abbe.models.arrays import F1
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.columns import AIR_PER_K
+from abbe.models.effects.probe_paths import DEAD_PATH_MM, probe_paths
+from abbe.simulators.hidden.instrument import AIR_PPM_PER_K
+from abbe.simulators.scenario import from_dict
+from abbe.simulators.truth.surroundings import Air
+from abbe.simulators.world import World
 from tests.unit.simulators.conftest import QUIET
 
 BY_NAME = {e.name: e for e in CATALOGUE}

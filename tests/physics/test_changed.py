@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.discovery.changed import Changed, changed_since
-from models.discovery.changed_bench import LINEAR
-from models.solvers.joint import solve_joint
-from models.uncertainty.known_field import KnownField
+from abbe.models.discovery.changed import Changed, changed_since
+from abbe.models.discovery.changed_bench import LINEAR
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.uncertainty.known_field import KnownField
 from tests.physics.truth import MACHINE, Truth
 
 SEEDS = range(40) if os.environ.get("ABBE_TEST_LONG") == "1" else range(1)

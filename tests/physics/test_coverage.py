@@ -8,14 +8,14 @@ import os
 import numpy as np
 import pytest
 
-from models.compensation.additive import additive
-from models.compensation.summary import mean_linear
-from models.compensation.tables import nine_tables, predict_residual
-from models.geometry.chain import design
-from models.solvers.joint import JointSolution, solve_joint
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.sources import error_sources
-from models.volumetric import remove_rigid, rigid_design, volume_grid
+from abbe.models.compensation.additive import additive
+from abbe.models.compensation.summary import mean_linear
+from abbe.models.compensation.tables import nine_tables, predict_residual
+from abbe.models.geometry.chain import design
+from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.sources import error_sources
+from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 from tests.physics.truth import MACHINE, SIGMA, Truth, linear_parameters
 
 SEEDS = range(1, 11) if os.environ.get("ABBE_TEST_LONG") == "1" else range(1, 5)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
-from models.solvers.joint import JointSolution, solve_joint
+from abbe.models.solvers.joint import JointSolution, solve_joint
 from tests.campaigns.statistics import share
 from tests.physics.truth import MACHINE, Truth
 

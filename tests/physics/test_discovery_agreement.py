@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.discovery.agreement import NO_NOISE, TOO_FEW, _Noise, _tested, agreements
-from models.discovery.answer import Agreement, Unjudged
-from models.discovery.baseline import baseline_of
-from models.discovery.case import Case, CaseRun
-from models.discovery.prediction import Solved, predictions, solve
-from models.discovery.scene import Scene, scene_of
-from service.workflows.never_fitted import ALARM
-from simulators.hidden.cases import make_case
-from simulators.hidden.suite import write_case
+from abbe.models.discovery.agreement import NO_NOISE, TOO_FEW, _Noise, _tested, agreements
+from abbe.models.discovery.answer import Agreement, Unjudged
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.discovery.prediction import Solved, predictions, solve
+from abbe.models.discovery.scene import Scene, scene_of
+from abbe.service.workflows.never_fitted import ALARM
+from abbe.simulators.hidden.cases import make_case
+from abbe.simulators.hidden.suite import write_case
 from tests.bench.discovery_case import read_case
 
 FIRST_SEED = 5_910_000

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.arrays import F1
-from models.discovery.generic import generic_rivals, is_unnamed, where_of
-from models.discovery.generic_shapes import SIGNALS, place_at
-from models.effects.effect import Effect
-from models.effects.path import Path
+from abbe.models.arrays import F1
+from abbe.models.discovery.generic import generic_rivals, is_unnamed, where_of
+from abbe.models.discovery.generic_shapes import SIGNALS, place_at
+from abbe.models.effects.effect import Effect
+from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import campaign, case_of_paths, noise
 
 SIGMA = {"bar": 4e-4, "laser": 3e-4}

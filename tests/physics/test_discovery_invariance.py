@@ -1,7 +1,7 @@
 """What must not change the answer: being asked twice, the order of the runs, the names of the axes, how numbers are written.
 
-The cases come from `simulators.hidden`, whose formulas are its own. The exchange format has no units to choose (they are in its keys), so
-"units converted" means here what a converter may leave behind: numbers that went through another unit and back, and another zero of the
+The cases come from `abbe.simulators.hidden`, whose formulas are its own. The exchange format has no units to choose (they are in its keys),
+so "units converted" means here what a converter may leave behind: numbers that went through another unit and back, and another zero of the
 clock. Every question is asked of one or two cases, of all with ``ABBE_TEST_LONG=1``.
 """
 
@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.discovery.answer import Discovery
-from models.discovery.discover import discover
-from models.effects.catalogue import CATALOGUE
-from models.effects.path import Path
-from service.errors import MeasurementFault
-from service.runs.cases import case_of
-from service.site import machine_from_doc
-from simulators.hidden.cases import make_case
-from simulators.hidden.suite import campaign, run_file
+from abbe.models.discovery.answer import Discovery
+from abbe.models.discovery.discover import discover
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.path import Path
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.cases import case_of
+from abbe.service.site import machine_from_doc
+from abbe.simulators.hidden.cases import make_case
+from abbe.simulators.hidden.suite import campaign, run_file
 from tests.physics.discovery_frames import later, renamed, turned_machine, turned_run
 
 Doc = dict[str, Any]

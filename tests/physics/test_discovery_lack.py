@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.discovery.baseline import baseline_of
-from models.discovery.lack import floors, repeat_steps
-from models.discovery.next_offers import offers
-from models.discovery.scene import scene_of
-from service.runs.cases import case_of
-from service.runs.exchange import read_folder
-from service.site import machine_from_doc
-from service.workflows.discovery_words import verdict_of
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.lack import floors, repeat_steps
+from abbe.models.discovery.next_offers import offers
+from abbe.models.discovery.scene import scene_of
+from abbe.service.runs.cases import case_of
+from abbe.service.runs.exchange import read_folder
+from abbe.service.site import machine_from_doc
+from abbe.service.workflows.discovery_words import verdict_of
 from tests.unit.service.axis_bench import axis_case, found_in, searched, with_repeats
 
 BIFROST = (

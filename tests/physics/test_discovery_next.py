@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.discovery.next_offers import offers
-from models.discovery.next_test import Suspect, propose, prospects
-from models.effects.catalogue import CATALOGUE
-from models.effects.path import Path
+from abbe.models.discovery.next_offers import offers
+from abbe.models.discovery.next_test import Suspect, propose, prospects
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import bar, campaign, case_of_paths, circle
 
 EFFECTS = {e.name: e for e in CATALOGUE}

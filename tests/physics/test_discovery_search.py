@@ -8,20 +8,20 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.arrays import F1, F2
-from models.discovery.answer import Discovery
-from models.discovery.baseline import baseline_of
-from models.discovery.candidates import rows_for
-from models.discovery.case import Case, CaseRun, Role
-from models.discovery.discover import discover, fairly
-from models.discovery.noise import Colour, unscaled
-from models.discovery.scene import scene_of
-from models.discovery.selection import Contest, joined, weighed
-from models.discovery.space import Space
-from models.effects.catalogue import CATALOGUE
-from models.effects.path import Path, driven, standing
-from models.machine import Machine
-from service.workflows.discovery_answer import answer_doc
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.answer import Discovery
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.candidates import rows_for
+from abbe.models.discovery.case import Case, CaseRun, Role
+from abbe.models.discovery.discover import discover, fairly
+from abbe.models.discovery.noise import Colour, unscaled
+from abbe.models.discovery.scene import scene_of
+from abbe.models.discovery.selection import Contest, joined, weighed
+from abbe.models.discovery.space import Space
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.path import Path, driven, standing
+from abbe.models.machine import Machine
+from abbe.service.workflows.discovery_answer import answer_doc
 
 R, N = 100.0, 109
 MACHINE = Machine("w-X-b-Y-Z-t", np.array([[0.0, 400.0]] * 3))

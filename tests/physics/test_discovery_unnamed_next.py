@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.discovery.answer import Where
-from models.discovery.generic import generic_rivals
-from models.discovery.next_offers import offers
-from models.discovery.next_unnamed import propose_unnamed
-from models.discovery.unnamed import Structure
-from models.discovery.unseen import unseen
-from models.effects.path import Path
+from abbe.models.discovery.answer import Where
+from abbe.models.discovery.generic import generic_rivals
+from abbe.models.discovery.next_offers import offers
+from abbe.models.discovery.next_unnamed import propose_unnamed
+from abbe.models.discovery.unnamed import Structure
+from abbe.models.discovery.unseen import unseen
+from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import bar, campaign, case_of_paths, circle, laser
 
 INCLUDES = ("rigid6", "setup_centre_offset", "bar_length_error", "mirror_tilt")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.arrays import F1
-from models.discovery.variance import VarianceFinding, candidates, extra_variance
-from models.discovery.variance_mixture import contaminated
-from models.effects.path import Path
+from abbe.models.arrays import F1
+from abbe.models.discovery.variance import VarianceFinding, candidates, extra_variance
+from abbe.models.discovery.variance_mixture import contaminated
+from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import bar, campaign, circle, noise
 
 PATHS = campaign()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.arrays import F1
-from models.discovery.where import SIGNIFICANT, locate
-from models.discovery.where_signal import where_of_signal
+from abbe.models.arrays import F1
+from abbe.models.discovery.where import SIGNIFICANT, locate
+from abbe.models.discovery.where_signal import where_of_signal
 from tests.physics.discovery_paths import campaign, noise
 
 PATHS = campaign()

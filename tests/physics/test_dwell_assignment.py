@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from models.alignment.dwell import Planned, detect, named
-from models.alignment.matching import match, places_reach
+from abbe.models.alignment.dwell import Planned, detect, named
+from abbe.models.alignment.matching import match, places_reach
 from tests.physics.dwell_world import SETTLE_S, ZERO_MM, case, wrong_readings
 
 

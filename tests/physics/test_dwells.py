@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from models.alignment.dwell import Planned, detect, merged, named
-from models.alignment.stands import noise_of
+from abbe.models.alignment.dwell import Planned, detect, merged, named
+from abbe.models.alignment.stands import noise_of
 
 SETTLE_S = 0.3
 

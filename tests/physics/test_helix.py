@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.solvers.helix import LINEAR, fit_run
-from models.solvers.observations import RunData
-from models.solvers.priors import Priors
+from abbe.models.solvers.helix import LINEAR, fit_run
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import Priors
 from tests.physics.truth import PLACES, Truth
 
 

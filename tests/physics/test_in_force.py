@@ -8,20 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.compensation.smooth import smooth_of
-from models.compensation.tables import NineTables, model_uncertainty_mm, nine_tables, quantise
-from models.geometry.chain import travel_sign
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.in_force import LEAD_IN_MM, InForce
-from models.solvers.joint import JointSolution, solve_joint
-from models.solvers.observations import RunData, block_average
-from models.volumetric import remove_rigid, volume_grid
-from simulators.campaign.sampler import Conditions, Rig
-from simulators.scenario import MachineConfig, Scenario
-from simulators.truth.play import Play
-from simulators.truth.surroundings import drift
+from abbe.models.compensation.smooth import smooth_of
+from abbe.models.compensation.tables import NineTables, model_uncertainty_mm, nine_tables, quantise
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.in_force import LEAD_IN_MM, InForce
+from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.solvers.observations import RunData, block_average
+from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.simulators.campaign.sampler import Conditions, Rig
+from abbe.simulators.scenario import MachineConfig, Scenario
+from abbe.simulators.truth.play import Play
+from abbe.simulators.truth.surroundings import drift
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 QUIET = Conditions(bar_noise_mm=0.0, laser_noise_mm=0.0, outlier_share=0.0, bar_length_sd_mm=0.0, wavelength_sd=0.0, drift=False)

@@ -8,15 +8,15 @@ import os
 import numpy as np
 import pytest
 
-from models.compensation.summary import mean_linear
-from models.compensation.tables import nine_tables, predict_residual, quantise
-from models.paths.lines import diagonal_ends, straight_line
-from models.solvers.joint import JointSolution, solve_joint
-from models.solvers.observations import block_average, nominal_reading
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.sources import error_sources
-from models.verification import diagonal_figure, helix_figure
-from models.volumetric import field_figures, remove_rigid, rigid_design, volume_grid
+from abbe.models.compensation.summary import mean_linear
+from abbe.models.compensation.tables import nine_tables, predict_residual, quantise
+from abbe.models.paths.lines import diagonal_ends, straight_line
+from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.solvers.observations import block_average, nominal_reading
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.sources import error_sources
+from abbe.models.verification import diagonal_figure, helix_figure
+from abbe.models.volumetric import field_figures, remove_rigid, rigid_design, volume_grid
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 

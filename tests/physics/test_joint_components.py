@@ -5,10 +5,10 @@ import pytest
 from numpy.polynomial import legendre
 from scipy import stats
 
-from models.geometry.bases import smooth_terms
-from models.solvers.components import Components, Found, cautious, estimate, posterior, slope
-from models.solvers.information import Sums
-from models.solvers.priors import SMALLEST_BEND, Priors, SizeModel, size_model, smooth_shapes
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.solvers.components import Components, Found, cautious, estimate, posterior, slope
+from abbe.models.solvers.information import Sums
+from abbe.models.solvers.priors import SMALLEST_BEND, Priors, SizeModel, size_model, smooth_shapes
 from tests.physics.truth import MACHINE
 
 SIZES = SizeModel(np.ones(6), np.eye(6), (), 0.5, ("a", "b"), np.repeat(np.eye(2), 3, axis=0), np.array([2.0, 2.0]))

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.solvers.joint import JointSolution, solve_joint
-from models.solvers.noise import repeat_noise_mm
-from models.solvers.observations import RunData
-from models.solvers.observe import predict, setup_unknowns
-from models.solvers.order import folds
-from models.solvers.priors import Priors
-from models.solvers.residual_tests import residual_tests
-from models.solvers.robust import threshold, weights
+from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.solvers.noise import repeat_noise_mm
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import predict, setup_unknowns
+from abbe.models.solvers.order import folds
+from abbe.models.solvers.priors import Priors
+from abbe.models.solvers.residual_tests import residual_tests
+from abbe.models.solvers.robust import threshold, weights
 from tests.physics.truth import MACHINE, Truth
 
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from models.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
-from models.kwon.forensics import square_grid
-from models.kwon.geometry import Geometry
-from models.kwon.kinematics import forward, inverse
-from models.kwon.layout import FLATNESS, layout
-from models.kwon.planes import parallel_planes
-from models.kwon.surface import fit_surface
-from models.kwon.terms import CUBIC, IN_PLANE, regressors
+from abbe.models.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
+from abbe.models.kwon.forensics import square_grid
+from abbe.models.kwon.geometry import Geometry
+from abbe.models.kwon.kinematics import forward, inverse
+from abbe.models.kwon.layout import FLATNESS, layout
+from abbe.models.kwon.planes import parallel_planes
+from abbe.models.kwon.surface import fit_surface
+from abbe.models.kwon.terms import CUBIC, IN_PLANE, regressors
 
 NOMINAL = Geometry(100.0, 30.0, 101.26, 8.0, 8.0, np.radians(35.0), 20.0)  # type: ignore[arg-type]
 RANK = {1: 10, 2: 16, 3: 19}

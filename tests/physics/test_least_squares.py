@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.solvers.least_squares import solve_map
+from abbe.models.solvers.least_squares import solve_map
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.arrays import F1
-from models.discovery.case import CaseRun
-from models.discovery.prediction import left_over, left_together
-from models.effects.bar_thermal import relaxing
-from models.paths.helix import Law, even_helix_points, helix_points
-from service.runs.cases import case_of
+from abbe.models.arrays import F1
+from abbe.models.discovery.case import CaseRun
+from abbe.models.discovery.prediction import left_over, left_together
+from abbe.models.effects.bar_thermal import relaxing
+from abbe.models.paths.helix import Law, even_helix_points, helix_points
+from abbe.service.runs.cases import case_of
 from tests.physics.discovery_paths import MACHINE, campaign
 
 PATHS = [p for p in campaign() if p.setup == "B"]

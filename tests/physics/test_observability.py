@@ -9,20 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.geometry.bases import smooth_terms
-from models.geometry.chain import all_chains, design, travel_sign
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.joint import solve_joint
-from models.solvers.observability import observability, observability_of, posterior_covariance
-from models.solvers.observability_parameters import correlations, observable_motions, status_of
-from models.solvers.observability_rank import campaign_columns, compressed, stated_knowledge, with_knowledge
-from models.solvers.observability_volume import inner_box
-from models.solvers.observations import RunData
-from models.solvers.observe import predict, setup_unknowns
-from models.solvers.priors import Priors, size_model
-from models.volumetric import remove_rigid, volume_grid
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.chain import all_chains, design, travel_sign
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observability import observability, observability_of, posterior_covariance
+from abbe.models.solvers.observability_parameters import correlations, observable_motions, status_of
+from abbe.models.solvers.observability_rank import campaign_columns, compressed, stated_knowledge, with_knowledge
+from abbe.models.solvers.observability_volume import inner_box
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import predict, setup_unknowns
+from abbe.models.solvers.priors import Priors, size_model
+from abbe.models.volumetric import remove_rigid, volume_grid
 from tests.physics.observability_cases import ONE, YANG, laser
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 

@@ -10,14 +10,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.compensation.per_motion import observable_alone
-from models.machine import Machine
-from models.paths.lines import diagonal_ends, step_diagonal, straight_line
-from models.solvers.joint import solve_joint
-from models.solvers.observability import motions_of, observability, observability_of
-from models.solvers.observe import setup_unknowns
-from models.solvers.priors import Priors
-from models.solvers.rounding import as_meant
+from abbe.models.compensation.per_motion import observable_alone
+from abbe.models.machine import Machine
+from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observability import motions_of, observability, observability_of
+from abbe.models.solvers.observe import setup_unknowns
+from abbe.models.solvers.priors import Priors
+from abbe.models.solvers.rounding import as_meant
 from tests.physics.observability_cases import FXYZ, ONE, STEPS, TEN, YANG, helix, laser
 
 BOX = np.array([[0.0, 500.0], [0.0, 400.0], [0.0, 300.0]])

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.geometry.bases import smooth_terms
-from models.solvers.observability import observability
-from models.solvers.observability_cures import Campaign, count_seen, trials
-from models.solvers.observability_rank import Knowledge, campaign_columns, compressed
-from models.solvers.observe import setup_unknowns
-from models.solvers.priors import Priors
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.solvers.observability import observability
+from abbe.models.solvers.observability_cures import Campaign, count_seen, trials
+from abbe.models.solvers.observability_rank import Knowledge, campaign_columns, compressed
+from abbe.models.solvers.observe import setup_unknowns
+from abbe.models.solvers.priors import Priors
 from tests.physics.observability_cases import (
     FXYZ,
     ONE,

@@ -10,18 +10,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.geometry.bases import smooth_terms, term_values
-from models.geometry.chain import all_chains, travel_sign
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.observations import RunData, nominal_reading
-from models.solvers.observe import linearise, perpendicular, predict, run_design, run_jacobian, setup_unknowns
-from models.solvers.priors import Priors, term_prior_sd
-from simulators.scenario import MachineConfig
-from simulators.truth.machine import Geometry
-from simulators.truth.machine import Machine as TrueMachine
-from simulators.truth.play import Play
+from abbe.models.geometry.bases import smooth_terms, term_values
+from abbe.models.geometry.chain import all_chains, travel_sign
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.observations import RunData, nominal_reading
+from abbe.models.solvers.observe import linearise, perpendicular, predict, run_design, run_jacobian, setup_unknowns
+from abbe.models.solvers.priors import Priors, term_prior_sd
+from abbe.simulators.scenario import MachineConfig
+from abbe.simulators.truth.machine import Geometry
+from abbe.simulators.truth.machine import Machine as TrueMachine
+from abbe.simulators.truth.play import Play
 
 STROKE = np.array([[0.0, 600.0], [-50.0, 450.0], [20.0, 470.0]])
 TERMS = smooth_terms(4)
@@ -170,7 +170,7 @@ def truth_of(machine: Machine, theta: np.ndarray, tool_mm: np.ndarray | None) ->
 @pytest.mark.parametrize("chain", ["w-b-X-Y-Z-t", "w-X-Y-b-Z-t", "w-Z-b-X-Y-t", "w-Y-X-Z-b-t", "w-X-b-Y-Z-t"])
 @pytest.mark.parametrize("lost_motion", [False, True])
 def test_the_independent_simulator_reads_the_same(chain, lost_motion):
-    """Positions from `simulators.truth` (its own transforms and play), instruments written out here from math.md 4.2 and 5.4.
+    """Positions from `abbe.simulators.truth` (its own transforms and play), instruments written out here from math.md 4.2 and 5.4.
 
     With lost motion the simulator's errors are those of the place where the axis stands, the model's of the commanded one: 1e-3 of 25 um.
     Where a drive has not yet taken up its play after a turn, the model has the axis at its end: such readings are left out here.

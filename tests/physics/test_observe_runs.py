@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.geometry.bases import smooth_terms
-from models.geometry.chain import travel_sign
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import diagonal_ends, step_diagonal, straight_line
-from models.solvers.observations import RunData, block_average, nominal_reading, reading_noise_mm
-from models.solvers.observe import bar_normals, predict, setup_unknowns
-from models.solvers.priors import Priors
-from service.errors import MeasurementFault
-from service.runs.observations import BLOCKS, bar_noise_mm, run_data
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.observations import RunData, block_average, nominal_reading, reading_noise_mm
+from abbe.models.solvers.observe import bar_normals, predict, setup_unknowns
+from abbe.models.solvers.priors import Priors
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.observations import BLOCKS, bar_noise_mm, run_data
 
 CENTRE = np.array([300.0, 250.0, 100.0])
 NOISE_MM = 5e-4

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from models.functions.line_fit import straight_line
-from models.notation.pahk import (
+from abbe.models.functions.line_fit import straight_line
+from abbe.models.notation.pahk import (
     TYPES,
     iso_squareness,
     motions_from_pahk,
@@ -13,9 +13,9 @@ from models.notation.pahk import (
     pahk_squareness,
     pahk_type,
 )
-from models.pahk.diagonals import length_deviation, space_diagonals
-from models.pahk.tables import ParameterTables
-from models.pahk.volume_map import chain_deviation_mm, volumetric_map
+from abbe.models.pahk.diagonals import length_deviation, space_diagonals
+from abbe.models.pahk.tables import ParameterTables
+from abbe.models.pahk.volume_map import chain_deviation_mm, volumetric_map
 
 
 def first_order(name, p, d, e, square):

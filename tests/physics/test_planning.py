@@ -12,19 +12,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.geometry.bases import DIRECTIONS
-from models.geometry.chain import all_chains
-from models.machine import Machine
-from models.paths.lines import DIAGONALS
-from models.planning.candidates import candidates, opening
-from models.planning.information import factor, field_rows, mounting_information, problem, scale_temperature_mm2
-from models.planning.instruments import Instruments, SetupMinutes
-from models.planning.measurements import DiagonalTest, HelixTest, LineTest, expected_run, machine_seconds
-from models.planning.plan import plan_campaign, uncertainty_mm
-from models.planning.search import extra_minutes
-from models.solvers.observe import run_design, setup_unknowns
-from models.solvers.priors import Priors
-from models.uncertainty.inputs import Inputs
+from abbe.models.geometry.bases import DIRECTIONS
+from abbe.models.geometry.chain import all_chains
+from abbe.models.machine import Machine
+from abbe.models.paths.lines import DIAGONALS
+from abbe.models.planning.candidates import candidates, opening
+from abbe.models.planning.information import factor, field_rows, mounting_information, problem, scale_temperature_mm2
+from abbe.models.planning.instruments import Instruments, SetupMinutes
+from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, expected_run, machine_seconds
+from abbe.models.planning.plan import plan_campaign, uncertainty_mm
+from abbe.models.planning.search import extra_minutes
+from abbe.models.solvers.observe import run_design, setup_unknowns
+from abbe.models.solvers.priors import Priors
+from abbe.models.uncertainty.inputs import Inputs
 from tests.campaigns.planner_against_papers import compare, machines
 
 MACHINE = Machine(

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.planning.instruments import Instruments
-from models.planning.plan import plan_campaign
-from models.solvers.joint import solve_joint
-from models.uncertainty.frame import volume_frame
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import error_sources
-from models.volumetric import volume_grid
-from simulators.campaign.sampler import Conditions, Rig
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.plan import plan_campaign
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.uncertainty.frame import volume_frame
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.sources import error_sources
+from abbe.models.volumetric import volume_grid
+from abbe.simulators.campaign.sampler import Conditions, Rig
 from tests.campaigns.accuracy_plan import measured
 from tests.campaigns.population import draw_machine
 

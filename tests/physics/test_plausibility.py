@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from models.solvers.evidence import Part, conditional, scatter, together
-from models.solvers.plausibility import suspects
+from abbe.models.solvers.evidence import Part, conditional, scatter, together
+from abbe.models.solvers.plausibility import suspects
 from tests.physics.truth import MACHINE, Truth
 
 CONSTANT = 0.5 * np.log(2 * np.pi)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.discovery.repeats import P_LIMIT, repeat_drift
+from abbe.models.discovery.repeats import P_LIMIT, repeat_drift
 
 PLACES = np.tile(np.arange(10.0), 5)
 TIMES = 60.0 * np.arange(50.0)

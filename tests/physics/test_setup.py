@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.compensation.summary import mean_linear
-from models.solvers.joint import solve_joint
-from models.solvers.observe import setup_unknowns
-from models.solvers.priors import Priors
-from models.volumetric import remove_rigid, volume_grid
-from service.errors import MeasurementFault
-from service.runs.observations import run_data
+from abbe.models.compensation.summary import mean_linear
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observe import setup_unknowns
+from abbe.models.solvers.priors import Priors
+from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.observations import run_data
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 LONG = np.array([0.0, 0.0, -240.0])

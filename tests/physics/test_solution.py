@@ -5,15 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from models.paths.lines import DIAGONALS
-from models.solvers.observations import RunData
-from service.cli.solve import _print
-from service.devices.session import DeviceUrls
-from service.errors import InstrumentsDisagree
-from service.site import Site, machine_doc
-from service.workflows.demo_report import parameter_rows
-from service.workflows.solve import Solved, solve_runs
-from service.workflows.solve_report import account, solution_doc
+from abbe.models.paths.lines import DIAGONALS
+from abbe.models.solvers.observations import RunData
+from abbe.service.cli.solve import _print
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.errors import InstrumentsDisagree
+from abbe.service.site import Site, machine_doc
+from abbe.service.workflows.demo_report import parameter_rows
+from abbe.service.workflows.solve import Solved, solve_runs
+from abbe.service.workflows.solve_report import account, solution_doc
 from tests.physics.truth import MACHINE, Truth
 
 SITE = Site("sim", MACHINE, machine_doc("sim", MACHINE), DeviceUrls())

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-import models.compensation.additive as additive
-from models.compensation.tables import nine_tables
-from models.paths.lines import DIAGONALS, diagonal_ends
-from models.solvers.joint import solve_joint
-from models.volumetric import field_figures, volume_grid
+import abbe.models.compensation.additive as additive
+from abbe.models.compensation.tables import nine_tables
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.volumetric import field_figures, volume_grid
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 
 

@@ -7,20 +7,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.compensation.additive import additive
-from models.compensation.distances import correction_error_mm, figures, inner_box_mm, pair_design, predict_distances, random_pairs
-from models.compensation.grid import check_steps, grid_table, node_design, nodes_mm, quantisation_mm, quantise_grid
-from models.compensation.interpolation import cells, fit_positions, trilinear
-from models.compensation.tables import grid_positions, model_uncertainty_mm, nine_tables
-from models.geometry.chain import design
-from models.solvers.joint import solve_joint
-from models.solvers.observations import block_average
-from models.uncertainty.frame import RigidFree
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.mask import compensable_mask
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import error_sources
-from models.volumetric import remove_rigid, rigid_design, volume_grid
+from abbe.models.compensation.additive import additive
+from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, pair_design, predict_distances, random_pairs
+from abbe.models.compensation.grid import check_steps, grid_table, node_design, nodes_mm, quantisation_mm, quantise_grid
+from abbe.models.compensation.interpolation import cells, fit_positions, trilinear
+from abbe.models.compensation.tables import grid_positions, model_uncertainty_mm, nine_tables
+from abbe.models.geometry.chain import design
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observations import block_average
+from abbe.models.uncertainty.frame import RigidFree
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.mask import compensable_mask
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.sources import error_sources
+from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 from tests.physics.truth import MACHINE, Truth
 
 PAIRS = random_pairs(inner_box_mm(MACHINE), 3000, seed=5)

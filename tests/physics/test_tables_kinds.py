@@ -6,18 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.compensation.achievable import achievable
-from models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
-from models.compensation.grid import quantisation_mm
-from models.compensation.one_axis import cross_only, positioning_only, squareness_tables
-from models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
-from models.compensation.stages import Stage, applied, at_corrected_position, of_corrected_position, second_order_mm
-from models.compensation.summary import SQUARENESS, mean_linear
-from models.compensation.tables import NineTables, nine_tables, quantise
-from models.solvers.joint import solve_joint
-from models.solvers.observability import observability_of
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.sources import error_sources
+from abbe.models.compensation.achievable import achievable
+from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
+from abbe.models.compensation.grid import quantisation_mm
+from abbe.models.compensation.one_axis import cross_only, positioning_only, squareness_tables
+from abbe.models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
+from abbe.models.compensation.stages import Stage, applied, at_corrected_position, of_corrected_position, second_order_mm
+from abbe.models.compensation.summary import SQUARENESS, mean_linear
+from abbe.models.compensation.tables import NineTables, nine_tables, quantise
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observability import observability_of
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.sources import error_sources
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 
 COUNTS = (25, 21, 19)

@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg
 
-from models.compensation.distances import inner_box_mm, random_pairs
-from models.compensation.grid import compensable_nodes, grid_table, nodes_mm
-from models.compensation.interpolation import trilinear
-from models.compensation.masking import blend
-from models.solvers.joint import solve_joint
-from models.solvers.observations import block_average
-from models.volumetric import remove_rigid, rigid_design
+from abbe.models.compensation.distances import inner_box_mm, random_pairs
+from abbe.models.compensation.grid import compensable_nodes, grid_table, nodes_mm
+from abbe.models.compensation.interpolation import trilinear
+from abbe.models.compensation.masking import blend
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observations import block_average
+from abbe.models.volumetric import remove_rigid, rigid_design
 from tests.physics.truth import MACHINE, Truth
 
 NODES = (np.linspace(0.0, 600.0, 5), np.linspace(0.0, 500.0, 4), np.linspace(0.0, 450.0, 4))

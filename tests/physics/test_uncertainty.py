@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.geometry.chain import design
-from models.solvers.joint import solve_joint
-from models.solvers.least_squares import solve_map
-from models.solvers.observe import run_design
-from models.uncertainty import prediction as module
-from models.uncertainty.budget import budget_over
-from models.uncertainty.frame import RigidFree, rigid_at, volume_frame
-from models.uncertainty.inputs import STEEL_PER_K, Inputs
-from models.uncertainty.mask import compensable_mask
-from models.uncertainty.order import omitted_prior_sd
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.response import response
-from models.uncertainty.sources import WORDS, error_sources
-from models.volumetric import remove_rigid, volume_grid
+from abbe.models.geometry.chain import design
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.least_squares import solve_map
+from abbe.models.solvers.observe import run_design
+from abbe.models.uncertainty import prediction as module
+from abbe.models.uncertainty.budget import budget_over
+from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
+from abbe.models.uncertainty.inputs import STEEL_PER_K, Inputs
+from abbe.models.uncertainty.mask import compensable_mask
+from abbe.models.uncertainty.order import omitted_prior_sd
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.response import response
+from abbe.models.uncertainty.sources import WORDS, error_sources
+from abbe.models.volumetric import remove_rigid, volume_grid
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 
 GRID = volume_grid(MACHINE.stroke_mm, 4)

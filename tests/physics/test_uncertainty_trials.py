@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.solvers.joint import solve_joint
-from models.solvers.observations import block_average
-from models.uncertainty import campaign_trials as module
-from models.uncertainty.campaign_trials import LIMITS, campaign_trials
-from models.uncertainty.distributions import Distribution
-from models.uncertainty.frame import RigidFree, rigid_at, volume_frame
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import error_sources
-from models.volumetric import rigid_design, volume_grid
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observations import block_average
+from abbe.models.uncertainty import campaign_trials as module
+from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
+from abbe.models.uncertainty.distributions import Distribution
+from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.sources import error_sources
+from abbe.models.volumetric import rigid_design, volume_grid
 from tests.campaigns.population import draw_case
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 

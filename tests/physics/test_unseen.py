@@ -5,14 +5,14 @@ import os
 import numpy as np
 import pytest
 
-from models.compensation.grid import compensable_nodes, grid_positions, nodes_mm
-from models.solvers.joint import solve_joint
-from models.solvers.observe import predict, run_jacobian
-from models.solvers.priors import Priors, term_prior_sd
-from models.uncertainty.frame import RigidFree
-from models.uncertainty.prediction import predict_deviation
-from models.uncertainty.sources import error_sources
-from models.uncertainty.unseen import NO_TRACE_SIGMA, unseen_directions, unseen_mm
+from abbe.models.compensation.grid import compensable_nodes, grid_positions, nodes_mm
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observe import predict, run_jacobian
+from abbe.models.solvers.priors import Priors, term_prior_sd
+from abbe.models.uncertainty.frame import RigidFree
+from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.sources import error_sources
+from abbe.models.uncertainty.unseen import NO_TRACE_SIGMA, unseen_directions, unseen_mm
 from tests.campaigns.population import draw_case
 from tests.campaigns.scoring import INPUTS, judge
 

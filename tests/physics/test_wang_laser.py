@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from models.functions.monomials import ErrorArrays
-from models.geometry.chain import deviation_mm
-from models.notation.wang import ACUTE_FROM_OBTUSE, iso_motions, iso_squareness, machine
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
-from models.solvers.step_diagonal import (
+from abbe.models.functions.monomials import ErrorArrays
+from abbe.models.geometry.chain import deviation_mm
+from abbe.models.notation.wang import ACUTE_FROM_OBTUSE, iso_motions, iso_squareness, machine
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.solvers.step_diagonal import (
     closure_mm,
     demeaned,
     increments,
@@ -17,8 +17,8 @@ from models.solvers.step_diagonal import (
     wang_eq7,
     wang_four,
 )
-from models.wang.angular import abbe_and_spurious_eq7, closure_of_angles_mm, false_straightness_mm
-from models.wang.mirror import (
+from abbe.models.wang.angular import abbe_and_spurious_eq7, closure_of_angles_mm, false_straightness_mm
+from abbe.models.wang.mirror import (
     cosine_error,
     diagonal_beam,
     mirror_normal,
@@ -29,8 +29,8 @@ from models.wang.mirror import (
     tilt_bias_eq7,
     tilt_closure_mm,
 )
-from models.wang.model import displacement_eq11, displacement_eq11_printed, position_error_eq9, position_error_eq9_printed
-from models.wang.squareness import (
+from abbe.models.wang.model import displacement_eq11, displacement_eq11_printed, position_error_eq9, position_error_eq9_printed
+from abbe.models.wang.squareness import (
     AcuteSquareness,
     bias_eq13,
     common_scale,

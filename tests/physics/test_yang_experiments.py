@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from models.functions.monomials import error_arrays, monomials
-from models.notation.yang import workpiece_mm
-from models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution, stacked
-from models.wang.experiments import Plan as LaserPlan
-from models.wang.experiments import distance_errors_mm, interpolated_mm, problem, readings
-from models.wang.model import monomial_errors as wang_errors
-from models.wang.model import monomial_field as wang_field
-from models.wang.model import position_error_eq9
-from models.yang.complete import delta_eq1, monomial_errors, monomial_field
-from models.yang.experiments import Plan, all_helices, one_helix, step_diagonals, together, vector_map
-from models.yang.origins import origin_plan
+from abbe.models.functions.monomials import error_arrays, monomials
+from abbe.models.notation.yang import workpiece_mm
+from abbe.models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution, stacked
+from abbe.models.wang.experiments import Plan as LaserPlan
+from abbe.models.wang.experiments import distance_errors_mm, interpolated_mm, problem, readings
+from abbe.models.wang.model import monomial_errors as wang_errors
+from abbe.models.wang.model import monomial_field as wang_field
+from abbe.models.wang.model import position_error_eq9
+from abbe.models.yang.complete import delta_eq1, monomial_errors, monomial_field
+from abbe.models.yang.experiments import Plan, all_helices, one_helix, step_diagonals, together, vector_map
+from abbe.models.yang.origins import origin_plan
 
 TRAVEL, TOOL = np.array([812.8, 495.0, 508.0]), np.array([0.0, 0.0, 150.0])
 ORIGINS = origin_plan(np.stack([np.zeros(3), TRAVEL], axis=1))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from models.machine import Machine
-from service.errors import ConfigError
-from service.sequences.recipes import Helix
+from abbe.models.machine import Machine
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.recipes import Helix
 
 MACHINE = Machine("w-b-X-Y-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from random import Random
 
-from service.push.candidate import Candidate, Column, Evidence, Scene, Seal
-from service.push.validate import content_digest
+from abbe.service.push.candidate import Candidate, Column, Evidence, Scene, Seal
+from abbe.service.push.validate import content_digest
 
 LSB_MM = 1e-4
 NOW_S = 1.8e9

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from drivers.cnc.tables import encode
-from service.workflows.tables import table_image
+from abbe.drivers.cnc.tables import encode
+from abbe.service.workflows.tables import table_image
 from tests.push.pushing_child import tables
 
 FIRST, OTHER = 40, 60

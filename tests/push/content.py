@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.cnc.tables import NO_CORRECTION, TableImage, encode
-from models.compensation.tables import NineTables
+from abbe.drivers.cnc.tables import NO_CORRECTION, TableImage, encode
+from abbe.models.compensation.tables import NineTables
 
 
 def tables(scale: int, sign: int = 1) -> NineTables:

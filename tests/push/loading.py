@@ -22,8 +22,8 @@ Edits = tuple[tuple[str, str, str], ...]
 
 def real() -> SimpleNamespace:
     """The modules as they are."""
-    found = {name: import_module(f"service.push.{name}") for name in NAMES}
-    return SimpleNamespace(**found, codec=import_module("service.workflows.tables"))
+    found = {name: import_module(f"abbe.service.push.{name}") for name in NAMES}
+    return SimpleNamespace(**found, codec=import_module("abbe.service.workflows.tables"))
 
 
 def edited(edits: Edits) -> SimpleNamespace:
@@ -37,7 +37,11 @@ def edited(edits: Edits) -> SimpleNamespace:
         sources[module] = sources[module].replace(old, new)
     made = {}
     for name in ("second_decoder", *NAMES, "codec"):
-        text = sources[name].replace("service.push.", f"{package}.").replace("drivers.cnc.second_decoder", f"{package}.second_decoder")
+        text = (
+            sources[name]
+            .replace("abbe.service.push.", f"{package}.")
+            .replace("abbe.drivers.cnc.second_decoder", f"{package}.second_decoder")
+        )
         module = ModuleType(f"{package}.{name}")
         sys.modules[f"{package}.{name}"] = module
         exec(compile(text, f"{package}/{name}.py", "exec"), module.__dict__)

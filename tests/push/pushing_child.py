@@ -18,21 +18,21 @@ from typing import Any
 
 import numpy as np
 
-from drivers.cnc.tables import encode
-from drivers.registry import open_controller
-from models.compensation.tables import NineTables
-from service.clock import SystemClock
-from service.errors import AbbeError
-from service.push import operations as o
-from service.push.adapter import ControllerPort, People
-from service.push.approval import approval_digest
-from service.push.book import StoreBook, read_entries
-from service.push.conduct import push, recover
-from service.push.entries import check_chain, facts
-from service.push.meaning import meaning_of_tables
-from service.push.order import Order
-from service.storage.store import Store
-from service.workflows.tables import table_image
+from abbe.drivers.cnc.tables import encode
+from abbe.drivers.registry import open_controller
+from abbe.models.compensation.tables import NineTables
+from abbe.service.clock import SystemClock
+from abbe.service.errors import AbbeError
+from abbe.service.push import operations as o
+from abbe.service.push.adapter import ControllerPort, People
+from abbe.service.push.approval import approval_digest
+from abbe.service.push.book import StoreBook, read_entries
+from abbe.service.push.conduct import push, recover
+from abbe.service.push.entries import check_chain, facts
+from abbe.service.push.meaning import meaning_of_tables
+from abbe.service.push.order import Order
+from abbe.service.storage.store import Store
+from abbe.service.workflows.tables import table_image
 
 MACHINE = "sim"
 

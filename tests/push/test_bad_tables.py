@@ -7,9 +7,9 @@ from random import Random
 
 import pytest
 
-from service.push.candidate import Candidate, Scene
-from service.push.limits import PushLimits
-from service.push.validate import reasons_against
+from abbe.service.push.candidate import Candidate, Scene
+from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import reasons_against
 from tests.push.bad_tables import CLASSES, EACH, LSB_MM, NOW_S, good, signed
 from tests.push.loading import real
 from tests.push.world import Case, World

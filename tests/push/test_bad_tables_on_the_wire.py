@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.compensation.tables import NineTables
-from service.errors import TableRefused
-from service.push.book import read_entries
-from service.push.limits import PushLimits
-from service.push.operations import Verdict
-from service.push.states import State
-from service.push.validate import reasons_against
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.models.compensation.tables import NineTables
+from abbe.service.errors import TableRefused
+from abbe.service.push.book import read_entries
+from abbe.service.push.limits import PushLimits
+from abbe.service.push.operations import Verdict
+from abbe.service.push.states import State
+from abbe.service.push.validate import reasons_against
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.pushing import Pushing, Questions, Wanted
 from tests.faults.sequencer_world import bench
 from tests.push.bad_tables import CLASSES, EACH, good
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.solvers.observations import RunData
-from service.devices.session import DeviceUrls
-from service.site import Site, machine_doc
+from abbe.models.solvers.observations import RunData
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.site import Site, machine_doc
 from tests.campaigns import population
 
 Doc = dict[str, Any]

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-ABBE = [sys.executable, "-c", "from service.cli import main; main()"]
+ABBE = [sys.executable, "-c", "from abbe.service.cli import main; main()"]
 
 
 @dataclass
@@ -46,7 +46,7 @@ def machine_toml(ready: dict[str, Any], extra: str = "") -> str:
     return "\n".join(lines) + "\n" + extra + "\n"
 
 
-SIMULATORS = (sys.executable, "-m", "simulators")
+SIMULATORS = (sys.executable, "-m", "abbe.simulators")
 
 
 @contextmanager

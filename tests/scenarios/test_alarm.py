@@ -13,35 +13,35 @@ from typing import Any
 
 import pytest
 
-from service.audit.book import AuditBook
-from service.cli import run
-from service.cli.serve import duties_on
-from service.clock import SystemClock
-from service.config import load_machine
-from service.config_timetable import AlarmSection
-from service.devices.session import open_session
-from service.errors import StoreError
-from service.events import ProgressSink
-from service.push.limits import PushLimits
-from service.scheduler.desk import AlarmDesk, Telling
-from service.scheduler.job import CheckJob
-from service.scheduler.keep import StoreLedger, StoreShelf
-from service.scheduler.loop import Scheduler, Terms
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.sequences.campaigns import identification
-from service.sequences.control import Control
-from service.sequences.interlocks import Watching
-from service.sequences.steps import CampaignPlan
-from service.site import Site, site_of
-from service.web.board import Board
-from service.web.view import View
-from service.workflows.alarm_states import Alarm, Kind
-from service.workflows.alarms import acknowledge, alarms_of
-from service.workflows.check import CheckResult, run_check
-from service.workflows.proposal_checks import approve
-from service.workflows.proposal_doc import load
-from service.workflows.proposal_states import standing
+from abbe.service.audit.book import AuditBook
+from abbe.service.cli import run
+from abbe.service.cli.serve import duties_on
+from abbe.service.clock import SystemClock
+from abbe.service.config import load_machine
+from abbe.service.config_timetable import AlarmSection
+from abbe.service.devices.session import open_session
+from abbe.service.errors import StoreError
+from abbe.service.events import ProgressSink
+from abbe.service.push.limits import PushLimits
+from abbe.service.scheduler.desk import AlarmDesk, Telling
+from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.keep import StoreLedger, StoreShelf
+from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.campaigns import identification
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, site_of
+from abbe.service.web.board import Board
+from abbe.service.web.view import View
+from abbe.service.workflows.alarm_states import Alarm, Kind
+from abbe.service.workflows.alarms import acknowledge, alarms_of
+from abbe.service.workflows.check import CheckResult, run_check
+from abbe.service.workflows.proposal_checks import approve
+from abbe.service.workflows.proposal_doc import load
+from abbe.service.workflows.proposal_states import standing
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
 from tests.scenarios.conftest import Sims
 
@@ -73,7 +73,7 @@ class Shop:
 
     @asynccontextmanager
     async def service(self) -> AsyncIterator[Board]:
-        """What `service.serve` wires, without page and broker."""
+        """What `abbe.service.serve` wires, without page and broker."""
         clock, board = SystemClock(), Board({}, SystemClock())
         full = identification(self.site.machine, rate_hz=RATE_HZ)
         tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))

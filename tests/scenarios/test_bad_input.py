@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from service.cli import run
+from abbe.service.cli import run
 from tests.scenarios.conftest import simulated
 from tests.scenarios.world import bar_chunks, laser_chunks, position_and_counters, runs_of, wait_for
 

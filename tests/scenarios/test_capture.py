@@ -8,18 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from drivers.ballbar import driver
-from drivers.errors import Backpressure
-from service.capture.file_io import RealFileIO
-from service.capture.recovery import ledger_of
-from service.cli import run
-from service.config import load_machine
-from service.devices.session import open_session
-from service.sequences.recipes import Helix
-from service.sequences.steps import CampaignPlan
-from service.site import site_of
-from service.storage.store import Store
-from service.workflows.measure import measure
+from abbe.drivers.ballbar import driver
+from abbe.drivers.errors import Backpressure
+from abbe.service.capture.file_io import RealFileIO
+from abbe.service.capture.recovery import ledger_of
+from abbe.service.cli import run
+from abbe.service.config import load_machine
+from abbe.service.devices.session import open_session
+from abbe.service.sequences.recipes import Helix
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import site_of
+from abbe.service.storage.store import Store
+from abbe.service.workflows.measure import measure
 from tests.scenarios.world import axes_at_rest, bar_chunks, interrupt, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
@@ -88,8 +88,8 @@ class HangingDisk(RealFileIO):
 
 async def test_a_hanging_disk_stops_the_axes_before_a_sample_is_lost(start_sims, monkeypatch):
     disk = HangingDisk()
-    monkeypatch.setattr("service.capture.recorder.RealFileIO", lambda: disk)
-    monkeypatch.setattr("service.capture.log.MAX_PENDING", 200)
+    monkeypatch.setattr("abbe.service.capture.recorder.RealFileIO", lambda: disk)
+    monkeypatch.setattr("abbe.service.capture.log.MAX_PENDING", 200)
     monkeypatch.setattr(driver, "_MAX_RATE_HZ", 40)  # the ring is 28,800 bytes: 1,200 samples
     sims = start_sims("--speed", "2")
     loaded = load_machine(Path(sims.machine_file))

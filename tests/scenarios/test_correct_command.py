@@ -16,10 +16,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.registry import open_controller
-from service.config import load_machine
-from service.site import site_of
-from service.storage.store import Store
+from abbe.drivers.registry import open_controller
+from abbe.service.config import load_machine
+from abbe.service.site import site_of
+from abbe.service.storage.store import Store
 from tests.pretended import as_if_commissioned_at
 from tests.scenarios.conftest import ABBE, Sims, simulated
 from tests.scenarios.world import one_line, position_and_counters, registers, runs_of, wait_for

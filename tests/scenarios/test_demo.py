@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.storage.store import Store
+from abbe.service.storage.store import Store
 from tests.scenarios.world import interrupt, simulators_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]

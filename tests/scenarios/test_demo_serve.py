@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
-from service.errors import StoreError
-from service.storage.store import Store
-from service.workflows import demo_serve
-from service.workflows.demo_serve import DRIFT_UM_PER_M, ROOM_UM, USER, served_lines
+from abbe.service.errors import StoreError
+from abbe.service.storage.store import Store
+from abbe.service.workflows import demo_serve
+from abbe.service.workflows.demo_serve import DRIFT_UM_PER_M, ROOM_UM, USER, served_lines
 from tests.system.serve_bench import Process, require
 from tests.system.test_serve_page import QUIET
 
@@ -30,7 +30,7 @@ PATIENCE_S = 400.0
 def demo(tmp_path: Path) -> Iterator[Process]:
     with ExitStack() as stack:
         words = ("demo", "--serve", "--seed", os.environ.get("ABBE_TEST_SEED", "1"), "--keep", str(tmp_path / "demo"), "--port", "0")
-        process = Process(sys.executable, "-c", "from service.cli import main; main()", *words)
+        process = Process(sys.executable, "-c", "from abbe.service.cli import main; main()", *words)
         stack.callback(process.close)
         yield process
 
@@ -126,9 +126,9 @@ def left_behind(folder: Path) -> list[str]:
 
 
 def test_the_machine_file_of_the_demonstration_is_one(tmp_path: Path) -> None:
-    from service.config import load_machine
-    from service.site import machine_from_doc
-    from service.workflows.demo import demo_site, write_machine_file
+    from abbe.service.config import load_machine
+    from abbe.service.site import machine_from_doc
+    from abbe.service.workflows.demo import demo_site, write_machine_file
 
     doc = {
         "chain": "w-X-Y-b-Z-t", "tool_mm": [0.0, 0.0, -120.0], "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]},

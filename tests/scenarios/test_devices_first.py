@@ -20,15 +20,15 @@ from typing import Any
 
 import pytest
 
-from service import cli
-from service.config import load_machine
-from service.errors import ConfigError, DevicesNotReady
-from service.events import ignore_progress
-from service.sequences.recipe_file import recipe_text
-from service.sequences.recipes import Helix, Linear
-from service.storage.store import Store
-from service.workflows.check import run_check
-from simulators.cnc.log import MOTION
+from abbe.service import cli
+from abbe.service.config import load_machine
+from abbe.service.errors import ConfigError, DevicesNotReady
+from abbe.service.events import ignore_progress
+from abbe.service.sequences.recipe_file import recipe_text
+from abbe.service.sequences.recipes import Helix, Linear
+from abbe.service.storage.store import Store
+from abbe.service.workflows.check import run_check
+from abbe.simulators.cnc.log import MOTION
 from tests.scenarios.conftest import Sims, simulated
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]

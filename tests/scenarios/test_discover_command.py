@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from service import cli
+from abbe.service import cli
 from tests.unit.service.discovery_bench import NOISE_MM, circle, write_case
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]

@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from service.runs.exchange import read_folder
+from abbe.service.runs.exchange import read_folder
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 

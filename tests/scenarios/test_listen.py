@@ -6,9 +6,9 @@ import threading
 import numpy as np
 import pytest
 
-from service.cli import run
-from service.runs.columns import load_run
-from service.storage.store import Store
+from abbe.service.cli import run
+from abbe.service.runs.columns import load_run
+from abbe.service.storage.store import Store
 from tests.unit.service_jobs.nc_reader import read_gcode
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]

@@ -9,14 +9,14 @@ from dataclasses import replace
 
 import pytest
 
-from service.clock import SystemClock
-from service.devices.session import Session, open_session
-from service.errors import StatusUnknown, StillActive
-from service.push.book import read_entries
-from service.storage.store import Store
-from service.workflows.pending import finish_when_safe
-from simulators.faults.modbus_proxy import ModbusProxy
-from simulators.faults.scenario import Fault, FaultScenario
+from abbe.service.clock import SystemClock
+from abbe.service.devices.session import Session, open_session
+from abbe.service.errors import StatusUnknown, StillActive
+from abbe.service.push.book import read_entries
+from abbe.service.storage.store import Store
+from abbe.service.workflows.pending import finish_when_safe
+from abbe.simulators.faults.modbus_proxy import ModbusProxy
+from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.scenarios.test_push import active
 from tests.scenarios.verifying import LIMIT_S, Push, Shop, long, made_shop, state
 

@@ -14,27 +14,27 @@ from typing import Any
 
 import pytest
 
-from service.cli import run
-from service.clock import SystemClock
-from service.config import load_machine
-from service.devices.session import DeviceUrls, open_session
-from service.errors import StoreError, TableRefused
-from service.events import ignore_progress
-from service.push.book import read_entries
-from service.sequences.campaigns import identification, verification
-from service.sequences.control import Control
-from service.sequences.interlocks import Watching
-from service.sequences.steps import CampaignPlan
-from service.site import Site, site_of
-from service.storage.records import ApprovalRecord
-from service.storage.store import Store
-from service.workflows.correct import Correction, push
-from service.workflows.measure import measure
-from service.workflows.proposal_checks import approve, hold
-from service.workflows.proposal_doc import digest_of_doc, load
-from service.workflows.proposal_states import standing, standing_of
-from service.workflows.proposals import load_runs, login
-from service.workflows.push_approved import Approved, Order, next_approved, push_approved
+from abbe.service.cli import run
+from abbe.service.clock import SystemClock
+from abbe.service.config import load_machine
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.errors import StoreError, TableRefused
+from abbe.service.events import ignore_progress
+from abbe.service.push.book import read_entries
+from abbe.service.sequences.campaigns import identification, verification
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, site_of
+from abbe.service.storage.records import ApprovalRecord
+from abbe.service.storage.store import Store
+from abbe.service.workflows.correct import Correction, push
+from abbe.service.workflows.measure import measure
+from abbe.service.workflows.proposal_checks import approve, hold
+from abbe.service.workflows.proposal_doc import digest_of_doc, load
+from abbe.service.workflows.proposal_states import standing, standing_of
+from abbe.service.workflows.proposals import load_runs, login
+from abbe.service.workflows.push_approved import Approved, Order, next_approved, push_approved
 from tests.pretended import as_if_commissioned
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import registers

@@ -12,27 +12,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.cnc.tables import crc32, encode
-from drivers.errors import LinkDown
-from models.compensation.tables import NineTables, grid_positions, quantise
-from service.devices.session import DeviceUrls, open_session
-from service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
-from service.events import ignore_progress
-from service.push.book import StoreBook, read_entries
-from service.push.entries import check_chain
-from service.push.operations import Verdict
-from service.push.states import State
-from service.runs.columns import load_run
-from service.sequences.recipes import Diagonal
-from service.sequences.steps import CampaignPlan
-from service.site import Site, machine_doc, machine_from_doc
-from service.storage.store import Store
-from service.workflows import pushing
-from service.workflows.base_table import read_base
-from service.workflows.measure import measure
-from service.workflows.pushing import Pushing, Questions, Wanted
-from service.workflows.recover import accept, recover
-from service.workflows.tables import table_image
+from abbe.drivers.cnc.tables import crc32, encode
+from abbe.drivers.errors import LinkDown
+from abbe.models.compensation.tables import NineTables, grid_positions, quantise
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
+from abbe.service.events import ignore_progress
+from abbe.service.push.book import StoreBook, read_entries
+from abbe.service.push.entries import check_chain
+from abbe.service.push.operations import Verdict
+from abbe.service.push.states import State
+from abbe.service.runs.columns import load_run
+from abbe.service.sequences.recipes import Diagonal
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows import pushing
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.measure import measure
+from abbe.service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.service.workflows.recover import accept, recover
+from abbe.service.workflows.tables import table_image
 from tests.pretended import as_if_commissioned
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]

@@ -20,21 +20,21 @@ import numpy as np
 import pypdf
 import pytest
 
-from models.compensation.tables import NineTables, grid_positions, quantise
-from service.cli import run
-from service.config import load_machine
-from service.devices.session import open_session
-from service.push.operations import Verdict
-from service.report.numbers import with_uncertainty
-from service.runs.columns import load_run
-from service.scheduler import record
-from service.scheduler.slots import Schedule
-from service.site import site_of
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.check import CheckResult
-from service.workflows.pushing import Pushing, Questions, Wanted
-from service.workflows.verify import figure_rows, figures
+from abbe.models.compensation.tables import NineTables, grid_positions, quantise
+from abbe.service.cli import run
+from abbe.service.config import load_machine
+from abbe.service.devices.session import open_session
+from abbe.service.push.operations import Verdict
+from abbe.service.report.numbers import with_uncertainty
+from abbe.service.runs.columns import load_run
+from abbe.service.scheduler import record
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.site import site_of
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.check import CheckResult
+from abbe.service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.service.workflows.verify import figure_rows, figures
 from tests.scenarios.conftest import simulated
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
@@ -216,7 +216,7 @@ def test_the_same_data_give_the_same_bytes_in_another_process_on_another_day(sto
         ["report", *KINDS[kind], "--machine", str(stored / "machine.toml"), *(w for f in files.values() for w in ("--out", str(f)))]
         for kind, files in again.items()
     ]
-    program = "import json, sys; from service.cli import run; sys.exit(sum(run(w) for w in json.loads(sys.argv[1])))"
+    program = "import json, sys; from abbe.service.cli import run; sys.exit(sum(run(w) for w in json.loads(sys.argv[1])))"
     environment = os.environ | {"TZ": "Asia/Tokyo", "SOURCE_DATE_EPOCH": "86400", "LC_ALL": "C", "PYTHONHASHSEED": "7"}
     subprocess.run([sys.executable, "-c", program, json.dumps(words)], check=True, env=environment, capture_output=True)
     differ = [(kind, form) for kind, files in again.items() for form, path in files.items() if path.read_bytes() != first[kind][form]]

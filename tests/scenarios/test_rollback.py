@@ -14,17 +14,17 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from drivers.cnc.tables import crc32, encode
-from service.cli import run
-from service.errors import PushNotBegun, StoreError, TableMismatch, TableRefused
-from service.push.book import StoreBook, read_entries
-from service.push.entries import check_chain
-from service.push.states import State
-from service.workflows import rollback as workflow
-from service.workflows.base_table import read_base
-from service.workflows.recover import recover
-from service.workflows.rollback import rollback
-from service.workflows.tables import table_image
+from abbe.drivers.cnc.tables import crc32, encode
+from abbe.service.cli import run
+from abbe.service.errors import PushNotBegun, StoreError, TableMismatch, TableRefused
+from abbe.service.push.book import StoreBook, read_entries
+from abbe.service.push.entries import check_chain
+from abbe.service.push.states import State
+from abbe.service.workflows import rollback as workflow
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.recover import recover
+from abbe.service.workflows.rollback import rollback
+from abbe.service.workflows.tables import table_image
 from tests.scenarios.test_push import active, bench, last, linear_tables, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]

@@ -7,15 +7,15 @@ import tarfile
 import numpy as np
 import pytest
 
-from models.uncertainty.frame import field, volume_frame
-from service import cli
-from service.runs.exchange import import_folder
-from service.runs.solution_file import SolutionFile
-from service.site import machine_from_doc
-from service.storage.store import Store
-from service.workflows.campaign_folder import from_folder
-from service.workflows.solve import solve_runs
-from service.workflows.stored_prediction import stored_prediction
+from abbe.models.uncertainty.frame import field, volume_frame
+from abbe.service import cli
+from abbe.service.runs.exchange import import_folder
+from abbe.service.runs.solution_file import SolutionFile
+from abbe.service.site import machine_from_doc
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import from_folder
+from abbe.service.workflows.solve import solve_runs
+from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.campaigns.population import draw_case
 from tests.scenarios.campaign_files import measured, write_folder
 

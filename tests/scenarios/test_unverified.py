@@ -8,10 +8,10 @@ import re
 
 import pytest
 
-from service.cli import run
-from service.push.book import read_entries
-from service.storage.store import Store
-from service.workflows.in_force import look_at_table
+from abbe.service.cli import run
+from abbe.service.push.book import read_entries
+from abbe.service.storage.store import Store
+from abbe.service.workflows.in_force import look_at_table
 from tests.scenarios.test_push import bench, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service.storage.store import Store
+from abbe.service.storage.store import Store
 from tests.scenarios.conftest import ABBE, Sims
 from tests.scenarios.test_correct_command import table
 from tests.scenarios.world import wait_for

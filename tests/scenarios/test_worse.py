@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DriverError
-from service.devices.session import open_session
-from service.errors import MeasurementFault, WorldChanged
-from service.storage.store import Store
+from abbe.drivers.errors import DriverError
+from abbe.service.devices.session import open_session
+from abbe.service.errors import MeasurementFault, WorldChanged
+from abbe.service.storage.store import Store
 from tests.scenarios.test_push import active
 from tests.scenarios.verifying import LIMIT_S, LONG, Push, Runs, Shop, long, made_shop, plan_of, state
 

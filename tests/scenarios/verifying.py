@@ -15,21 +15,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.compensation.tables import NineTables
-from service.devices.session import Session, open_session
-from service.events import Progress, ignore_progress
-from service.push.book import read_entries
-from service.push.entries import check_chain
-from service.push.operations import Verdict
-from service.sequences.recipes import Diagonal, Helix
-from service.sequences.steps import CampaignPlan
-from service.site import Site
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.correct import load_runs
-from service.workflows.measure import measure
-from service.workflows.pushing import Pushed, Pushing, Questions, Wanted
-from service.workflows.verify import Figures, decide, figures
+from abbe.models.compensation.tables import NineTables
+from abbe.service.devices.session import Session, open_session
+from abbe.service.events import Progress, ignore_progress
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import check_chain
+from abbe.service.push.operations import Verdict
+from abbe.service.sequences.recipes import Diagonal, Helix
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.correct import load_runs
+from abbe.service.workflows.measure import measure
+from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.workflows.verify import Figures, decide, figures
 from tests.scenarios.conftest import simulated
 from tests.scenarios.test_push import linear_tables, site_of
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from service.storage.records import RunRecord
-from service.storage.store import Store
+from abbe.service.storage.records import RunRecord
+from abbe.service.storage.store import Store
 
 
 def wait_for(condition: Callable[[], Any], seconds: float, what: str) -> Any:
@@ -42,7 +42,7 @@ def simulators_of(folder: Path) -> list[int]:
                 state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
             except OSError:
                 continue
-            if b"simulators" in words and str(folder).encode() in b" ".join(words) and state != "Z":
+            if b"abbe.simulators" in words and str(folder).encode() in b" ".join(words) and state != "Z":
                 found.append(int(entry.name))
     return found
 

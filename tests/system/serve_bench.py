@@ -177,7 +177,7 @@ class Machine:
     """The simulators as a process, and a machine file that names their ports."""
 
     def __init__(self, folder: Path, speed: float, *sections: str) -> None:
-        self.process = Process(sys.executable, "-m", "simulators", "--speed", str(speed), "--ballbar", "tcp", "--link-dir", folder)
+        self.process = Process(sys.executable, "-m", "abbe.simulators", "--speed", str(speed), "--ballbar", "tcp", "--link-dir", folder)
         ready = json.loads(self.process.expect('"ready"'))
         machine = ready["machine"]
         lines = ['name = "mill-7"', f"chain = {json.dumps(machine['chain'])}", f"tool_mm = {json.dumps(machine['tool_mm'])}"]
@@ -190,4 +190,4 @@ class Machine:
 
 def abbe(*arguments: str | Path) -> Process:
     """Start the command ``abbe``."""
-    return Process(sys.executable, "-c", "from service.cli import main; main()", *arguments)
+    return Process(sys.executable, "-c", "from abbe.service.cli import main; main()", *arguments)

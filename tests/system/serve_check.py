@@ -14,15 +14,15 @@ from typing import Any
 
 import aiomqtt
 
-from service.core.setup import Setup
-from service.events import Progress, ProgressSink
-from service.logs import configure_logs
-from service.mqtt.broker import parse
-from service.mqtt.topics import Topics
-from service.plant.opcua.setup import OpcUaSetup
-from service.scheduler.slots import Schedule
-from service.sequences.control import Control, State
-from service.serve import serve
+from abbe.service.core.setup import Setup
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.logs import configure_logs
+from abbe.service.mqtt.broker import parse
+from abbe.service.mqtt.topics import Topics
+from abbe.service.plant.opcua.setup import OpcUaSetup
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.sequences.control import Control, State
+from abbe.service.serve import serve
 
 
 @dataclass(frozen=True)

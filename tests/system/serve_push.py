@@ -13,27 +13,27 @@ from typing import Any
 
 import numpy as np
 
-from service.core.setup import Setup
-from service.devices.alone import alone
-from service.devices.session import DeviceUrls, Session, open_session
-from service.events import Progress
-from service.logs import configure_logs
-from service.mqtt.topics import Topics
-from service.push.operations import Verdict
-from service.scheduler import desk
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.sequences.recipes import Diagonal
-from service.sequences.steps import CampaignPlan
-from service.serve import serve
-from service.site import Site, machine_doc, machine_from_doc
-from service.workflows.at_start import recover_at_start
-from service.workflows.base_table import read_base
-from service.workflows.measure import Manner, measure
-from service.workflows.push_approved import Approved, Order
-from service.workflows.push_word import Outcome
-from service.workflows.pushing import Pushing, Questions, Wanted
-from service.workflows.recover import recover
+from abbe.service.core.setup import Setup
+from abbe.service.devices.alone import alone
+from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.events import Progress
+from abbe.service.logs import configure_logs
+from abbe.service.mqtt.topics import Topics
+from abbe.service.push.operations import Verdict
+from abbe.service.scheduler import desk
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.recipes import Diagonal
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.serve import serve
+from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.workflows.at_start import recover_at_start
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.measure import Manner, measure
+from abbe.service.workflows.push_approved import Approved, Order
+from abbe.service.workflows.push_word import Outcome
+from abbe.service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.service.workflows.recover import recover
 from tests.scenarios.test_push import linear_tables
 
 PROPOSAL = Approved(4, 9, 0)

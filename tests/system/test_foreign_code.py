@@ -21,7 +21,7 @@ from tests.system.test_serve_users import MACHINE
 pytestmark = pytest.mark.timeout(300)
 
 ABBE = Path(sys.executable).with_name("abbe")
-OURS = ("service", "drivers", "models", "simulators")
+OURS = ("abbe", "service", "drivers", "models", "simulators")
 FILES = (
     "models",
     "drivers",
@@ -47,7 +47,7 @@ def traps(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "traps"
     folder.mkdir()
     code = TRAP.format(folder=str(tmp_path))
-    for package in (*OURS, "service/web", "service/cli"):
+    for package in (*OURS, "abbe/service", "abbe/simulators", "service/web", "service/cli"):
         (folder / package).mkdir()
         for name in ("__init__", "__main__", "process"):
             (folder / package / f"{name}.py").write_text(code)
@@ -79,8 +79,8 @@ def said(folder: Path) -> str:
 def test_the_traps_work(tmp_path: Path, traps: Path) -> None:
     """As children were started before; and as `multiprocessing` starts its own."""
     for words in (
-        ["-m", "service.web.process"],
-        ["-m", "simulators"],
+        ["-m", "abbe.service.web.process"],
+        ["-m", "abbe.simulators"],
         ["-c", "import models"],
         ["-c", "from multiprocessing.spawn import x"],
     ):
@@ -122,7 +122,9 @@ def test_serve(traps: Path) -> None:
 def test_workers(traps: Path) -> None:
     """Python's own way of starting processes looks in the working directory, too. The parent is a script, as `abbe` is: without ``-P``."""
     program = traps.parent / "program.py"
-    words = "from operator import neg; from service.workflows.executors import Processes; print(list(Processes(2).map(neg, [1, 2, 3])))"
+    words = (
+        "from operator import neg; from abbe.service.workflows.executors import Processes; print(list(Processes(2).map(neg, [1, 2, 3])))"
+    )
     program.write_text(f"if __name__ == '__main__':\n    {words}\n")
     done = subprocess.run(
         [sys.executable, program], cwd=traps, capture_output=True, text=True, check=False, timeout=120, env=os.environ | {"PYTHONPATH": ""}

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, Route
 
-from service.web.page import HERE
+from abbe.service.web.page import HERE
 from tests.system.test_serve_page import browser
 
 pytestmark = pytest.mark.browser

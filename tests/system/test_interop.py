@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.registry import open_ballbar
+from abbe.drivers.registry import open_ballbar
 from tests.scenarios.world import simulators_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
 
 @pytest.fixture
 def ready(tmp_path: Path):
-    words = [sys.executable, "-m", "simulators", "--watch-stdin", "--speed", "1", "--link-dir", str(tmp_path)]
+    words = [sys.executable, "-m", "abbe.simulators", "--watch-stdin", "--speed", "1", "--link-dir", str(tmp_path)]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
     assert process.stdout is not None
@@ -51,7 +51,7 @@ def assert_canaries(port: str) -> None:
 def test_mbpoll_reads_a_running_demonstration(require, tmp_path):
     require("mbpoll", shutil.which("mbpoll") is not None, "mbpoll is not installed")
     folder = tmp_path / "kept"
-    words = [sys.executable, "-c", "from service.cli import main; main()", "demo", "--speed", "1", "--keep", str(folder)]
+    words = [sys.executable, "-c", "from abbe.service.cli import main; main()", "demo", "--speed", "1", "--keep", str(folder)]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as demo:
         try:
             address = wait_for(lambda: cnc_port(folder / "machine.toml"), 30, "the demonstration's machine file")

@@ -16,24 +16,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import Refused
-from drivers.links.modbus_line import Canary
-from drivers.links.modbus_link import ModbusLink
-from drivers.links.modbus_policy import Op
-from drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
-from models.compensation.tables import NineTables, grid_positions
-from service.push.operations import Verdict
-from service.storage.store import Store
-from service.workflows.base_table import read_base
-from service.workflows.pushing import Pushing, Questions, Wanted
-from simulators.cnc.device import Controller
-from simulators.cnc.wire import CncRegisters
-from simulators.faults.modbus_frames import crc16
-from simulators.laser.wire import LaserRegisters
-from simulators.modbus_wire import ModbusRtu, ModbusTcp
-from simulators.scenario import MachineConfig, Scenario
-from simulators.truth.machine import Geometry
-from simulators.world import World
+from abbe.drivers.errors import Refused
+from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
+from abbe.models.compensation.tables import NineTables, grid_positions
+from abbe.service.push.operations import Verdict
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import read_base
+from abbe.service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.simulators.cnc.device import Controller
+from abbe.simulators.cnc.wire import CncRegisters
+from abbe.simulators.faults.modbus_frames import crc16
+from abbe.simulators.laser.wire import LaserRegisters
+from abbe.simulators.modbus_wire import ModbusRtu, ModbusTcp
+from abbe.simulators.scenario import MachineConfig, Scenario
+from abbe.simulators.truth.machine import Geometry
+from abbe.simulators.world import World
 from tests.faults.sequencer_world import bench
 from tests.mbpoll import poll_table
 

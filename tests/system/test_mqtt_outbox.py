@@ -13,12 +13,12 @@ import aiomqtt
 import pytest
 from structlog.testing import capture_logs
 
-from service.clock import SystemClock
-from service.mqtt.broker import parse
-from service.mqtt.outbox import StoreOutbox
-from service.mqtt.publisher import Publisher
-from service.mqtt.topics import Topics
-from service.scheduler.store import ServiceStore
+from abbe.service.clock import SystemClock
+from abbe.service.mqtt.broker import parse
+from abbe.service.mqtt.outbox import StoreOutbox
+from abbe.service.mqtt.publisher import Publisher
+from abbe.service.mqtt.topics import Topics
+from abbe.service.scheduler.store import ServiceStore
 from tests.certificates import authority, issued
 from tests.system.serve_bench import Broker, Process, free_port, payload, service
 
@@ -117,7 +117,7 @@ async def test_mosquitto_killed_and_everything_comes_afterwards_in_order(tmp_pat
 async def test_the_table_does_not_grow_with_what_was_delivered(
     tmp_path: Path, store: ServiceStore, ending: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.mqtt.publisher.TIDY_EVERY", 50)
+    monkeypatch.setattr("abbe.service.mqtt.publisher.TIDY_EVERY", 50)
     broker = Broker(tmp_path)
     ending.callback(lambda: broker.process.close())
     receiver = ending.enter_context(closing(broker.subscriber()))

@@ -8,8 +8,8 @@ import json
 import pytest
 from playwright.sync_api import Page, Route
 
-from service.web.language import SPAN_KEYS, catalogue
-from service.web.page import HERE
+from abbe.service.web.language import SPAN_KEYS, catalogue
+from abbe.service.web.page import HERE
 from tests.system.serve_bench import free_port
 from tests.system.test_serve_page import browser
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cnc.registers import Bit
-from drivers.registry import open_controller
-from service.config import load_machine
-from service.scheduler.store import ServiceStore
+from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.registry import open_controller
+from abbe.service.config import load_machine
+from abbe.service.scheduler.store import ServiceStore
 from tests.system.serve_bench import Broker, Machine, abbe, free_port, payload
 from tests.system.test_serve_page import browser, only_us, open_page, shot
 

@@ -15,9 +15,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.channel.messages import PAGE_MEMORY_MB
-from service.core.limits import FIRST_TO_GO
-from service.users.roles import Role
+from abbe.service.channel.messages import PAGE_MEMORY_MB
+from abbe.service.core.limits import FIRST_TO_GO
+from abbe.service.users.roles import Role
 from tests.system.test_serve_processes import YEARLY, Running, bench, ended
 
 GIGABYTE, PIECE_B, GROWTH_KB = 1 << 30, 1 << 18, 8 * 1024

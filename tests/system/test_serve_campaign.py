@@ -18,14 +18,14 @@ import httpx
 import pytest
 from playwright.sync_api import Page as Screen
 
-from service.audit.book import AuditBook
-from service.clock import SystemClock
-from service.scheduler.store import ServiceStore
-from service.users.passwords import Passwords
-from service.users.people import People
-from service.workflows.proposal_doc import load
-from service.workflows.proposal_states import standing
-from service.workflows.resume import begun_source
+from abbe.service.audit.book import AuditBook
+from abbe.service.clock import SystemClock
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.passwords import Passwords
+from abbe.service.users.people import People
+from abbe.service.workflows.proposal_doc import load
+from abbe.service.workflows.proposal_states import standing
+from abbe.service.workflows.resume import begun_source
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import wait_for
 from tests.system.serve_bench import Process, abbe, free_port

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.serve import setup_of
-from service.config import load_machine
+from abbe.service.cli.serve import setup_of
+from abbe.service.config import load_machine
 from tests.system.serve_bench import Process, free_port, require
 
 ROOT = Path(__file__).parents[2]

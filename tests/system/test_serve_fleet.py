@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import run
-from service.scheduler.store import ServiceStore
+from abbe.service.cli import run
+from abbe.service.scheduler.store import ServiceStore
 from tests.system.serve_bench import Machine, Process
 
 pytestmark = [
@@ -42,7 +42,7 @@ def test_two_services_check_at_once_into_one_database(
         ServiceStore.open(url).close()
         services = [
             stack.enter_context(
-                closing(Process(sys.executable, "-c", "from service.cli import main; main()", "serve", f, "--once", "--port", "0"))
+                closing(Process(sys.executable, "-c", "from abbe.service.cli import main; main()", "serve", f, "--once", "--port", "0"))
             )
             for f in files
         ]

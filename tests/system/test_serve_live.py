@@ -25,9 +25,9 @@ from playwright.sync_api import TimeoutError as NotSeen
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from service.clock import SystemClock
-from service.scheduler.store import ServiceStore
-from service.users.people import People
+from abbe.service.clock import SystemClock
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.people import People
 from tests.system.serve_bench import Machine, Process, abbe, free_port
 from tests.system.test_serve_page import Seen, browser, only_us, shot
 from tests.system.test_serve_screens import INSIDE, SIZES, SMALL, violations

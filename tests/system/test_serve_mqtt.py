@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.scheduler.store import ServiceStore
+from abbe.service.scheduler.store import ServiceStore
 from tests.system.serve_bench import Broker, Process, free_port, payload, service
 
 EVERY_SECOND = ["fast", "* * * * * *", "quick"]

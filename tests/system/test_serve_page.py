@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, sync_playwright
 
-from drivers.errors import LinkDown
-from service.scheduler import record
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
+from abbe.drivers.errors import LinkDown
+from abbe.service.scheduler import record
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
 from tests.system.serve_bench import free_port, require, service
 from tests.system.serve_check import Result
 from tests.system.test_serve_users import PHRASE, add_user

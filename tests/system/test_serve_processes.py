@@ -18,12 +18,12 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from service.audit.book import AuditBook
-from service.capture.account import ledger_of, streams_told
-from service.clock import SystemClock
-from service.scheduler.store import ServiceStore
-from service.users.people import People
-from service.users.roles import ALLOWED, Permission, Role
+from abbe.service.audit.book import AuditBook
+from abbe.service.capture.account import ledger_of, streams_told
+from abbe.service.clock import SystemClock
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.people import People
+from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.system.serve_bench import Machine, Process, abbe, free_port, service
 from tests.system.test_serve_stop import slots_of
 

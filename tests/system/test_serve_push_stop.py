@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.push.book import read_entries
-from service.push.entries import check_chain
-from service.scheduler.store import ServiceStore
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import check_chain
+from abbe.service.scheduler.store import ServiceStore
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import axes_at_rest, registers, wait_for
 from tests.system.serve_bench import Process

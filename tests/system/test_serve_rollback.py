@@ -11,15 +11,15 @@ from typing import Any
 import httpx
 import pytest
 
-from service.audit.book import AuditBook
-from service.clock import SystemClock
-from service.push.book import read_entries
-from service.push.entries import check_chain
-from service.push.states import State
-from service.scheduler.store import ServiceStore
-from service.users.passwords import Passwords
-from service.users.people import People
-from service.web.api.once import REPLAYED
+from abbe.service.audit.book import AuditBook
+from abbe.service.clock import SystemClock
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import check_chain
+from abbe.service.push.states import State
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.passwords import Passwords
+from abbe.service.users.people import People
+from abbe.service.web.api.once import REPLAYED
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.test_push import bench, push, steep
 from tests.scenarios.world import wait_for

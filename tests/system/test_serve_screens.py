@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Route, sync_playwright
 
-from service.audit.chain import Event
+from abbe.service.audit.chain import Event
 from tests.pages_world import PHRASE, PROPOSER, Filled, Served, fill, screens, served
 from tests.system.serve_bench import require
 from tests.system.test_serve_page import ARTIFACTS, QUIET

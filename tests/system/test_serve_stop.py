@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service.scheduler.store import ServiceStore
+from abbe.service.scheduler.store import ServiceStore
 from tests.system.serve_bench import Process, free_port, service
 
 YEARLY = ["yearly", "0 0 1 1 *", "quick"]

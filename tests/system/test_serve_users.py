@@ -16,9 +16,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 
-from service.clock import SystemClock
-from service.scheduler.store import ServiceStore
-from service.users.people import People
+from abbe.service.clock import SystemClock
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.people import People
 from tests.system.serve_bench import Process, free_port
 
 PHRASE = "correct horse battery staple"
@@ -26,7 +26,7 @@ MACHINE = 'name = "mill-7"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 500]\nY 
 
 
 def abbe(*words: str | Path) -> Process:
-    return Process(sys.executable, "-c", "from service.cli import main; main()", *words)
+    return Process(sys.executable, "-c", "from abbe.service.cli import main; main()", *words)
 
 
 def add_user(folder: Path) -> None:

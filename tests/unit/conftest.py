@@ -49,7 +49,7 @@ def _copying() -> Callable[[Any, str], None]:
 
     @cache
     def statements() -> tuple[str, ...]:
-        from service.storage.migrate import _config
+        from abbe.service.storage.migrate import _config
 
         engine = create_engine("sqlite://")
         with engine.begin() as connection:

@@ -5,9 +5,9 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from models.effects.catalogue import CATALOGUE
-from service.workflows.thinned import MOST_READINGS
-from simulators.hidden import plans
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.service.workflows.thinned import MOST_READINGS
+from abbe.simulators.hidden import plans
 from tests.bench import discovery_report as report
 from tests.bench.discovery_case import CASES, kinds_of, measured_bar_readings, read_case, write_long
 from tests.bench.discovery_contestants import (

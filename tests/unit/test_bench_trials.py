@@ -5,7 +5,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from models.solvers.joint import solve_joint
+from abbe.models.solvers.joint import solve_joint
 from tests.bench import trials_case as cases
 from tests.bench import trials_contestants as contestants
 from tests.bench import trials_report as report

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.discovery.answer import NamedEffect
-from models.discovery.finding import _confounded, _of_scatter
-from models.discovery.residue import residues
-from models.discovery.variance import VarianceFinding
-from models.discovery.where import Where
-from service.workflows.discovery_answer import _effect
+from abbe.models.discovery.answer import NamedEffect
+from abbe.models.discovery.finding import _confounded, _of_scatter
+from abbe.models.discovery.residue import residues
+from abbe.models.discovery.variance import VarianceFinding
+from abbe.models.discovery.where import Where
+from abbe.service.workflows.discovery_answer import _effect
 
 SCATTER = frozenset({"vibration:Z", "stick_slip:X", "beam_outliers"})
 

@@ -10,13 +10,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-import models.geometry
-from models.functions.motions import ErrorMotions
-from models.functions.table import Table
-from models.geometry import fast, kernel
-from models.geometry.chain import all_chains, deviation_mm
-from models.geometry.table_machine import TableMachine, sampled
-from models.machine import Machine
+import abbe.models.geometry
+from abbe.models.functions.motions import ErrorMotions
+from abbe.models.functions.table import Table
+from abbe.models.geometry import fast, kernel
+from abbe.models.geometry.chain import all_chains, deviation_mm
+from abbe.models.geometry.table_machine import TableMachine, sampled
+from abbe.models.machine import Machine
 
 STROKE = np.array([[-50.0, 600.0], [100.0, 600.0], [0.0, 450.0]])
 RANGE = np.array([[-40.0, 560.0], [100.0, 590.0], [-5.0, 450.0]])
@@ -31,7 +31,7 @@ def scattered(request, require):
     if request.param == "numpy":
         return kernel.scattered
     require("numba", importlib.util.find_spec("numba") is not None, NO_NUMBA)
-    from models.geometry import compiled
+    from abbe.models.geometry import compiled
 
     return partial(compiled.scattered, all_cores=request.param == "all cores")
 
@@ -42,7 +42,7 @@ def grid(request, require):
     if request.param == "numpy":
         return kernel.grid
     require("numba", importlib.util.find_spec("numba") is not None, NO_NUMBA)
-    from models.geometry import compiled
+    from abbe.models.geometry import compiled
 
     return partial(compiled.grid, all_cores=request.param == "all cores")
 
@@ -202,8 +202,8 @@ def test_positions_of_another_shape_are_refused(axes, scattered):
 
 
 def test_without_numba_the_automatic_choice_is_numpy(monkeypatch):
-    monkeypatch.setitem(sys.modules, "models.geometry.compiled", None)
-    monkeypatch.delattr(models.geometry, "compiled", raising=False)
+    monkeypatch.setitem(sys.modules, "abbe.models.geometry.compiled", None)
+    monkeypatch.delattr(abbe.models.geometry, "compiled", raising=False)
     monkeypatch.setattr(fast, "WORTH_COMPILING", 5)
     fast.compiled_path.cache_clear()
     try:

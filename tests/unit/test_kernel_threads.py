@@ -14,7 +14,7 @@ from tests.unit.test_kernel import NO_NUMBA
 PREPARE = """
 import os, sys, threading
 import numpy as np
-from models.geometry import fast, kernel
+from abbe.models.geometry import fast, kernel
 from tests.unit.test_kernel import machine, points
 fast.WORTH_COMPILING = 1
 tables, p, axes = machine(), points(20_000), [np.linspace(0.0, 500.0, 30)] * 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import re
 import shutil
 import subprocess
@@ -12,17 +13,18 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.book import AuditBook, files_of, sqlite_base
-from service.audit.chain import Event
-from service.capture.settings import CaptureSettings, segment_folder
-from service.storage.migrate import known_revisions
-from service.storage.store import Store
-from service.workflows.restore import BESIDE
+from abbe.service.audit.book import AuditBook, files_of, sqlite_base
+from abbe.service.audit.chain import Event
+from abbe.service.capture.settings import CaptureSettings, segment_folder
+from abbe.service.storage.migrate import known_revisions
+from abbe.service.storage.store import Store
+from abbe.service.workflows.restore import BESIDE
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("service", "drivers", "models", "simulators")
+PARTS = ("service", "drivers", "models", "simulators")
+"""Of the package ``abbe``, and folders of the repository."""
 LOCKS = ("requirements.lock", "requirements-dev.lock", "requirements-bench.lock")
-SOURCES = sorted(p for package in PACKAGES for p in (ROOT / package).rglob("*.py"))
+SOURCES = sorted(p for part in PARTS for p in (ROOT / part).rglob("*.py"))
 
 # In two parts, so that this file does not itself hold what it forbids.
 HOSTS = [
@@ -81,9 +83,19 @@ def test_one_place_says_how_a_python_is_started() -> None:
     assert starts == {"service/children.py"}
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_only_this_distribution_provides(package: str) -> None:
-    assert set(importlib.metadata.packages_distributions()[package]) == {"abbe"}
+def test_one_package_is_installed_and_its_parts_are_links_to_the_folders() -> None:
+    assert [name for name, whose in importlib.metadata.packages_distributions().items() if "abbe" in whose] == ["abbe"]
+    links = {path.name: path.readlink().as_posix() for path in (ROOT / "abbe").iterdir() if path.is_symlink()}
+    assert links == {part: f"../{part}" for part in PARTS}
+    spec = importlib.util.find_spec("abbe")
+    assert spec is not None
+    assert spec.origin == str(ROOT / "abbe" / "__init__.py")
+
+
+def test_nothing_is_imported_but_through_abbe() -> None:
+    """A module imported both as ``models.x`` and as ``abbe.models.x`` would be two, with classes of its own each."""
+    bare = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(PARTS)})\b", re.MULTILINE)
+    assert [p for p in (*SOURCES, *(ROOT / "tests").rglob("*.py")) if bare.search(p.read_text())] == []
 
 
 @pytest.mark.parametrize("name", LOCKS)

@@ -4,10 +4,10 @@ import copy
 import json
 import random
 
-from service.errors import FileFormatError
-from service.vectors.case import Case
-from service.vectors.checks import Checks
-from service.vectors.run import READERS
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
+from abbe.service.vectors.run import READERS
 
 FACTOR = 1 + 5e-8
 

@@ -5,9 +5,9 @@ import shutil
 
 import pytest
 
-from service.cli import run
-from service.errors import FileFormatError
-from service.vectors.run import check_file, examine
+from abbe.service.cli import run
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.run import check_file, examine
 from tests.vectors.altering import load, read
 
 QUICK = ("pahk_diagonals", "paper_tables", "yang_helix")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.errors import FileFormatError
-from service.vectors.run import check_file
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.run import check_file
 from tests.vectors.altering import changed, load, numbers, read, value
 
 FILES = ("kwon_kinematics", "kwon_rsm")

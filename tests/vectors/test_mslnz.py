@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from models.geometry.chain import all_chains, deviation_mm, exact_deviation_mm
-from models.machine import Machine
+from abbe.models.geometry.chain import all_chains, deviation_mm, exact_deviation_mm
+from abbe.models.machine import Machine
 
 CHAIN = "w-X-b-Y-Z-t"
 STROKE = np.array([[0.0, 800.0], [0.0, 600.0], [0.0, 600.0]])

@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from service.errors import FileFormatError
-from service.vectors.run import check_file
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.run import check_file
 from tests.vectors.altering import changed, load, numbers, read
 
 

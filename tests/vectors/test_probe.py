@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from service.vectors.run import check_file
+from abbe.service.vectors.run import check_file
 from tests.vectors.altering import changed, load, numbers, read
 
 

@@ -5,15 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from models.geometry.bases import smooth_terms
-from models.geometry.chain import travel_sign
-from models.machine import Machine
-from models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from models.solvers.identifiability import analyse, project_out
-from models.solvers.observations import RunData
-from models.solvers.observe import run_design, setup_unknowns
-from models.solvers.priors import Priors
-from service.vectors.run import check_file
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import Machine
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.identifiability import analyse, project_out
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import run_design, setup_unknowns
+from abbe.models.solvers.priors import Priors
+from abbe.service.vectors.run import check_file
 from tests.vectors.altering import missed
 
 

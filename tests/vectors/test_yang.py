@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from models.paths.helix import helix_points
-from models.solvers.helix import fit_helix, helix_design
-from models.solvers.identifiability import analyse
-from service.vectors.run import check_file
+from abbe.models.paths.helix import helix_points
+from abbe.models.solvers.helix import fit_helix, helix_design
+from abbe.models.solvers.identifiability import analyse
+from abbe.service.vectors.run import check_file
 from tests.vectors.altering import load, missed, read
 
 FILES = ("yang_volumetric", "yang_helix", "yang_conditioning", "yang_ranks", "yang_ballbar_complete")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from service.plant.facts import Alarm, Check, Facts, Unit, unit_of
+from abbe.service.plant.facts import Alarm, Check, Facts, Unit, unit_of
 
 Value = str | bool | int | float | datetime | list[str] | list[datetime] | None
 Kind = Literal["text", "flag", "count", "real", "time", "texts", "times"]

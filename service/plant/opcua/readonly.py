@@ -19,7 +19,7 @@ from asyncua.server.internal_session import InternalSession
 from asyncua.server.user_managers import UserManager
 from cryptography import x509
 
-from service.plant.opcua.setup import in_force
+from abbe.service.plant.opcua.setup import in_force
 
 MAX_CONNECTIONS = 20
 MAX_SUBSCRIPTIONS = 40

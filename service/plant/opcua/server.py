@@ -12,13 +12,13 @@ import structlog
 from asyncua import Server, ua
 from asyncua.common.connection import TransportLimits
 
-from service.clock import Clock
-from service.errors import ConfigError, StoreError
-from service.plant.facts import FactsSource
-from service.plant.opcua.picture import picture_of
-from service.plant.opcua.readonly import ReadOnlyServer, seal
-from service.plant.opcua.setup import OpcUaSetup, trusted
-from service.plant.opcua.space import NAMESPACE, Space
+from abbe.service.clock import Clock
+from abbe.service.errors import ConfigError, StoreError
+from abbe.service.plant.facts import FactsSource
+from abbe.service.plant.opcua.picture import picture_of
+from abbe.service.plant.opcua.readonly import ReadOnlyServer, seal
+from abbe.service.plant.opcua.setup import OpcUaSetup, trusted
+from abbe.service.plant.opcua.space import NAMESPACE, Space
 
 log = structlog.get_logger("abbe.opcua")
 

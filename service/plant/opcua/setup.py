@@ -11,7 +11,7 @@ from pathlib import Path
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from service.errors import ConfigError
+from abbe.service.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from datetime import datetime
 
 from asyncua import Node, Server, ua
 
-from service.plant.facts import Unit
-from service.plant.opcua.picture import Kind, Leaf, Picture
+from abbe.service.plant.facts import Unit
+from abbe.service.plant.opcua.picture import Kind, Leaf, Picture
 
 NAMESPACE = "urn:abbe:machine"
 UNECE = "http://www.opcfoundation.org/UA/units/un/cefact"

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.report.axes import Panel, data_range
-from service.report.numbers import COVERAGE, plain
-from service.report.solution_model import MotionCurve
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.numbers import COVERAGE, plain
+from abbe.service.report.solution_model import MotionCurve
+from abbe.service.report.svg import Svg
 
 WIDTH, CELL_HEIGHT = 1010.0, 132.0
 LEFT, GAP, TOP, BOTTOM = 68.0, 30.0, 30.0, 48.0

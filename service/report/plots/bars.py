@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from service.report.axes import Panel, data_range
-from service.report.model import Contribution, ParameterRow
-from service.report.numbers import COVERAGE, UM, Unit, finite, plain, with_uncertainty
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.model import Contribution, ParameterRow
+from abbe.service.report.numbers import COVERAGE, UM, Unit, finite, plain, with_uncertainty
+from abbe.service.report.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM = 500.0, 22.0, 34.0, 46.0
 LABELS = 150.0

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.report.axes import Panel, round_up
-from service.report.numbers import plain, tidy
-from service.report.palette import SEQUENCE
-from service.report.plots.signed import SignedScale
-from service.report.solution_model import Correlations, Slice
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, round_up
+from abbe.service.report.numbers import plain, tidy
+from abbe.service.report.palette import SEQUENCE
+from abbe.service.report.plots.signed import SignedScale
+from abbe.service.report.solution_model import Correlations, Slice
+from abbe.service.report.svg import Svg
 
 WIDTH, HEIGHT = 500.0, 420.0
 LEFT, TOP, RIGHT, BOTTOM = 62.0, 48.0, 20.0, 96.0

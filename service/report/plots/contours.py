@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import Panel, tick_text
-from service.report.numbers import plain
-from service.report.plots.facets import Surface
-from service.report.plots.signed import SignedScale, extremes
-from service.report.svg import XY, Svg
+from abbe.service.report.axes import Panel, tick_text
+from abbe.service.report.numbers import plain
+from abbe.service.report.plots.facets import Surface
+from abbe.service.report.plots.signed import SignedScale, extremes
+from abbe.service.report.svg import XY, Svg
 
 Array = NDArray[np.float64]
 Segment = tuple[XY, XY]

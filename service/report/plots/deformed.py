@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import nice_step
-from service.report.numbers import plain, tidy
-from service.report.plots.isometric import Paper, Window, label_edges, round_down
-from service.report.svg import Svg
+from abbe.service.report.axes import nice_step
+from abbe.service.report.numbers import plain, tidy
+from abbe.service.report.plots.isometric import Paper, Window, label_edges, round_down
+from abbe.service.report.svg import Svg
 
 Array = NDArray[np.float64]
 

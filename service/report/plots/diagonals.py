@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from service.report.axes import Panel, data_range
-from service.report.model import Floats
-from service.report.numbers import plain
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.model import Floats
+from abbe.service.report.numbers import plain
+from abbe.service.report.svg import Svg
 
 WIDTH, CELL_HEIGHT = 1010.0, 150.0
 LEFT, GAP, TOP, BOTTOM = 68.0, 46.0, 44.0, 48.0

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import nice_step, tick_text, ticks
-from service.report.numbers import plain, tidy
-from service.report.plots.isometric import Paper, Window, depth, draw_box
-from service.report.plots.signed import SignedScale, extremes
-from service.report.svg import XY, Svg
+from abbe.service.report.axes import nice_step, tick_text, ticks
+from abbe.service.report.numbers import plain, tidy
+from abbe.service.report.plots.isometric import Paper, Window, depth, draw_box
+from abbe.service.report.plots.signed import SignedScale, extremes
+from abbe.service.report.svg import XY, Svg
 
 Array = NDArray[np.float64]
 

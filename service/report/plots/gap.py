@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from service.report.axes import Panel, data_range
-from service.report.discovery_model import Array, Place, RunGap, Trace
-from service.report.numbers import COVERAGE, plain
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.discovery_model import Array, Place, RunGap, Trace
+from abbe.service.report.numbers import COVERAGE, plain
+from abbe.service.report.svg import Svg
 
 WIDE, HALF = 1010.0, 500.0
 ROW, TOP, BOTTOM, LABELS = 20.0, 52.0, 46.0, 190.0

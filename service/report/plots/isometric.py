@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.numbers import tidy
-from service.report.svg import XY, Svg
+from abbe.service.report.numbers import tidy
+from abbe.service.report.svg import XY, Svg
 
 F2 = NDArray[np.float64]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from service.report.axes import Panel
-from service.report.numbers import plain
-from service.report.plots.contours import contour_plot
-from service.report.plots.facets import Surface
-from service.report.plots.signed import SignedScale
-from service.report.solution_model import MotionShare, Slice
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel
+from abbe.service.report.numbers import plain
+from abbe.service.report.plots.contours import contour_plot
+from abbe.service.report.plots.facets import Surface
+from abbe.service.report.plots.signed import SignedScale
+from abbe.service.report.solution_model import MotionShare, Slice
+from abbe.service.report.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM = 500.0, 20.0, 54.0, 50.0
 LABELS, WORDS = 64.0, 118.0

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import Panel, data_range
-from service.report.numbers import COVERAGE, UM, Unit, plain
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.numbers import COVERAGE, UM, Unit, plain
+from abbe.service.report.svg import Svg
 
 Array = NDArray[np.float64]
 

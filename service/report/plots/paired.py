@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.report.axes import Panel, data_range
-from service.report.numbers import COVERAGE, UM, Unit, finite, with_uncertainty
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.numbers import COVERAGE, UM, Unit, finite, with_uncertainty
+from abbe.service.report.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM, LABELS, FIGURES = 640.0, 46.0, 58.0, 46.0, 170.0, 130.0
 STYLES = ("f-c1", "f-c2")

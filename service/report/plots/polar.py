@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from service.report.axes import data_range, nice_step, tick_text, ticks
-from service.report.model import PolarTrace
-from service.report.numbers import UM, Unit, plain
-from service.report.svg import XY, Svg
+from abbe.service.report.axes import data_range, nice_step, tick_text, ticks
+from abbe.service.report.model import PolarTrace
+from abbe.service.report.numbers import UM, Unit, plain
+from abbe.service.report.svg import XY, Svg
 
 SIZE = 470.0
 CENTRE, INNER, OUTER = (SIZE / 2.0, SIZE / 2.0 + 14.0), 52.0, 188.0

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import Panel, data_range
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.svg import Svg
 
 WIDTH, HEIGHT = 700.0, 300.0
 Array = NDArray[np.float64]

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import Panel, data_range
-from service.report.model import ResidualSeries
-from service.report.numbers import COVERAGE, finite, plain
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.model import ResidualSeries
+from abbe.service.report.numbers import COVERAGE, finite, plain
+from abbe.service.report.svg import Svg
 
 WIDTH, HEIGHT = 500.0, 215.0
 MAX_POINTS = 900

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.plots.isometric import Paper, Window, depth, draw_box, label_edges
-from service.report.svg import Svg
+from abbe.service.report.plots.isometric import Paper, Window, depth, draw_box, label_edges
+from abbe.service.report.svg import Svg
 
 F2 = NDArray[np.float64]
 

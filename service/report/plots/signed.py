@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import round_up, tick_text
-from service.report.svg import XY, Svg
+from abbe.service.report.axes import round_up, tick_text
+from abbe.service.report.svg import XY, Svg
 
 BANDS = 8
 HALF = BANDS // 2

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import Panel
-from service.report.numbers import MM, UM, Unit, placed, plain, tidy
-from service.report.palette import SEQUENCE
-from service.report.plots.isometric import round_down
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel
+from abbe.service.report.numbers import MM, UM, Unit, placed, plain, tidy
+from abbe.service.report.palette import SEQUENCE
+from abbe.service.report.plots.isometric import round_down
+from abbe.service.report.svg import Svg
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import F1
-from service.report.axes import Panel, data_range
-from service.report.numbers import COVERAGE, plain, tidy
-from service.report.svg import Svg
+from abbe.models.arrays import F1
+from abbe.service.report.axes import Panel, data_range
+from abbe.service.report.numbers import COVERAGE, plain, tidy
+from abbe.service.report.svg import Svg
 
 WIDTH, CELL_HEIGHT = 1010.0, 150.0
 LEFT, GAP, TOP, BOTTOM = 68.0, 14.0, 46.0, 48.0

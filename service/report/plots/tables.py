@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from service.report.axes import Panel, data_range, nice_step, ticks
-from service.report.model import TableCurve
-from service.report.numbers import finite, plain, tidy
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel, data_range, nice_step, ticks
+from abbe.service.report.model import TableCurve
+from abbe.service.report.numbers import finite, plain, tidy
+from abbe.service.report.svg import Svg
 
 WIDTH, CELL_HEIGHT = 1010.0, 150.0
 LEFT, GAP, TOP, BOTTOM = 68.0, 14.0, 30.0, 48.0

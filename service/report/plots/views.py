@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import Panel
-from service.report.numbers import MM, Unit
-from service.report.svg import Svg
+from abbe.service.report.axes import Panel
+from abbe.service.report.numbers import MM, Unit
+from abbe.service.report.svg import Svg
 
 F2 = NDArray[np.float64]
 F1 = NDArray[np.float64]

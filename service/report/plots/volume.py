@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.report.axes import nice_step, round_up
-from service.report.model import ArrowField
-from service.report.numbers import plain, tidy
-from service.report.palette import SEQUENCE
-from service.report.plots.isometric import Paper, Window, depth, draw_box, label_edges, round_down
-from service.report.svg import Svg
+from abbe.service.report.axes import nice_step, round_up
+from abbe.service.report.model import ArrowField
+from abbe.service.report.numbers import plain, tidy
+from abbe.service.report.palette import SEQUENCE
+from abbe.service.report.plots.isometric import Paper, Window, depth, draw_box, label_edges, round_down
+from abbe.service.report.svg import Svg
 
 F2 = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.sequences.nc.blocks import Arc, Block, Dwell, Go, Smooth
-from service.sequences.steps import Point
+from abbe.service.sequences.nc.blocks import Arc, Block, Dwell, Go, Smooth
+from abbe.service.sequences.steps import Point
 
 
 @dataclass(frozen=True, slots=True)

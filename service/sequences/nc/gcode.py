@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from models.machine import AXES
-from service.sequences.nc.blocks import Arc, Block, Dwell, Go, Halt, Program, Say, Smooth
-from service.sequences.steps import Point
+from abbe.models.machine import AXES
+from abbe.service.sequences.nc.blocks import Arc, Block, Dwell, Go, Halt, Program, Say, Smooth
+from abbe.service.sequences.steps import Point
 
 LAST_NUMBER = 999
 """Block numbers begin again after N9990: four digits are what old controllers take."""

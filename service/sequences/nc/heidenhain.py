@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from models.machine import AXES
-from service.sequences.nc.blocks import Arc, Block, Dwell, Go, Halt, Program, Say, Smooth
-from service.sequences.nc.gcode import ISO, plain
-from service.sequences.steps import Point
+from abbe.models.machine import AXES
+from abbe.service.sequences.nc.blocks import Arc, Block, Dwell, Go, Halt, Program, Say, Smooth
+from abbe.service.sequences.nc.gcode import ISO, plain
+from abbe.service.sequences.steps import Point
 
 TOLERANCE_MM = 0.001
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from models.machine import Machine
-from models.paths.circles import PLANES
-from service.errors import ConfigError
-from service.sequences.nc.blocks import Program, program
-from service.sequences.nc.duration import Pace, Runtime, runtime
-from service.sequences.nc.gcode import DIALECTS, gcode
-from service.sequences.nc.heidenhain import heidenhain
-from service.sequences.nc.settings import NcSettings
-from service.sequences.steps import CampaignPlan
+from abbe.models.machine import Machine
+from abbe.models.paths.circles import PLANES
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.nc.blocks import Program, program
+from abbe.service.sequences.nc.duration import Pace, Runtime, runtime
+from abbe.service.sequences.nc.gcode import DIALECTS, gcode
+from abbe.service.sequences.nc.heidenhain import heidenhain
+from abbe.service.sequences.nc.settings import NcSettings
+from abbe.service.sequences.steps import CampaignPlan
 
 NAMES = (*DIALECTS, "heidenhain")
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from fastapi import FastAPI
 
-from service.web.api.field import add_field
-from service.web.api.found import add_found
-from service.web.api.measured import add_measured
-from service.web.api.plant import add_plant
-from service.web.api.reports import add_reports
-from service.web.api.sources import Sources
-from service.web.api.tables import add_tables
+from abbe.service.web.api.field import add_field
+from abbe.service.web.api.found import add_found
+from abbe.service.web.api.measured import add_measured
+from abbe.service.web.api.plant import add_plant
+from abbe.service.web.api.reports import add_reports
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.api.tables import add_tables
 
 
 def add_api(app: FastAPI, sources: Sources) -> None:

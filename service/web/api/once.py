@@ -12,11 +12,11 @@ from fastapi import Header, Request
 from fastapi.responses import Response
 from pydantic import BaseModel
 
-from service.errors import AbbeError, KeyInUse, KeyReused
-from service.push.entries import canonical
-from service.storage.store import Store
-from service.web.guard import Visit
-from service.web.problems import MEDIA_TYPE, problem_of
+from abbe.service.errors import AbbeError, KeyInUse, KeyReused
+from abbe.service.push.entries import canonical
+from abbe.service.storage.store import Store
+from abbe.service.web.guard import Visit
+from abbe.service.web.problems import MEDIA_TYPE, problem_of
 
 REPLAYED = "Idempotent-Replayed"
 Key = Annotated[

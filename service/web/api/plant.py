@@ -6,15 +6,15 @@ from dataclasses import asdict
 
 from fastapi import FastAPI
 
-from service.errors import Unusable
-from service.scheduler.slots import Schedule, cron_in_words, next_slot
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.api import shapes as s
-from service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, finite, read_as
-from service.web.catalogue import entries
-from service.web.schemas import Verification
-from service.workflows.shipped import RECIPES
+from abbe.service.errors import Unusable
+from abbe.service.scheduler.slots import Schedule, cron_in_words, next_slot
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.api import shapes as s
+from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, finite, read_as
+from abbe.service.web.catalogue import entries
+from abbe.service.web.schemas import Verification
+from abbe.service.workflows.shipped import RECIPES
 
 LATEST = 10
 BLANK: Doc = {

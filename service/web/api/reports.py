@@ -9,12 +9,12 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
-from service.errors import NotStored
-from service.report.document import Document
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.api.sources import Number, Sources, as_stored, storable
-from service.workflows.report import FORMS, default_name, numbered_report, stored_report
+from abbe.service.errors import NotStored
+from abbe.service.report.document import Document
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.api.sources import Number, Sources, as_stored, storable
+from abbe.service.workflows.report import FORMS, default_name, numbered_report, stored_report
 
 AT_A_TIME = 2
 

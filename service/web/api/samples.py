@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import zlib
 
-from service.errors import NotStored, StoreError
-from service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, pack_bar
-from service.runs.columns import IMPORTED_CHANNEL, load_run
-from service.storage.records import ChunkRecord
-from service.storage.store import Store
-from service.web.api.shapes import BarSamples, Columns, Samples
-from service.web.api.sources import as_stored, finite, storable
+from abbe.service.errors import NotStored, StoreError
+from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, pack_bar
+from abbe.service.runs.columns import IMPORTED_CHANNEL, load_run
+from abbe.service.storage.records import ChunkRecord
+from abbe.service.storage.store import Store
+from abbe.service.web.api.shapes import BarSamples, Columns, Samples
+from abbe.service.web.api.sources import as_stored, finite, storable
 
 JSON_ROWS = 10_000
 BINARY_ROWS = 100_000

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.runs.machine_object import MachineObject
-from service.web.schemas import Device, Verification, Verified
+from abbe.service.runs.machine_object import MachineObject
+from abbe.service.web.schemas import Device, Verification, Verified
 
 
 class Answer(BaseModel):

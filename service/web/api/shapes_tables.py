@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.runs.discovery_file import DiscoveryFile
-from service.runs.solution_file import SolutionFile
-from service.web.api.shapes import Answer, NextCursor
+from abbe.service.runs.discovery_file import DiscoveryFile
+from abbe.service.runs.solution_file import SolutionFile
+from abbe.service.web.api.shapes import Answer, NextCursor
 
 
 class Solution(Answer):

@@ -15,14 +15,14 @@ from fastapi import Path, Query
 from pydantic import BaseModel, ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.clock import Clock
-from service.errors import NotStored, StoreError, Unusable
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.storage.store_pages import LARGEST
-from service.web.logtail import LogTail
-from service.web.schemas import Device
-from service.workflows.report_parts import Rules
+from abbe.service.clock import Clock
+from abbe.service.errors import NotStored, StoreError, Unusable
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store_pages import LARGEST
+from abbe.service.web.logtail import LogTail
+from abbe.service.web.schemas import Device
+from abbe.service.workflows.report_parts import Rules
 
 log = structlog.get_logger("abbe.api")
 M = TypeVar("M", bound=BaseModel)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
-from service.channel.messages import Answer
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.api.once import REPLAYED, Key
-from service.web.api.shapes_tables import PushBody, RollbackBody
-from service.web.api.sources import Number
-from service.web.core_line import CoreLine
-from service.web.guard import Visit
-from service.web.jobs import ACCEPTED, REFUSALS, answered
-from service.web.schemas_jobs import JobState
+from abbe.service.channel.messages import Answer
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.api.once import REPLAYED, Key
+from abbe.service.web.api.shapes_tables import PushBody, RollbackBody
+from abbe.service.web.api.sources import Number
+from abbe.service.web.core_line import CoreLine
+from abbe.service.web.guard import Visit
+from abbe.service.web.jobs import ACCEPTED, REFUSALS, answered
+from abbe.service.web.schemas_jobs import JobState
 
 LONGEST_BODY = 4096
 RESPONSES = ACCEPTED | REFUSALS

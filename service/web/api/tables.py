@@ -8,22 +8,22 @@ from typing import Annotated
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import Response
 
-from service.errors import Unusable
-from service.push.book import read_entries
-from service.push.entries import Entry
-from service.storage.base import utc_text
-from service.storage.store_pages import LARGEST
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.api import shapes_tables as s
-from service.web.api.once import Key, once
-from service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, as_stored
-from service.web.guard import Visit
-from service.workflows.proposal_checks import approve as work_approve
-from service.workflows.proposal_checks import reject as work_reject
-from service.workflows.proposal_diff import ACTIVE, compare, diff_json
-from service.workflows.proposal_doc import Proposed, load
-from service.workflows.proposal_states import Standing, check_waiting, standing, standing_of
+from abbe.service.errors import Unusable
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import Entry
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.store_pages import LARGEST
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.api import shapes_tables as s
+from abbe.service.web.api.once import Key, once
+from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, as_stored
+from abbe.service.web.guard import Visit
+from abbe.service.workflows.proposal_checks import approve as work_approve
+from abbe.service.workflows.proposal_checks import reject as work_reject
+from abbe.service.workflows.proposal_diff import ACTIVE, compare, diff_json
+from abbe.service.workflows.proposal_doc import Proposed, load
+from abbe.service.workflows.proposal_states import Standing, check_waiting, standing, standing_of
 
 LONGEST_BODY = 4096
 

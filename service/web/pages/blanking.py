@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from service.secrets import mask_secrets
+from abbe.service.secrets import mask_secrets
 
 HIDDEN = "***"
 _NAMED = r"(?:pass(?:word|phrase|wd|code)|pwd|secret|token|api[_-]?key|private[_-]?key|credential|cookie|authori[sz]ation|csrf)"

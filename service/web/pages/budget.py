@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from service.report.model import Contribution
-from service.report.numbers import COVERAGE, NOT_AVAILABLE, finite, fixed, placed, plain
-from service.report.plots.bars import contribution_bars
-from service.storage.records import SolutionRecord
-from service.storage.store import Store
-from service.web.frame import current
+from abbe.service.report.model import Contribution
+from abbe.service.report.numbers import COVERAGE, NOT_AVAILABLE, finite, fixed, placed, plain
+from abbe.service.report.plots.bars import contribution_bars
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+from abbe.service.web.frame import current
 
 Say = Callable[..., str]
 NOTHING = Markup("")

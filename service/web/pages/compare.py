@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from service.errors import AbbeError
-from service.report.model import PolarTrace
-from service.report.numbers import COVERAGE, finite, plain
-from service.report.plots.overlay import difference_plot, overlay_plot
-from service.report.plots.polar import polar_plot
-from service.runs.observations import run_data
-from service.storage.records import RunRecord
-from service.storage.store import Store
-from service.web.frame import current
-from service.web.pages.desk import found
-from service.web.pages.runs import run_document
-from service.workflows.compare_runs import MOST, Curve, Difference, FigureRow, Loaded, against, curve, difference, figure_rows, remarks
-from service.workflows.report_parts import Rules
+from abbe.service.errors import AbbeError
+from abbe.service.report.model import PolarTrace
+from abbe.service.report.numbers import COVERAGE, finite, plain
+from abbe.service.report.plots.overlay import difference_plot, overlay_plot
+from abbe.service.report.plots.polar import polar_plot
+from abbe.service.runs.observations import run_data
+from abbe.service.storage.records import RunRecord
+from abbe.service.storage.store import Store
+from abbe.service.web.frame import current
+from abbe.service.web.pages.desk import found
+from abbe.service.web.pages.runs import run_document
+from abbe.service.workflows.compare_runs import MOST, Curve, Difference, FigureRow, Loaded, against, curve, difference, figure_rows, remarks
+from abbe.service.workflows.report_parts import Rules
 
 LETTERS = "ABCD"
 LISTED = 40

@@ -12,13 +12,13 @@ from zoneinfo import ZoneInfo
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
-from service.errors import StoreError
-from service.storage.store import Store
-from service.web import words
-from service.web.api.sources import storable
-from service.web.door import Door
-from service.web.schemas import Status, Verification
-from service.workflows.report_parts import Rules
+from abbe.service.errors import StoreError
+from abbe.service.storage.store import Store
+from abbe.service.web import words
+from abbe.service.web.api.sources import storable
+from abbe.service.web.door import Door
+from abbe.service.web.schemas import Status, Verification
+from abbe.service.workflows.report_parts import Rules
 
 T = TypeVar("T")
 

@@ -13,11 +13,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from service.storage.store_health import Health
-from service.web.api.sources import Sources
-from service.web.pages.blanking import blanked_doc, blanked_line
-from service.web.schemas import Status
-from service.workflows.provenance import versions
+from abbe.service.storage.store_health import Health
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.pages.blanking import blanked_doc, blanked_line
+from abbe.service.web.schemas import Status
+from abbe.service.workflows.provenance import versions
 
 DAY_S = 86_400.0
 MEGA = 1e6
@@ -86,7 +86,7 @@ def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
 
 
 def bundle(diagnosis: Diagnosis, config: Mapping[str, Any], status: Status, log: Sequence[str]) -> bytes:
-    """The support bundle as a zip file; no part of it without `service.web.pages.blanking`."""
+    """The support bundle as a zip file; no part of it without `abbe.service.web.pages.blanking`."""
     members = {
         "config.json": _json(config),
         "diagnosis.json": _json(asdict(diagnosis)),

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from service.scheduler.fleet import Figure, Stand, stands
-from service.scheduler.store import ServiceStore
-from service.storage.base import utc_text
-from service.workflows.alarm_states import folded, is_open
+from abbe.service.scheduler.fleet import Figure, Stand, stands
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.base import utc_text
+from abbe.service.workflows.alarm_states import folded, is_open
 
 SORTS = ("worst", "machine", "due")
 COLUMNS = (

@@ -8,13 +8,13 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
-from service.channel.messages import JobSeen
-from service.users.roles import Permission
-from service.web import language
-from service.web.access import needs
-from service.web.door import Door
-from service.web.frame import current
-from service.web.pages.desk import Desk, Source
+from abbe.service.channel.messages import JobSeen
+from abbe.service.users.roles import Permission
+from abbe.service.web import language
+from abbe.service.web.access import needs
+from abbe.service.web.door import Door
+from abbe.service.web.frame import current
+from abbe.service.web.pages.desk import Desk, Source
 
 SCRIPT_WORDS = (
     "live.abort", "live.ended", "live.gone", "live.old", "live.pause", "live.resume", "live.stop", "live.no_path",

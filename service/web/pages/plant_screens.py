@@ -11,19 +11,19 @@ from fastapi.responses import HTMLResponse, Response
 from jinja2 import Environment
 from pydantic import AfterValidator
 
-from service.audit.chain import Event
-from service.users.roles import Permission
-from service.web import language
-from service.web.access import needs
-from service.web.api.sources import Sources
-from service.web.door import Door
-from service.web.frame import THEMES, current
-from service.web.guard import Visit
-from service.web.pages.desk import Desk, Source, can_be_stored
-from service.web.pages.devices import device_screen
-from service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
-from service.web.pages.fleet import SORTS, Asked, fleet_csv, fleet_lines
-from service.web.units import SYSTEMS
+from abbe.service.audit.chain import Event
+from abbe.service.users.roles import Permission
+from abbe.service.web import language
+from abbe.service.web.access import needs
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.door import Door
+from abbe.service.web.frame import THEMES, current
+from abbe.service.web.guard import Visit
+from abbe.service.web.pages.desk import Desk, Source, can_be_stored
+from abbe.service.web.pages.devices import device_screen
+from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
+from abbe.service.web.pages.fleet import SORTS, Asked, fleet_csv, fleet_lines
+from abbe.service.web.units import SYSTEMS
 
 Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 Sort = Literal["worst", "machine", "due"]

@@ -8,19 +8,19 @@ from datetime import UTC, datetime
 
 from markupsafe import Markup
 
-from service.clock import Clock, SystemClock
-from service.errors import StoreError
-from service.push.book import read_entries
-from service.report.plots.table_change import DiffCurve, change_plot
-from service.storage.base import utc_text
-from service.storage.records import ApprovalRecord
-from service.storage.store import Store
-from service.web.frame import current
-from service.web.units import INCH
-from service.workflows.proposal_checks import approve
-from service.workflows.proposal_diff import HEADINGS, compare, largest, rows
-from service.workflows.proposal_doc import Proposed, load
-from service.workflows.proposal_states import Standing, check_waiting, standing, standing_of
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.errors import StoreError
+from abbe.service.push.book import read_entries
+from abbe.service.report.plots.table_change import DiffCurve, change_plot
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.records import ApprovalRecord
+from abbe.service.storage.store import Store
+from abbe.service.web.frame import current
+from abbe.service.web.units import INCH
+from abbe.service.workflows.proposal_checks import approve
+from abbe.service.workflows.proposal_diff import HEADINGS, compare, largest, rows
+from abbe.service.workflows.proposal_doc import Proposed, load
+from abbe.service.workflows.proposal_states import Standing, check_waiting, standing, standing_of
 
 MOST = 50
 SIGNS = {"kept": "ok", "approved": "ok", "pushed": "ok", "refused": "bad", "rolled back": "bad", "changed": "bad", "rejected": "bad"}

@@ -7,16 +7,16 @@ from typing import Annotated, Literal
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse
 
-from service.storage.records import SolutionRecord
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.frame import current
-from service.web.pages.budget import budget_screen
-from service.web.pages.compare import compare_screen
-from service.web.pages.desk import Desk, found
-from service.web.pages.results import solution_lines
-from service.web.pages.volume import NODES, Asked, volume_screen
-from service.web.pages.whatif import whatif_screen
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.frame import current
+from abbe.service.web.pages.budget import budget_screen
+from abbe.service.web.pages.compare import compare_screen
+from abbe.service.web.pages.desk import Desk, found
+from abbe.service.web.pages.results import solution_lines
+from abbe.service.web.pages.volume import NODES, Asked, volume_screen
+from abbe.service.web.pages.whatif import whatif_screen
 
 LARGEST = 2**31 - 1
 Number = Annotated[int | None, Query(ge=1, le=LARGEST)]

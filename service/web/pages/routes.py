@@ -12,23 +12,23 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 from pydantic import AfterValidator
 
-from service.errors import StoreError, TableRefused
-from service.report.document_data import shown
-from service.report.palette import style_rules
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.door import Door
-from service.web.guard import Visit
-from service.web.pages import times
-from service.web.pages.colours import themed
-from service.web.pages.desk import Desk, Source, can_be_stored, found
-from service.web.pages.proposals import approve_as, proposal_lines, proposal_screen
-from service.web.pages.result_routes import add_result_pages
-from service.web.pages.results import discovery_lines, discovery_screen, result_screen, solution_lines
-from service.web.pages.runs import STATES, TESTS, Wanted, newest_run, run_list, run_screen
-from service.web.pages.table import ends
-from service.web.problems import problem
-from service.workflows.report_parts import Rules
+from abbe.service.errors import StoreError, TableRefused
+from abbe.service.report.document_data import shown
+from abbe.service.report.palette import style_rules
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.door import Door
+from abbe.service.web.guard import Visit
+from abbe.service.web.pages import times
+from abbe.service.web.pages.colours import themed
+from abbe.service.web.pages.desk import Desk, Source, can_be_stored, found
+from abbe.service.web.pages.proposals import approve_as, proposal_lines, proposal_screen
+from abbe.service.web.pages.result_routes import add_result_pages
+from abbe.service.web.pages.results import discovery_lines, discovery_screen, result_screen, solution_lines
+from abbe.service.web.pages.runs import STATES, TESTS, Wanted, newest_run, run_list, run_screen
+from abbe.service.web.pages.table import ends
+from abbe.service.web.problems import problem
+from abbe.service.workflows.report_parts import Rules
 
 LONGEST_FORM = 1024
 HOURS = (1.0, 8.0, 24.0, 72.0)

@@ -8,14 +8,14 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
-from service.errors import StoreError
-from service.users.roles import Permission
-from service.web.access import needs
-from service.web.api.sources import Sources
-from service.web.door import Door
-from service.web.frame import current
-from service.web.pages.desk import Desk, Source
-from service.workflows.table_story import story
+from abbe.service.errors import StoreError
+from abbe.service.users.roles import Permission
+from abbe.service.web.access import needs
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.door import Door
+from abbe.service.web.frame import current
+from abbe.service.web.pages.desk import Desk, Source
+from abbe.service.workflows.table_story import story
 
 MOST = 50
 SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}

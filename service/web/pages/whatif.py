@@ -8,20 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from models.uncertainty.what_if import Outcome, check_figures, what_if
-from service.errors import AbbeError
-from service.report.numbers import COVERAGE, with_uncertainty
-from service.report.plots.paired import Pair, paired_bars
-from service.sequences.campaigns import hemisphere
-from service.storage.records import SolutionRecord
-from service.storage.store import Store
-from service.web.frame import current
-from service.workflows.solution_field import StoredField, stored_field
+from abbe.models.uncertainty.what_if import Outcome, check_figures, what_if
+from abbe.service.errors import AbbeError
+from abbe.service.report.numbers import COVERAGE, with_uncertainty
+from abbe.service.report.plots.paired import Pair, paired_bars
+from abbe.service.sequences.campaigns import hemisphere
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+from abbe.service.web.frame import current
+from abbe.service.workflows.solution_field import StoredField, stored_field
 
 MEAN = "mean."
 """Before the name of a scale or squareness that is averaged over the volume."""
 CHECK_PLACE, CHECK_SHARE = (0.45, 0.55, 0.12), 0.7
-"""Where the shipped checks set up the ball-bar (`service.sequences.campaigns.quick_check`)."""
+"""Where the shipped checks set up the ball-bar (`abbe.service.sequences.campaigns.quick_check`)."""
 UM = 1e3
 RESOLUTION_MM = 1e-7
 """Nobody measures a tenth of a nanometre; an uncertainty below it is rounding of numbers."""

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.api import BarSample
-from drivers.ballbar import frames
-from drivers.ballbar.frames import Ack, Bad, FrameDecoder, Info
+from abbe.drivers.api import BarSample
+from abbe.drivers.ballbar import frames
+from abbe.drivers.ballbar.frames import Ack, Bad, FrameDecoder, Info
 
 SAMPLE = bytes.fromhex("A55A01120700000087D6120000000000C7CFFFFF0800A8E2")
 INFO = bytes.fromhex("A55A021C01000100FECA671200000001E80300004142422D3100000000000000EAF7")

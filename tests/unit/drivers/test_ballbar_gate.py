@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.api import BarSample
-from drivers.ballbar.sequence import OtherPace, OtherSettings, Reads, SequenceRestart, SequenceTracker
+from abbe.drivers.api import BarSample
+from abbe.drivers.ballbar.sequence import OtherPace, OtherSettings, Reads, SequenceRestart, SequenceTracker
 
 READS = Reads(number=3, range_nm=1_000_000)
 NUMBER = 3 << 8

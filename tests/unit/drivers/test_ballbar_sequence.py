@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.api import BarSample
-from drivers.ballbar.sequence import SequenceRestart, SequenceTracker
+from abbe.drivers.api import BarSample
+from abbe.drivers.ballbar.sequence import SequenceRestart, SequenceTracker
 
 
 def bar(seq: int, us: int | None = None) -> BarSample:

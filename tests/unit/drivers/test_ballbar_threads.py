@@ -10,14 +10,14 @@ import tty
 
 import pytest
 
-from drivers.api import BarBatch, BarSample
-from drivers.ballbar.driver import SerialBallBar
-from drivers.ballbar.stream import Stream
-from drivers.errors import LinkDown
-from drivers.links import reading
-from drivers.links.reading import ReadingThread, Ring
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import SerialUrl
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.ballbar.stream import Stream
+from abbe.drivers.errors import LinkDown
+from abbe.drivers.links import reading
+from abbe.drivers.links.reading import ReadingThread, Ring
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import SerialUrl
 
 
 @pytest.mark.parametrize("call", ["dup", "pipe"])

@@ -7,12 +7,12 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ballbar import frames
-from drivers.ballbar.frames import Ack, FrameDecoder, Info, Settings
-from drivers.laser import registers as laser
-from drivers.links.words import bytes_of, words_of
-from simulators.ballbar.device import Settings as BoxSettings
-from simulators.ballbar.wire import Parser, encode_ack, encode_info, encode_settings
+from abbe.drivers.ballbar import frames
+from abbe.drivers.ballbar.frames import Ack, FrameDecoder, Info, Settings
+from abbe.drivers.laser import registers as laser
+from abbe.drivers.links.words import bytes_of, words_of
+from abbe.simulators.ballbar.device import Settings as BoxSettings
+from abbe.simulators.ballbar.wire import Parser, encode_ack, encode_info, encode_settings
 
 u8, u16, u32, i32 = st.integers(0, 255), st.integers(0, 0xFFFF), st.integers(0, 2**32 - 1), st.integers(-(2**31), 2**31 - 1)
 SETTINGS = bytes.fromhex("A55A040C0500010040420F000000000000B5")

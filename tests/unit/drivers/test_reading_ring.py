@@ -10,15 +10,15 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from drivers.api import BarBatch, BarSample
-from drivers.ballbar import driver as module
-from drivers.ballbar.driver import SerialBallBar
-from drivers.ballbar.sequence import Reads
-from drivers.ballbar.stream import Stream
-from drivers.errors import Backpressure, LossyLine
-from drivers.links.reading import ReadingThread, Ring
-from drivers.links.serial_link import ByteLink
-from drivers.links.urls import parse_url
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.drivers.ballbar import driver as module
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.ballbar.sequence import Reads
+from abbe.drivers.ballbar.stream import Stream
+from abbe.drivers.errors import Backpressure, LossyLine
+from abbe.drivers.links.reading import ReadingThread, Ring
+from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.urls import parse_url
 from tests.contract.conftest import bar_peer as bar_peer  # fixture
 
 

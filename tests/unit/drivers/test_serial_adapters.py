@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import LinkDown, WrongDevice
-from drivers.links import reading as module
-from drivers.links.adapters import Adapter, adapter_at, path_to_open
-from drivers.links.reading import ReadingThread, Ring
-from drivers.links.serial_link import ByteLink, plugged_in
-from drivers.links.urls import SerialUrl
+from abbe.drivers.errors import LinkDown, WrongDevice
+from abbe.drivers.links import reading as module
+from abbe.drivers.links.adapters import Adapter, adapter_at, path_to_open
+from abbe.drivers.links.reading import ReadingThread, Ring
+from abbe.drivers.links.serial_link import ByteLink, plugged_in
+from abbe.drivers.links.urls import SerialUrl
 
 MINE, OTHER = Adapter("/dev/ttyUSB0", "0403:6001", "A5XK3RJT"), Adapter("/dev/ttyUSB0", "0403:6001", "B7")
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import BadUrl
-from drivers.links.urls import PARITIES, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
+from abbe.drivers.errors import BadUrl
+from abbe.drivers.links.urls import PARITIES, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
 
 paths = (
     st.text(st.characters(codec="utf-8", exclude_categories=["C"]), min_size=1)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.api import BarSample
-from drivers.ballbar import frames
-from drivers.ballbar.frames import Ack, FrameDecoder, Info
-from drivers.cnc import registers as cnc
-from drivers.laser import registers as laser
-from drivers.links.modbus_reply import tcp_mismatch
-from drivers.links.words import words_of
+from abbe.drivers.api import BarSample
+from abbe.drivers.ballbar import frames
+from abbe.drivers.ballbar.frames import Ack, FrameDecoder, Info
+from abbe.drivers.cnc import registers as cnc
+from abbe.drivers.laser import registers as laser
+from abbe.drivers.links.modbus_reply import tcp_mismatch
+from abbe.drivers.links.words import words_of
 
 IDENTIFY = "A5 5A 81 02 01 00 1D 72"
 START = "A5 5A 82 04 02 00 E8 03 66 9C"

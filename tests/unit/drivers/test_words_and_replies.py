@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cnc import registers as cnc
-from drivers.errors import WrongDevice
-from drivers.laser import registers as laser
-from drivers.links.identity import check_identity
-from drivers.links.modbus_reply import rtu_mismatch, tcp_mismatch
-from drivers.links.words import Block, Register, bytes_of, words_of
+from abbe.drivers.cnc import registers as cnc
+from abbe.drivers.errors import WrongDevice
+from abbe.drivers.laser import registers as laser
+from abbe.drivers.links.identity import check_identity
+from abbe.drivers.links.modbus_reply import rtu_mismatch, tcp_mismatch
+from abbe.drivers.links.words import Block, Register, bytes_of, words_of
 
 READ = bytes.fromhex("0007 0000 0006 01 03 0064 0002")
 WRITE = bytes.fromhex("0008 0000 000B 01 10 0064 0002 04 0001 0002")

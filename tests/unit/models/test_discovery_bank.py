@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.discovery.baseline import baseline_of
-from models.discovery.candidates import Bank, bank_of, gain_of, rows_for, starts_of
-from models.discovery.scene import Scene, scene_of, taken_out
-from models.effects.catalogue import CATALOGUE
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.candidates import Bank, bank_of, gain_of, rows_for, starts_of
+from abbe.models.discovery.scene import Scene, scene_of, taken_out
+from abbe.models.effects.catalogue import CATALOGUE
 from tests.physics.test_discovery_search import campaign
 
 NAMES = ("backlash", "cyclic_error", "lateral_play", "dead_path")

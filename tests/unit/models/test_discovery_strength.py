@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
-from models.discovery.candidates import Pick
-from models.discovery.strength import TIME_TRUE_TO_FORM, shape_of, strength_of, true_to_form
-from models.effects.catalogue import CATALOGUE
-from models.effects.effect import Form
-from models.effects.smooth import WITH_CONSTANT, WITH_LINE
+from abbe.models.discovery.candidates import Pick
+from abbe.models.discovery.strength import TIME_TRUE_TO_FORM, shape_of, strength_of, true_to_form
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.effect import Form
+from abbe.models.effects.smooth import WITH_CONSTANT, WITH_LINE
 
 BY_NAME = {e.name: e for e in CATALOGUE}
 

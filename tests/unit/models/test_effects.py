@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from models.arrays import F1, F2
-from models.effects import vibration
-from models.effects.catalogue import CATALOGUE
-from models.effects.effect import Effect
-from models.effects.path import Path
-from models.effects.probe_paths import CENTRE_MM, DEAD_PATH_MM, MACHINE, probe_paths
-from models.effects.self_test import corners, declaration_faults, signal_faults
-from models.geometry.bases import smooth_terms
-from models.geometry.chain import design
-from models.machine import Machine
+from abbe.models.arrays import F1, F2
+from abbe.models.effects import vibration
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.effect import Effect
+from abbe.models.effects.path import Path
+from abbe.models.effects.probe_paths import CENTRE_MM, DEAD_PATH_MM, MACHINE, probe_paths
+from abbe.models.effects.self_test import corners, declaration_faults, signal_faults
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.chain import design
+from abbe.models.machine import Machine
 
 PATHS = probe_paths()
 BY_NAME = {e.name: e for e in CATALOGUE}
@@ -212,7 +212,7 @@ def test_smooth_errors_are_those_of_the_21_error_model(name: str, key: str, moti
 
 def arm_of(path: Path, key: str, q_mm: F2) -> F2:
     """What a constant angle of 1 rad of a carriage does, shape (n, 3)."""
-    from models.machine import levers_mm
+    from abbe.models.machine import levers_mm
 
     return np.asarray(np.cross(np.eye(3)["ABC".index(key[1])], levers_mm(path.machine, q_mm)[:, "XYZ".index(key[2])]))
 

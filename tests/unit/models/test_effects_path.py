@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.effects.columns import before_first_turn, commanded_turns, play, rise_of, turn_between, warmth
-from models.effects.path import FAR_MM, Places, driven
-from models.effects.probe_paths import probe_paths
+from abbe.models.effects.columns import before_first_turn, commanded_turns, play, rise_of, turn_between, warmth
+from abbe.models.effects.path import FAR_MM, Places, driven
+from abbe.models.effects.probe_paths import probe_paths
 
 RADIUS_MM, FEED = 150.0, 1200.0
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import interpolate
 
-from models.functions.bspline import BSpline, clamped_knots
-from models.functions.legendre import Legendre
-from models.functions.polynomial import Polynomial
-from models.functions.table import Table
+from abbe.models.functions.bspline import BSpline, clamped_knots
+from abbe.models.functions.legendre import Legendre
+from abbe.models.functions.polynomial import Polynomial
+from abbe.models.functions.table import Table
 
 KINDS = ("polynomial", "legendre", "bspline", "linear", "cubic")
 

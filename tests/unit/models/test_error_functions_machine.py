@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models.functions.legendre import Legendre
-from models.functions.motions import PLACES, SQUARENESS, ErrorMotions
-from models.functions.polynomial import Polynomial
-from models.functions.rules import least_squares_line
-from models.functions.table import Table
-from models.geometry import propagation
-from models.geometry.bases import Term, smooth_terms, term_values
-from models.geometry.chain import deviation_mm, exact_deviation_mm
-from models.geometry.covariance import checked_covariance
-from models.geometry.propagation import CHUNK, Points, deviation_covariance, sensitivity
-from models.machine import Machine
+from abbe.models.functions.legendre import Legendre
+from abbe.models.functions.motions import PLACES, SQUARENESS, ErrorMotions
+from abbe.models.functions.polynomial import Polynomial
+from abbe.models.functions.rules import least_squares_line
+from abbe.models.functions.table import Table
+from abbe.models.geometry import propagation
+from abbe.models.geometry.bases import Term, smooth_terms, term_values
+from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.geometry.covariance import checked_covariance
+from abbe.models.geometry.propagation import CHUNK, Points, deviation_covariance, sensitivity
+from abbe.models.machine import Machine
 
 STROKE = np.array([[-100.0, 500.0], [0.0, 400.0], [50.0, 450.0]])
 CHAINS = ["-".join(["w", *order[:k], "b", *order[k:], "t"]) for order in permutations("XYZ") for k in range(4)]

@@ -6,9 +6,9 @@ import statistics
 import numpy as np
 import pytest
 
-from models.evaluation.iso230_2 import Approaches, ScaleBudget, positioning
-from models.evaluation.iso230_4 import Circle, both_ways, centred, circular
-from models.evaluation.iso230_6 import FACE, diagonals
+from abbe.models.evaluation.iso230_2 import Approaches, ScaleBudget, positioning
+from abbe.models.evaluation.iso230_4 import Circle, both_ways, centred, circular
+from abbe.models.evaluation.iso230_6 import FACE, diagonals
 
 ROOT2 = np.sqrt(2.0)
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from models import probability as ours
+from abbe.models import probability as ours
 
 P = np.array([1e-250, 1e-12, 1e-4, 0.025, 0.3, 0.5, 0.9, 0.975, 1 - 1e-9])
 Z = np.array([-30.0, -6.0, -1.0, -1e-9, 0.0, 0.5, 3.0, 9.0, 35.0])
@@ -50,5 +50,8 @@ def test_f(dof: float, below: float) -> None:
 
 def test_no_command_and_no_service_imports_scipy_stats() -> None:
     """Half of a start's processor time went there."""
-    code = "import sys, service.serve, service.workflows.correct, service.workflows.discover; sys.exit('scipy.stats' in sys.modules)"
+    code = (
+        "import sys, abbe.service.serve, abbe.service.workflows.correct, abbe.service.workflows.discover\n"
+        "sys.exit('scipy.stats' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[3]).returncode == 0

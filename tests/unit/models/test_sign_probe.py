@@ -7,9 +7,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from models.compensation.sign_probe import expected_changes, probe
-from models.compensation.tables import NineTables
-from models.paths.helix import helix_points
+from abbe.models.compensation.sign_probe import expected_changes, probe
+from abbe.models.compensation.tables import NineTables
+from abbe.models.paths.helix import helix_points
 
 CENTRE = np.array([300.0, 250.0, 157.5])
 PLACES = helix_points(CENTRE, 135.0, turns=3.0, n=12, law="area", axis=2)

@@ -7,8 +7,8 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 
-from models.compensation.sign_proof import Shift, bar_shift, sign_proof, step_tables
-from models.compensation.tables import NineTables
+from abbe.models.compensation.sign_proof import Shift, bar_shift, sign_proof, step_tables
+from abbe.models.compensation.tables import NineTables
 
 STEP, U = 0.010, 0.0002
 

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from models.trend import CUSUM_H, MIN_CHECKS, average_run_length, cusum, ewma, forecast, standardised, trend
+from abbe.models.trend import CUSUM_H, MIN_CHECKS, average_run_length, cusum, ewma, forecast, standardised, trend
 
 LONG = bool(os.environ.get("ABBE_TEST_LONG"))
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from models.uncertainty.coverage import coverage_factor, effective_dof, shortest_interval, symmetric_interval, vector_factor
-from models.uncertainty.distributions import Distribution
-from models.uncertainty.moments import Moments
-from models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, batch_size, numerical_tolerance, validate
+from abbe.models.uncertainty.coverage import coverage_factor, effective_dof, shortest_interval, symmetric_interval, vector_factor
+from abbe.models.uncertainty.distributions import Distribution
+from abbe.models.uncertainty.moments import Moments
+from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, batch_size, numerical_tolerance, validate
 
 
 def test_effective_degrees_of_freedom_of_the_guide_s_end_gauge():

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.solvers.observations import RunData
-from models.uncertainty.budget import budget_at, budget_over, worst_point
-from models.uncertainty.inputs import Inputs
-from models.uncertainty.mask import compensable_mask
-from models.uncertainty.prediction import Prediction
-from models.uncertainty.repeatability import machine_repeatability
+from abbe.models.solvers.observations import RunData
+from abbe.models.uncertainty.budget import budget_at, budget_over, worst_point
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.mask import compensable_mask
+from abbe.models.uncertainty.prediction import Prediction
+from abbe.models.uncertainty.repeatability import machine_repeatability
 
 
 def prediction(deviation, variances, dof=np.inf, names=("bar_noise", "prior")):

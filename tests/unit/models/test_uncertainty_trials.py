@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from models.paths.helix import helix_points
-from models.uncertainty import helix_trials as module
-from models.uncertainty import linear_trials as linear
-from models.uncertainty.distributions import Distribution
-from models.uncertainty.helix_trials import HelixTask, fit_trials, helix_trials
-from models.uncertainty.linear_trials import linear_estimator, linear_trials
+from abbe.models.paths.helix import helix_points
+from abbe.models.uncertainty import helix_trials as module
+from abbe.models.uncertainty import linear_trials as linear
+from abbe.models.uncertainty.distributions import Distribution
+from abbe.models.uncertainty.helix_trials import HelixTask, fit_trials, helix_trials
+from abbe.models.uncertainty.linear_trials import linear_estimator, linear_trials
 
 RADIUS, SIGMA = 150.0, 5e-4
 POINTS = helix_points(np.zeros(3), RADIUS, turns=3, n=63, law="angle", axis=2)

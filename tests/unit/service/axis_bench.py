@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from models.discovery.answer import Discovery
-from models.discovery.case import Case
-from service.events import ignore_progress
-from service.runs.cases import case_of
-from service.site import machine_from_doc
-from service.workflows.discovery_doc import finding_doc
-from service.workflows.discovery_engine import catalogue, search
+from abbe.models.discovery.answer import Discovery
+from abbe.models.discovery.case import Case
+from abbe.service.events import ignore_progress
+from abbe.service.runs.cases import case_of
+from abbe.service.site import machine_from_doc
+from abbe.service.workflows.discovery_doc import finding_doc
+from abbe.service.workflows.discovery_engine import catalogue, search
 
 Doc = dict[str, Any]
 MACHINE: Doc = {
@@ -94,7 +94,7 @@ def searched(runs: list[Doc]) -> tuple[Discovery, Doc]:
 
 def found_in(case: Case) -> tuple[Discovery, Doc]:
     """The same of a case."""
-    from service.workflows.axis_test import SLOW_DRIFT
+    from abbe.service.workflows.axis_test import SLOW_DRIFT
 
     found = search(case, catalogue(), ignore_progress)
     return found, finding_doc(found, case, (*catalogue(), SLOW_DRIFT), {r.path.label: np.zeros(r.path.n) for r in case.runs})

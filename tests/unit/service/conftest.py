@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from service.storage.store import Store
+from abbe.service.storage.store import Store
 
 NOW = datetime(2026, 11, 21, 3, 34, tzinfo=UTC)
 

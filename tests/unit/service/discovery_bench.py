@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from models.discovery.answer import Agreement, Discovery, Gap, NamedEffect, NextTest, Significance, Verdict, Where
-from models.discovery.case import Case, CaseRun
-from models.effects.effect import Effect
-from service.events import ProgressSink
+from abbe.models.discovery.answer import Agreement, Discovery, Gap, NamedEffect, NextTest, Significance, Verdict, Where
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.effects.effect import Effect
+from abbe.service.events import ProgressSink
 
 Doc = dict[str, Any]
 MACHINE: Doc = {
@@ -66,7 +66,7 @@ class Search:
         self.verdict, self.width_um, self.holds, self.ahead, self.calls = verdict, width_um, holds, ahead, 0
 
     def __call__(self, case: Case, effects: tuple[Effect, ...], progress: ProgressSink) -> Discovery:
-        """As `service.workflows.discovery_engine.search`."""
+        """As `abbe.service.workflows.discovery_engine.search`."""
         self.calls += 1
         effect = next(e for e in effects if e.name == "backlash")
         paths = tuple(r.path for r in case.runs)

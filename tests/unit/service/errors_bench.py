@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service import cli
+from abbe.service import cli
 
 OBJECT = {
     "name": "VMC-1",

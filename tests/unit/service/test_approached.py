@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.runs.approached import came_from
-from service.runs.cases import path_of
-from service.runs.observations import run_data
-from service.site import machine_from_doc
+from abbe.service.runs.approached import came_from
+from abbe.service.runs.cases import path_of
+from abbe.service.runs.observations import run_data
+from abbe.service.site import machine_from_doc
 from tests.unit.service.axis_bench import MACHINE, axis_run, cycles, with_repeats
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import LinkDown, ReplyTimeout
-from service import cli
-from service.storage.engine import wal_is_safe
-from service.storage.store import Store
+from abbe.drivers.errors import LinkDown, ReplyTimeout
+from abbe.service import cli
+from abbe.service.storage.engine import wal_is_safe
+from abbe.service.storage.store import Store
 
 pytestmark = pytest.mark.usefixtures("clean_environment")
 
@@ -72,7 +72,7 @@ def machine(tmp_path: Path) -> Path:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    program = "import sys\nfrom service.cli import run\nrun(['--help'])\nprint(sorted({m.partition('.')[0] for m in sys.modules}))"
+    program = "import sys\nfrom abbe.service.cli import run\nrun(['--help'])\nprint(sorted({m.partition('.')[0] for m in sys.modules}))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert "check-config" in done.stdout
     modules = done.stdout.splitlines()[-1]
@@ -168,7 +168,7 @@ def test_database_of_environment_and_machine_file(
 
 def test_incomplete_run_is_listed_as_such(abbe: Abbe) -> None:
     program = (
-        "from service.storage.store import Store\n"
+        "from abbe.service.storage.store import Store\n"
         "s = Store.open()\n"
         "s.start_run(s.add_campaign(s.add_machine('m', {}), 'c1', {}), 'r01', 'ballbar_helix', 'identify', {})\n"
         "import os; os._exit(9)"
@@ -197,7 +197,7 @@ def test_driver_error_is_one_line(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -
     def broken(_: str | None, __: Path | None = None) -> str:
         raise LinkDown("mqtt://me:topsecret@h", "open", "refused\nby peer", "plug it in")
 
-    monkeypatch.setattr("service.cli.show.database_url", broken)
+    monkeypatch.setattr("abbe.service.cli.show.database_url", broken)
     assert abbe.fails("runs") == "error DRV-002: mqtt://me:***@h: open: refused by peer (plug it in)\n"
 
 
@@ -207,7 +207,7 @@ def test_a_device_that_does_not_answer_is_one_line_too(abbe: Abbe, monkeypatch: 
     def silent(_: str | None, __: Path | None = None) -> str:
         raise ReplyTimeout("serial:///dev/ttyUSB0", "read samples", "no sample for 1 s", "box switched off?")
 
-    monkeypatch.setattr("service.cli.show.database_url", silent)
+    monkeypatch.setattr("abbe.service.cli.show.database_url", silent)
     assert abbe.fails("runs") == "error DRV-003: serial:///dev/ttyUSB0: read samples: no sample for 1 s (box switched off?)\n"
 
 
@@ -215,7 +215,7 @@ def test_interrupt_exits_with_130(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -
     def interrupted(_: str | None, __: Path | None = None) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("service.cli.show.database_url", interrupted)
+    monkeypatch.setattr("abbe.service.cli.show.database_url", interrupted)
     assert abbe("runs").code == 130
 
 
@@ -230,12 +230,13 @@ signal.pause()
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 5), (signal.SIGTERM, 6)])
 def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signals, code: int) -> None:
-    package = tmp_path / "simulators"
-    package.mkdir()
-    (package / "__init__.py").touch()
-    (package / "__main__.py").write_text(CHILD)
-    command = [sys.executable, "-c", "from service.cli import main; main()", "sim", "a.toml", "--help", "--speed=3"]
-    process = subprocess.Popen(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, stdout=subprocess.PIPE, text=True)
+    child = tmp_path / "child.py"
+    child.write_text(CHILD)
+    instead = (
+        f"from abbe.service.cli import main, system; system.python_words = lambda _, *words: [{sys.executable!r}, {str(child)!r}, *words]"
+    )
+    command = [sys.executable, "-c", f"{instead}; main()", "sim", "a.toml", "--help", "--speed=3"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "['a.toml', '--help', '--speed=3', '--watch-stdin']\n"
     process.send_signal(number)
@@ -245,8 +246,8 @@ def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signa
 
 def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsys):
     """Notes carry what safety rests on: a bar that still hangs in, a table that may be in force."""
-    from service.cli import app as module
-    from service.errors import DoorOpen
+    from abbe.service.cli import app as module
+    from abbe.service.errors import DoorOpen
 
     def fails(**_: object) -> None:
         error = DoorOpen("the door is open", "close it")
@@ -294,7 +295,7 @@ def judge_letters(words: str, place: str, out: bytes, err: bytes, code: int | No
 @pytest.mark.parametrize("place", PLACES)
 def test_a_place_that_has_no_letters_gets_plain_ones(machine: Path, place: str) -> None:
     words = COMMANDS[0]
-    command = [sys.executable, "-m", "service.cli", *words.split()]
+    command = [sys.executable, "-m", "abbe.service.cli", *words.split()]
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("LC_", "LANG"))} | PLACES[place]
     done = subprocess.run(command, cwd=machine.parent, env=environment, capture_output=True, check=False, timeout=60)
     judge_letters(words, place, done.stdout, done.stderr, done.returncode)

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.api import BarSample
-from service.errors import StoreError
-from service.runs.codec import decode_bar, decode_json, encode_bar, encode_json
+from abbe.drivers.api import BarSample
+from abbe.service.errors import StoreError
+from abbe.service.runs.codec import decode_bar, decode_json, encode_bar, encode_json
 
 SAMPLES = st.builds(
     BarSample,

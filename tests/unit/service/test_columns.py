@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.api import BarSample
-from service.errors import MeasurementFault, StoreError
-from service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
-from service.runs.columns import load_run, pack_columns
-from service.storage.records import ImportedRun
-from service.storage.store import Store
+from abbe.drivers.api import BarSample
+from abbe.service.errors import MeasurementFault, StoreError
+from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
+from abbe.service.runs.columns import load_run, pack_columns
+from abbe.service.storage.records import ImportedRun
+from abbe.service.storage.store import Store
 
 RATE_HZ = 1000
 PERIOD_US = 1000

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.report.document import Figure
-from service.runs.observations import run_data
-from service.workflows.compare_runs import Loaded, against, curve, difference, figure_rows, remarks
+from abbe.service.report.document import Figure
+from abbe.service.runs.observations import run_data
+from abbe.service.workflows.compare_runs import Loaded, against, curve, difference, figure_rows, remarks
 
 RADIUS = 100.0
 

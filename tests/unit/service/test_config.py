@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from service.config import load_machine
-from service.errors import ConfigError
+from abbe.service.config import load_machine
+from abbe.service.errors import ConfigError
 
 GOOD = """
 name = "VMC-1"

@@ -21,17 +21,17 @@ from typing import Any
 
 import pytest
 
-from models.discovery.answer import Discovery, NextTest
-from service import cli
-from service.errors import MeasurementFault
-from service.runs.codec import JSON_CODEC, encode_json
-from service.runs.columns import pack_columns
-from service.sequences.interlocks import DRIVES, MOVING, REFERENCED, REMOTE
-from service.storage.owner import Owner
-from service.storage.records import NewVersion
-from service.storage.store import Store
-from service.workflows import campaign_checks, next_recipes
-from service.workflows.discover_live import rounds
+from abbe.models.discovery.answer import Discovery, NextTest
+from abbe.service import cli
+from abbe.service.errors import MeasurementFault
+from abbe.service.runs.codec import JSON_CODEC, encode_json
+from abbe.service.runs.columns import pack_columns
+from abbe.service.sequences.interlocks import DRIVES, MOVING, REFERENCED, REMOTE
+from abbe.service.storage.owner import Owner
+from abbe.service.storage.records import NewVersion
+from abbe.service.storage.store import Store
+from abbe.service.workflows import campaign_checks, next_recipes
+from abbe.service.workflows.discover_live import rounds
 from tests.unit.service.discovery_bench import MACHINE, Search, circle, write_case
 
 READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
@@ -108,12 +108,12 @@ class Bench:
         self.left: int | None = None
         self._folder, self._patch = folder, monkeypatch
         self._file()
-        monkeypatch.setattr("service.workflows.discovery_engine.search", self.search)
-        monkeypatch.setattr("service.cli.measure.ready_session", self._session)
-        monkeypatch.setattr("service.workflows.measure.measure_test", self._measure_test)
+        monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", self.search)
+        monkeypatch.setattr("abbe.service.cli.measure.ready_session", self._session)
+        monkeypatch.setattr("abbe.service.workflows.measure.measure_test", self._measure_test)
         for name in ("discover_live", "measure"):
-            monkeypatch.setattr(f"service.workflows.{name}.check_devices", self._answer)
-        monkeypatch.setattr("service.workflows.provenance.revision", lambda: "r")  # asks git for a second, each time
+            monkeypatch.setattr(f"abbe.service.workflows.{name}.check_devices", self._answer)
+        monkeypatch.setattr("abbe.service.workflows.provenance.revision", lambda: "r")  # asks git for a second, each time
         monkeypatch.setattr(Owner, "is_gone", lambda _self: True)
         for name in WRITES:
             monkeypatch.setattr(Store, name, self._counted(getattr(Store, name)))
@@ -258,7 +258,7 @@ def test_ended_within_a_search_only_that_one_is_done_again(bench: Bench, number:
             raise KeyboardInterrupt
         return found
 
-    monkeypatch.setattr("service.workflows.discovery_engine.search", doomed)
+    monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", doomed)
     assert bench.live() == 130
     assert bench.live() == 0
     assert bench.stored() == WHOLE
@@ -291,7 +291,7 @@ def test_a_fault_of_one_run_keeps_the_others(bench: Bench, monkeypatch: pytest.M
         raise MeasurementFault("the bar fell out")
 
     with monkeypatch.context() as patch:
-        patch.setattr("service.workflows.measure.measure_test", fails)
+        patch.setattr("abbe.service.workflows.measure.measure_test", fails)
         assert bench.live() == 2
     assert "error SEQ-003: the bar fell out" in capsys.readouterr().err
     assert bench.live() == 0

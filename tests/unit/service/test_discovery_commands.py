@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.effects.catalogue import CATALOGUE
-from service import cli
-from service.runs.discovery_file import DiscoveryFile
-from service.storage.store import Store
-from service.workflows.campaign_folder import from_folder, from_store
-from service.workflows.discover import prepare
-from service.workflows.discovery_engine import catalogue
-from service.workflows.model_book import current, no_table_lines
-from service.workflows.table_out import NO_TABLE
-from service.workflows.taken_out import taken_out
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.service import cli
+from abbe.service.runs.discovery_file import DiscoveryFile
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import from_folder, from_store
+from abbe.service.workflows.discover import prepare
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.model_book import current, no_table_lines
+from abbe.service.workflows.table_out import NO_TABLE
+from abbe.service.workflows.taken_out import taken_out
 from tests.unit.service.discovery_bench import WIDTH_MM, Search, write_case
 
 DB = "sqlite:///book.sqlite3"
@@ -41,7 +41,7 @@ def abbe(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
 @pytest.fixture
 def finds(monkeypatch: pytest.MonkeyPatch) -> Callable[[Search], Search]:
     def use(search: Search) -> Search:
-        monkeypatch.setattr("service.workflows.discovery_engine.search", search)
+        monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", search)
         return search
 
     return use

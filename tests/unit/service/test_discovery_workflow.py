@@ -15,21 +15,21 @@ from typing import Any
 
 import pytest
 
-from models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
-from service.errors import CampaignRefused, NotObservable, StoreError
-from service.events import ignore_progress
-from service.runs.discovery_file import DiscoveryFile
-from service.storage.store import Store
-from service.workflows.campaign_folder import from_folder
-from service.workflows.discover import Job, Journal, discover, prepare
-from service.workflows.discovery_doc import finite
-from service.workflows.discovery_engine import catalogue
-from service.workflows.discovery_pages import discovery_page, gap_rows
-from service.workflows.discovery_states import closed, entering, judge, not_entered, taken_back
-from service.workflows.discovery_store import StoredJournal, journal_of
-from service.workflows.discovery_words import lines_of, next_of, rival_lines, verdict_of
-from service.workflows.model_book import current
-from service.workflows.simulate import gap_doc, simulate
+from abbe.models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
+from abbe.service.errors import CampaignRefused, NotObservable, StoreError
+from abbe.service.events import ignore_progress
+from abbe.service.runs.discovery_file import DiscoveryFile
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import from_folder
+from abbe.service.workflows.discover import Job, Journal, discover, prepare
+from abbe.service.workflows.discovery_doc import finite
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.discovery_pages import discovery_page, gap_rows
+from abbe.service.workflows.discovery_states import closed, entering, judge, not_entered, taken_back
+from abbe.service.workflows.discovery_store import StoredJournal, journal_of
+from abbe.service.workflows.discovery_words import lines_of, next_of, rival_lines, verdict_of
+from abbe.service.workflows.model_book import current
+from abbe.service.workflows.simulate import gap_doc, simulate
 from tests.unit.service.discovery_bench import Search, write_case
 
 ALL = ["FITTED", "SUSPICIOUS", "PROPOSED", "TESTING", "EXPLAINED"]
@@ -352,10 +352,10 @@ def test_states_keep_their_order(folder: Path, book: Store) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from service.events import ignore_progress
-from service.storage.store import Store
-from service.workflows.discover import discover
-from service.workflows.discovery_store import journal_of
+from abbe.service.events import ignore_progress
+from abbe.service.storage.store import Store
+from abbe.service.workflows.discover import discover
+from abbe.service.workflows.discovery_store import journal_of
 from tests.unit.service.discovery_bench import Search
 from tests.unit.service.test_discovery_workflow import job_of
 

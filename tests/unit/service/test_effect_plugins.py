@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from models.effects.catalogue import CATALOGUE
-from service.workflows.effect_plugins import Plugins, installed
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.service.workflows.effect_plugins import Plugins, installed
 
 GOOD = """
 import numpy as np
-from models.effects.columns import of_machine, along, first
-from models.effects.effect import Effect
+from abbe.models.effects.columns import of_machine, along, first
+from abbe.models.effects.effect import Effect
 
 EFFECT = Effect(
     name="{name}", title="table clamp", family="structure", keys=("Z",), unit="um", per_unit=1.0, typical=(1.0, 20.0), shape=(),

@@ -14,9 +14,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from service.runs import points as points_file
-from service.workflows import deviations as workflow
-from service.workflows.deviations import standard_uncertainty_mm
+from abbe.service.runs import points as points_file
+from abbe.service.workflows import deviations as workflow
+from abbe.service.workflows.deviations import standard_uncertainty_mm
 from tests.unit.service.errors_bench import ERRORS, OBJECT, OWN, POINTS, TOML, TOOL, Bench
 
 pytestmark = pytest.mark.usefixtures("clean_environment")

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from service import cli
+from abbe.service import cli
 from tests.unit.service.errors_bench import ERRORS, OBJECT, OWN, TOML, Bench
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
@@ -201,7 +201,7 @@ TRIED = [(*end, option) for k, end in enumerate(ENDS) for option in (("", "--jso
 @pytest.mark.parametrize(("end", "code", "message", "option"), TRIED)
 def test_output_that_cannot_be_written_is_one_line(bench: Bench, option: str, end: str, code: int, message: str) -> None:
     words = f"errors --machine {bench.machine.name} --errors {bench.errors.name} --points {bench.points.name} {option}"
-    program = f"'{sys.executable}' -c 'from service import cli; cli.main()' {words}"
+    program = f"'{sys.executable}' -c 'from abbe.service import cli; cli.main()' {words}"
     script = f"set -o pipefail; {program} {end}"
     environment = {"PYTHONPATH": str(Path(cli.__file__).parents[2]), "PATH": "/usr/bin:/bin"}
     done = subprocess.run(["bash", "-c", script], cwd=bench.folder, env=environment, capture_output=True, text=True, check=False)

@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from drivers.api import BarSample
-from service.errors import FileFormatError, StoreError
-from service.runs.checks import UNITS, read_json
-from service.runs.codec import BAR_CODEC, encode_bar
-from service.runs.columns import load_run
-from service.runs.exchange import export_folder, import_folder, read_folder
-from service.storage.store import Store
+from abbe.drivers.api import BarSample
+from abbe.service.errors import FileFormatError, StoreError
+from abbe.service.runs.checks import UNITS, read_json
+from abbe.service.runs.codec import BAR_CODEC, encode_bar
+from abbe.service.runs.columns import load_run
+from abbe.service.runs.exchange import export_folder, import_folder, read_folder
+from abbe.service.storage.store import Store
 
 Change = Callable[[dict[str, Any]], object]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.files import NotPlainError, is_plain, read_plain
+from abbe.service.files import NotPlainError, is_plain, read_plain
 from tests.unit.service.test_cli import Abbe, abbe
 
 __all__ = ["abbe"]  # the fixture

@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.paths.helix import even_helix_points, helix_points
-from service.capture.live import angles_along
-from service.errors import MeasurementFault
-from service.report.document import Document
-from service.report.model import PolarTrace
-from service.runs.helix_axis import helix_axis
-from service.runs.observations import run_data
-from service.workflows import report_measured
-from service.workflows.campaign_folder import Campaign
-from service.workflows.compare_runs import Loaded, against, curve
-from service.workflows.report_measured import Measured, run_report
-from service.workflows.report_parts import Rules
+from abbe.models.paths.helix import even_helix_points, helix_points
+from abbe.service.capture.live import angles_along
+from abbe.service.errors import MeasurementFault
+from abbe.service.report.document import Document
+from abbe.service.report.model import PolarTrace
+from abbe.service.runs.helix_axis import helix_axis
+from abbe.service.runs.observations import run_data
+from abbe.service.workflows import report_measured
+from abbe.service.workflows.campaign_folder import Campaign
+from abbe.service.workflows.compare_runs import Loaded, against, curve
+from abbe.service.workflows.report_measured import Measured, run_report
+from abbe.service.workflows.report_parts import Rules
 from tests.scenarios.campaign_files import measured
 
 CENTRE = np.array([300.0, 250.0, 200.0])

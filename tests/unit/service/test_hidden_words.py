@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.workflows.demo_hidden import HiddenDemo
-from service.workflows.demo_hidden_words import hidden_json, judged, truth_lines
-from service.workflows.known_effects import _usual
-from service.workflows.new_measurement import NewGap, NewMeasurement
-from service.workflows.thinned import picked
+from abbe.service.workflows.demo_hidden import HiddenDemo
+from abbe.service.workflows.demo_hidden_words import hidden_json, judged, truth_lines
+from abbe.service.workflows.known_effects import _usual
+from abbe.service.workflows.new_measurement import NewGap, NewMeasurement
+from abbe.service.workflows.thinned import picked
 
 PLAY = {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 6.0}, "wild": 7}
 SURGE = {"name": "counterbalance_surge", "key": "", "parameters": {"strength": 4.0}, "wild": 0}

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.machine import Machine
-from models.verification import diagonal_figure
-from service.runs.observations import run_data
-from service.sequences.recipes import Linear
-from service.sequences.steps import MoveTo, ReadLaser
-from service.workflows.iso_readings import circle_tests, diagonal_tests, linear_tests
-from service.workflows.iso_report import evaluate
+from abbe.models.machine import Machine
+from abbe.models.verification import diagonal_figure
+from abbe.service.runs.observations import run_data
+from abbe.service.sequences.recipes import Linear
+from abbe.service.sequences.steps import MoveTo, ReadLaser
+from abbe.service.workflows.iso_readings import circle_tests, diagonal_tests, linear_tests
+from abbe.service.workflows.iso_report import evaluate
 
 MACHINE = {"name": "m", "chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 
@@ -96,7 +96,7 @@ def test_what_cannot_be_evaluated_is_told_and_stops_nothing():
 
 
 def test_the_verifications_range_is_the_standards_m():
-    """Two ways through the code, one figure: `models.verification` and ISO 230-6."""
+    """Two ways through the code, one figure: `abbe.models.verification` and ISO 230-6."""
     run = line(Linear("l", "L", "identify", 0, n=9), lambda x, d: 1e-8 * (x - 200.0) ** 2 + 0.003 * (d < 0) + 1e-4 * np.sin(x * d))
     run |= {"test": "laser_diagonal", "setup": run["setup"] | {"diagonal": "ppp"}}
     (test,) = diagonal_tests([run], [])["body"]

@@ -14,16 +14,16 @@ from typing import Any
 import pytest
 from sqlalchemy import event
 
-from service import cli
-from service.errors import ModelMovedOn
-from service.events import ignore_progress
-from service.storage.records import Doc, NewVersion
-from service.storage.store import Store
-from service.workflows.campaign_folder import from_folder
-from service.workflows.discover import Job, discover, prepare
-from service.workflows.discovery_engine import catalogue
-from service.workflows.discovery_store import StoredJournal, journal_of
-from service.workflows.model_book import current, revert
+from abbe.service import cli
+from abbe.service.errors import ModelMovedOn
+from abbe.service.events import ignore_progress
+from abbe.service.storage.records import Doc, NewVersion
+from abbe.service.storage.store import Store
+from abbe.service.workflows.campaign_folder import from_folder
+from abbe.service.workflows.discover import Job, discover, prepare
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.discovery_store import StoredJournal, journal_of
+from abbe.service.workflows.model_book import current, revert
 from tests.unit.service.discovery_bench import Search, write_case
 
 NAME = "VMC-1"
@@ -140,9 +140,9 @@ def test_a_version_is_added_to_the_current_one_and_to_no_other(pair: tuple[Store
 
 RACER = """
 import sys
-from service.errors import ModelMovedOn
-from service.storage.records import NewVersion
-from service.storage.store import Store
+from abbe.service.errors import ModelMovedOn
+from abbe.service.storage.records import NewVersion
+from abbe.service.storage.store import Store
 
 with Store.open(sys.argv[1]) as store:
     print("ready", flush=True)
@@ -208,7 +208,7 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, url: str, monkeypatch: 
             other.add_model(version(None))
         return Search()(*words)
 
-    monkeypatch.setattr("service.workflows.discovery_engine.search", search)
+    monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", search)
     assert cli.run(["discover", str(folder), "--db", url]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert len(lines) == 1

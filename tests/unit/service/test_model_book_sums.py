@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.effects.catalogue import CATALOGUE
-from service.workflows.model_book import grown
-from service.workflows.model_sums import total
-from service.workflows.packed import packed_covariance
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.service.workflows.model_book import grown
+from abbe.service.workflows.model_sums import total
+from abbe.service.workflows.packed import packed_covariance
 
 SOURCE = {"campaign": "c1", "discovery": "d1", "machine_digest": "m", "runs": [], "versions": {}}
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.discovery.unseen import LATE_S
-from service.sequences.recipes import Helix
-from service.sequences.steps import MountBar, MoveTo, RecordPath, Unmount
-from service.site import machine_from_doc
-from service.workflows.discovery_words import ADDS
-from service.workflows.next_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
+from abbe.models.discovery.unseen import LATE_S
+from abbe.service.sequences.recipes import Helix
+from abbe.service.sequences.steps import MountBar, MoveTo, RecordPath, Unmount
+from abbe.service.site import machine_from_doc
+from abbe.service.workflows.discovery_words import ADDS
+from abbe.service.workflows.next_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
 from tests.unit.service.discovery_bench import MACHINE, Doc
 
 HELIX: Doc = {

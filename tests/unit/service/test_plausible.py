@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from service import cli
-from service.cli.serve import setup_of
-from service.config import load_machine
-from service.errors import ConfigError
-from service.sequences.recipe_file import recipe_text
-from service.sequences.recipes import Helix
-from service.workflows.plausible import Doubts, doubts
+from abbe.service import cli
+from abbe.service.cli.serve import setup_of
+from abbe.service.config import load_machine
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.recipe_file import recipe_text
+from abbe.service.sequences.recipes import Helix
+from abbe.service.workflows.plausible import Doubts, doubts
 
 pytestmark = pytest.mark.usefixtures("clean_environment")
 

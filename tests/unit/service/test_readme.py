@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from service import cli
-from service.config import load_machine
+from abbe.service import cli
+from abbe.service.config import load_machine
 
 ROOT = Path(__file__).parents[3]
 READMES = ("README.md", "deploy/README.md")

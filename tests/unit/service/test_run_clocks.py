@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.api import BarSample
-from service.devices.clock_notes import KEPT, noted, notes_since
-from service.runs.codec import BAR_CODEC, encode_bar
-from service.runs.columns import run_document
-from service.storage.owner import Owner
-from service.storage.records import ChunkRecord, RunRecord
-from service.workflows.run_times import times
+from abbe.drivers.api import BarSample
+from abbe.service.devices.clock_notes import KEPT, noted, notes_since
+from abbe.service.runs.codec import BAR_CODEC, encode_bar
+from abbe.service.runs.columns import run_document
+from abbe.service.storage.owner import Owner
+from abbe.service.storage.records import ChunkRecord, RunRecord
+from abbe.service.workflows.run_times import times
 
 RATE_HZ = 100
 FEED_MM_S = 20.0

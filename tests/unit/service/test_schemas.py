@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from service.schemas import MODELS, schema_text
+from abbe.service.schemas import MODELS, schema_text
 
 FOLDER = Path(__file__).resolve().parents[3] / "docs" / "schemas"
 TYPES: dict[str, Any] = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}

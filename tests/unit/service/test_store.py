@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import StoreError
-from service.secrets import mask_secrets
-from service.storage.engine import resolve_url, wal_is_safe
-from service.storage.owner import process_start, this_process
-from service.storage.records import ImportedRun
-from service.storage.store import Store
+from abbe.service.errors import StoreError
+from abbe.service.secrets import mask_secrets
+from abbe.service.storage.engine import resolve_url, wal_is_safe
+from abbe.service.storage.owner import process_start, this_process
+from abbe.service.storage.records import ImportedRun
+from abbe.service.storage.store import Store
 
 
 def append(store: Store, run_id: int, seq: int, payload: bytes = b"abc") -> None:
@@ -122,7 +122,7 @@ def test_killed_process_leaves_acknowledged_chunks_and_an_incomplete_run(tmp_pat
     url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
     program = f"""
 import sys
-from service.storage.store import Store
+from abbe.service.storage.store import Store
 store = Store.open({url!r})
 run = store.start_run(store.add_campaign(store.add_machine("m", {{}}), "c1", {{}}), "r01", "ballbar_helix", "identify", {{}})
 for seq in range(100000):

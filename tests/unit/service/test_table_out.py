@@ -11,21 +11,21 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from drivers.cnc.tables import crc32, encode
-from models.compensation.tables import NineTables
-from models.solvers.in_force import InForce
-from service import cli
-from service.errors import TableMismatch
-from service.runs.solution_file import SolutionFile
-from service.storage.store import Store
-from service.workflows.base_table import Base
-from service.workflows.campaign_folder import from_folder, from_store
-from service.workflows.discover import prepare
-from service.workflows.discovery_engine import catalogue
-from service.workflows.proposals import check_same_table
-from service.workflows.simulate import simulate
-from service.workflows.table_out import NO_TABLE, STAYS, TABLE_OUT, Taken, as_left, less, table_line, table_then
-from service.workflows.tables import table_image
+from abbe.drivers.cnc.tables import crc32, encode
+from abbe.models.compensation.tables import NineTables
+from abbe.models.solvers.in_force import InForce
+from abbe.service import cli
+from abbe.service.errors import TableMismatch
+from abbe.service.runs.solution_file import SolutionFile
+from abbe.service.storage.store import Store
+from abbe.service.workflows.base_table import Base
+from abbe.service.workflows.campaign_folder import from_folder, from_store
+from abbe.service.workflows.discover import prepare
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.proposals import check_same_table
+from abbe.service.workflows.simulate import simulate
+from abbe.service.workflows.table_out import NO_TABLE, STAYS, TABLE_OUT, Taken, as_left, less, table_line, table_then
+from abbe.service.workflows.tables import table_image
 from tests.unit.service.discovery_bench import WIDTH_MM, write_case
 
 DB = "sqlite:///book.sqlite3"

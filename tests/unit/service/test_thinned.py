@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.events import ignore_progress
-from service.report.discovery_page import render_discovery
-from service.runs.discovery_file import DiscoveryFile
-from service.workflows import thinned as module
-from service.workflows.campaign_folder import from_folder
-from service.workflows.discover import Journal, discover, prepare
-from service.workflows.discovery_engine import catalogue
-from service.workflows.discovery_pages import discovery_page, page_facts
-from service.workflows.thinned import picked, thinned, thinning
+from abbe.service.events import ignore_progress
+from abbe.service.report.discovery_page import render_discovery
+from abbe.service.runs.discovery_file import DiscoveryFile
+from abbe.service.workflows import thinned as module
+from abbe.service.workflows.campaign_folder import from_folder
+from abbe.service.workflows.discover import Journal, discover, prepare
+from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.discovery_pages import discovery_page, page_facts
+from abbe.service.workflows.thinned import picked, thinned, thinning
 from tests.unit.service.discovery_bench import Search, circle, write_case
 
 

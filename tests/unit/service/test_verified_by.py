@@ -15,28 +15,28 @@ from typing import Any
 
 import pytest
 
-from drivers.cnc.tables import crc32
-from service.cli import run
-from service.clock import SystemClock
-from service.plant.facts import Facts
-from service.plant.gather import Gatherer
-from service.plant.mtconnect import Agent
-from service.plant.opcua.picture import picture_of
-from service.push.book import StoreBook
-from service.push.states import S
-from service.report.document import Document
-from service.scheduler import record
-from service.scheduler.fleet import Stand, stands
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.web.board import Board
-from service.web.page import environment, render
-from service.web.pages.times import trend_screen
-from service.web.schemas import Status
-from service.web.view import View
-from service.workflows.report import numbered_report
-from service.workflows.report_parts import Rules
-from service.workflows.verified_by import STRANGE, VerifiedBy, verified_by
+from abbe.drivers.cnc.tables import crc32
+from abbe.service.cli import run
+from abbe.service.clock import SystemClock
+from abbe.service.plant.facts import Facts
+from abbe.service.plant.gather import Gatherer
+from abbe.service.plant.mtconnect import Agent
+from abbe.service.plant.opcua.picture import picture_of
+from abbe.service.push.book import StoreBook
+from abbe.service.push.states import S
+from abbe.service.report.document import Document
+from abbe.service.scheduler import record
+from abbe.service.scheduler.fleet import Stand, stands
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.web.board import Board
+from abbe.service.web.page import environment, render
+from abbe.service.web.pages.times import trend_screen
+from abbe.service.web.schemas import Status
+from abbe.service.web.view import View
+from abbe.service.workflows.report import numbered_report
+from abbe.service.workflows.report_parts import Rules
+from abbe.service.workflows.verified_by import STRANGE, VerifiedBy, verified_by
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.system.serve_check import Result
 

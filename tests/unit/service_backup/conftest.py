@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.audit.book import AuditBook
-from service.audit.chain import Event
-from service.capture.ingest import chunk_of
-from service.capture.records import CHUNK
-from service.capture.scan import scan
-from service.capture.settings import segment_path
-from service.scheduler import record
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
+from abbe.service.audit.book import AuditBook
+from abbe.service.audit.chain import Event
+from abbe.service.capture.ingest import chunk_of
+from abbe.service.capture.records import CHUNK
+from abbe.service.capture.scan import scan
+from abbe.service.capture.settings import segment_path
+from abbe.service.scheduler import record
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
 from tests.unit.service_capture.capture_bench import abandon, batch, new_run, segment_bytes
 from tests.unit.service_serve.fakes import Result
 

@@ -15,19 +15,19 @@ from pathlib import Path
 
 import pytest
 
-from service.capture.recovery import recover_segments
-from service.capture.settings import CaptureSettings
-from service.cli import run
-from service.errors import BackupRefused, StoreError
-from service.runs.codec import decode_bar
-from service.storage.copying import copy_online, prove_copy, rows_of
-from service.storage.store import Store
-from service.workflows.backup_files import read_backup
+from abbe.service.capture.recovery import recover_segments
+from abbe.service.capture.settings import CaptureSettings
+from abbe.service.cli import run
+from abbe.service.errors import BackupRefused, StoreError
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage.copying import copy_online, prove_copy, rows_of
+from abbe.service.storage.store import Store
+from abbe.service.workflows.backup_files import read_backup
 from tests.unit.service_backup.conftest import SAMPLES, Shop, new_machine_file
 from tests.unit.service_capture.capture_bench import assert_true
 
 HERE = Path(__file__).parent
-ABBE = (sys.executable, "-c", "from service.cli import main; main()")
+ABBE = (sys.executable, "-c", "from abbe.service.cli import main; main()")
 
 
 class Writer:
@@ -70,8 +70,8 @@ def test_while_another_process_writes_nothing_acknowledged_is_missing(shop: Shop
 
 
 def test_a_database_that_is_written_between_all_steps_is_copied_in_one(shop: Shop, writer: Writer, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("service.storage.copying.PAGES", 1)
-    monkeypatch.setattr("service.storage.copying.RESTARTS", 1)
+    monkeypatch.setattr("abbe.service.storage.copying.PAGES", 1)
+    monkeypatch.setattr("abbe.service.storage.copying.RESTARTS", 1)
     copy_online(shop.database, tmp_path / "copy")
     prove_copy(tmp_path / "copy")
 

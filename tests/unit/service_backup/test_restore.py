@@ -13,15 +13,16 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import run
-from service.runs.exchange import import_folder
-from service.storage.store import Store
-from service.workflows.backup_files import listed
+from abbe.service.cli import run
+from abbe.service.runs.exchange import import_folder
+from abbe.service.storage.store import Store
+from abbe.service.workflows.backup_files import listed
 from tests.scenarios.campaign_files import measured, write_folder
 from tests.unit.service_backup.conftest import Shop, new_machine_file
 
 HOLDER = (
-    "import sys; from service.storage.store import Store\nwith Store.open(sys.argv[1]):\n    print('open', flush=True); sys.stdin.read()"
+    "import sys; from abbe.service.storage.store import Store\n"
+    "with Store.open(sys.argv[1]):\n    print('open', flush=True); sys.stdin.read()"
 )
 
 
@@ -183,7 +184,7 @@ def test_cut_off_at_any_step_there_is_the_old_database_or_none(shop: Shop, made:
     ]
     assert old.read_bytes() == before
     assert not list(shop.folder.glob(".*restoring*"))
-    monkeypatch.setattr("service.clock.SystemClock.utc", lambda _: _later())
+    monkeypatch.setattr("abbe.service.clock.SystemClock.utc", lambda _: _later())
     assert run(["restore", str(shop.machine), str(made), "--replace"]) == 0
 
 

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 
-from service.storage.store import Store
+from abbe.service.storage.store import Store
 
 
 def main() -> None:

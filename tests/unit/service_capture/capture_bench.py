@@ -10,12 +10,12 @@ from pathlib import Path
 
 from sqlalchemy import update
 
-from drivers.api import BarBatch, BarSample
-from service.capture.drafts import Drafter
-from service.capture.file_io import RealFileIO
-from service.capture.segment import Segment
-from service.storage.store import Store
-from service.storage.tables import runs
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.service.capture.drafts import Drafter
+from abbe.service.capture.file_io import RealFileIO
+from abbe.service.capture.segment import Segment
+from abbe.service.storage.store import Store
+from abbe.service.storage.tables import runs
 
 SYNC = 8
 

@@ -7,13 +7,13 @@ import json
 import sys
 from pathlib import Path
 
-from service.capture.recorder import recording
-from service.capture.recovery import ledger_of, read_segment
-from service.capture.settings import CaptureSettings
-from service.clock import SystemClock
-from service.errors import DiskFull
-from service.runs.codec import decode_bar
-from service.storage.store import Store
+from abbe.service.capture.recorder import recording
+from abbe.service.capture.recovery import ledger_of, read_segment
+from abbe.service.capture.settings import CaptureSettings
+from abbe.service.clock import SystemClock
+from abbe.service.errors import DiskFull
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import assert_true, batch, new_run
 
 

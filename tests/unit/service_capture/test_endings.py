@@ -14,21 +14,21 @@ from types import SimpleNamespace
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from service.capture import ingest as ingest_module
-from service.capture import log as log_module
-from service.capture import recorder as recorder_module
-from service.capture.drafts import Drafter
-from service.capture.file_io import RealFileIO
-from service.capture.ingest import is_full
-from service.capture.recorder import CaptureRecorder, close_run, is_active, recording
-from service.capture.recovery import ledger_of, read_segment, recover_segments
-from service.capture.settings import CaptureSettings, segment_folder, segment_path
-from service.clock import SystemClock
-from service.errors import AbbeError, CaptureFault, DiskFull, StoreError
-from service.runs.codec import decode_bar
-from service.storage import store_chunks
-from service.storage.records import ChunkRecord
-from service.storage.store import Store
+from abbe.service.capture import ingest as ingest_module
+from abbe.service.capture import log as log_module
+from abbe.service.capture import recorder as recorder_module
+from abbe.service.capture.drafts import Drafter
+from abbe.service.capture.file_io import RealFileIO
+from abbe.service.capture.ingest import is_full
+from abbe.service.capture.recorder import CaptureRecorder, close_run, is_active, recording
+from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
+from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
+from abbe.service.clock import SystemClock
+from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage import store_chunks
+from abbe.service.storage.records import ChunkRecord
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import abandon, batch, new_run
 
 SETTINGS = CaptureSettings(reserve_bytes=65536)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from service.capture.folder import folder_of
-from service.capture.recorder import recording
-from service.capture.recovery import recover_segments
-from service.capture.settings import CaptureSettings, other_folders, segment_folder, segment_path
-from service.clock import SystemClock
-from service.storage.store import Store
+from abbe.service.capture.folder import folder_of
+from abbe.service.capture.recorder import recording
+from abbe.service.capture.recovery import recover_segments
+from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder, segment_path
+from abbe.service.clock import SystemClock
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import abandon, batch, new_run
 
 SMALL = CaptureSettings(reserve_bytes=65536)

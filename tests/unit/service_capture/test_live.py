@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.api import BarBatch, BarSample
-from models.machine import Machine
-from service.capture.live import ANGLES, LONGEST, MOST_BATCHES, LiveFeed, angles_along
-from service.channel.messages import LARGEST_B, encode
-from service.clock import SystemClock
-from service.core.live import _message
-from service.sequences.campaigns import hemisphere
-from service.sequences.recipes import Circle, Helix
-from service.sequences.steps import RecordPath
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.models.machine import Machine
+from abbe.service.capture.live import ANGLES, LONGEST, MOST_BATCHES, LiveFeed, angles_along
+from abbe.service.channel.messages import LARGEST_B, encode
+from abbe.service.clock import SystemClock
+from abbe.service.core.live import _message
+from abbe.service.sequences.campaigns import hemisphere
+from abbe.service.sequences.recipes import Circle, Helix
+from abbe.service.sequences.steps import RecordPath
 
 SYNC, OUT = 0b1000, 0b0001
 SETUP = {"centre_mm": [0.0, 0.0, 0.0], "radius_mm": 100.0, "axis": "Z"}

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from service.capture.drafts import Drafter
-from service.capture.ingest import chunk_of
-from service.capture.log import GROUP_S
-from service.capture.records import CHUNK
-from service.capture.recovery import ledger_of, recover_segments
-from service.capture.scan import scan
-from service.capture.segment import Segment
-from service.capture.settings import CaptureSettings, segment_folder, segment_path
-from service.runs.codec import decode_bar
-from service.storage.store import Store
+from abbe.service.capture.drafts import Drafter
+from abbe.service.capture.ingest import chunk_of
+from abbe.service.capture.log import GROUP_S
+from abbe.service.capture.records import CHUNK
+from abbe.service.capture.recovery import ledger_of, recover_segments
+from abbe.service.capture.scan import scan
+from abbe.service.capture.segment import Segment
+from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import Tape, abandon, assert_true, batch, new_run
 
 SECTOR = 512

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from drivers.api import BarBatch, BarSample
-from service.capture import ingest as ingest_module
-from service.capture.recorder import CaptureRecorder, recording
-from service.capture.records import CHUNK, CLOSE, OPEN
-from service.capture.recovery import ledger_of, read_segment
-from service.capture.settings import CaptureSettings, segment_folder, segment_path
-from service.clock import SystemClock
-from service.errors import CaptureConflict, CaptureFault, ConfigError, DiskFull
-from service.runs.codec import decode_bar, decode_json
-from service.storage.records import ChunkRecord
-from service.storage.store import Store
+from abbe.drivers.api import BarBatch, BarSample
+from abbe.service.capture import ingest as ingest_module
+from abbe.service.capture.recorder import CaptureRecorder, recording
+from abbe.service.capture.records import CHUNK, CLOSE, OPEN
+from abbe.service.capture.recovery import ledger_of, read_segment
+from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
+from abbe.service.clock import SystemClock
+from abbe.service.errors import CaptureConflict, CaptureFault, ConfigError, DiskFull
+from abbe.service.runs.codec import decode_bar, decode_json
+from abbe.service.storage.records import ChunkRecord
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import BrokenDisk, JumpingClock, SmallDisk, assert_true, batch, new_run
 
 KEEP = CaptureSettings(reserve_bytes=65536, keep=True)
@@ -250,7 +250,7 @@ async def test_a_chunk_that_contradicts_the_database_stops_the_run(store: Store)
 
 
 async def test_a_stuck_disk_holds_the_tap_and_nobody_else(store: Store) -> None:
-    from service.capture.file_io import RealFileIO
+    from abbe.service.capture.file_io import RealFileIO
 
     class Stuck(RealFileIO):
         def __init__(self) -> None:

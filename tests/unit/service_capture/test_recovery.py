@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from service.capture.ingest import chunk_of
-from service.capture.records import CHUNK, encode
-from service.capture.recovery import DAMAGED, ledger_of, read_segment, recover_segments
-from service.capture.scan import scan
-from service.capture.settings import CaptureSettings, segment_path
-from service.runs.codec import decode_bar
-from service.storage.records import RunRecord
-from service.storage.store import Store
+from abbe.service.capture.ingest import chunk_of
+from abbe.service.capture.records import CHUNK, encode
+from abbe.service.capture.recovery import DAMAGED, ledger_of, read_segment, recover_segments
+from abbe.service.capture.scan import scan
+from abbe.service.capture.settings import CaptureSettings, segment_path
+from abbe.service.runs.codec import decode_bar
+from abbe.service.storage.records import RunRecord
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import abandon, assert_true, batch, new_run, segment_bytes
 
 GROUPS = [[batch(first, 25)] for first in range(0, 300, 25)]

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from service.capture.drafts import Drafter
-from service.capture.ingest import chunk_of
-from service.capture.records import CHUNK, Record
-from service.capture.recovery import recover_segments
-from service.capture.segment import Segment
-from service.capture.settings import CaptureSettings, segment_folder, segment_path
-from service.runs.codec import encode_bar
-from service.storage.store import Store
+from abbe.service.capture.drafts import Drafter
+from abbe.service.capture.ingest import chunk_of
+from abbe.service.capture.records import CHUNK, Record
+from abbe.service.capture.recovery import recover_segments
+from abbe.service.capture.segment import Segment
+from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
+from abbe.service.runs.codec import encode_bar
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import Tape, abandon, new_run, samples
 
 SAMPLES = 10_000_000 if os.environ.get("ABBE_TEST_LONG") else 1_000_000

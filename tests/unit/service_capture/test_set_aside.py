@@ -14,17 +14,17 @@ from pathlib import Path
 
 import pytest
 
-from service.capture import locks, recovery
-from service.capture.account import DAMAGED, TORN
-from service.capture.drafts import Drafter
-from service.capture.ingest import chunk_of
-from service.capture.records import CHUNK, CLOSE, Record, encode
-from service.capture.recovery import ledger_of, read_segment, recover_segments
-from service.capture.scan import scan
-from service.capture.segment import Segment
-from service.capture.settings import CaptureSettings, segment_path
-from service.errors import CaptureFault
-from service.storage.store import Store
+from abbe.service.capture import locks, recovery
+from abbe.service.capture.account import DAMAGED, TORN
+from abbe.service.capture.drafts import Drafter
+from abbe.service.capture.ingest import chunk_of
+from abbe.service.capture.records import CHUNK, CLOSE, Record, encode
+from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
+from abbe.service.capture.scan import scan
+from abbe.service.capture.segment import Segment
+from abbe.service.capture.settings import CaptureSettings, segment_path
+from abbe.service.errors import CaptureFault
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import Tape, batch, segment_bytes
 from tests.unit.service_capture.test_recovery import GROUPS, crashed, folder, seqs, store  # noqa: F401 - fixtures
 
@@ -186,7 +186,7 @@ def test_only_one_recovers_at_a_time(store: Store, folder: Path, monkeypatch) ->
 CUT = """
 import json, sys, threading
 from pathlib import Path
-from service.capture import recovery
+from abbe.service.capture import recovery
 path = Path(sys.argv[1])
 def cut(data, scan=recovery.scan):
     path.write_bytes(b"")  # while it is being read

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.capture.recorder import recording
-from service.capture.recovery import recover_segments
-from service.capture.settings import CaptureSettings
-from service.cli.app import app
-from service.clock import SystemClock
-from service.storage.store import Store
+from abbe.service.capture.recorder import recording
+from abbe.service.capture.recovery import recover_segments
+from abbe.service.capture.settings import CaptureSettings
+from abbe.service.cli.app import app
+from abbe.service.clock import SystemClock
+from abbe.service.storage.store import Store
 from tests.unit.service_capture.capture_bench import abandon, batch
 
 SMALL = CaptureSettings(reserve_bytes=65536)

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from service.capture import ingest as ingest_module
-from service.capture import recorder as recorder_module
-from service.capture.settings import CaptureSettings, segment_path
-from service.errors import CaptureFault, StoreError
-from service.storage.store import Store
-from service.workflows import listen_campaign
-from service.workflows import recover as recover_module
+from abbe.service.capture import ingest as ingest_module
+from abbe.service.capture import recorder as recorder_module
+from abbe.service.capture.settings import CaptureSettings, segment_path
+from abbe.service.errors import CaptureFault, StoreError
+from abbe.service.storage.store import Store
+from abbe.service.workflows import listen_campaign
+from abbe.service.workflows import recover as recover_module
 from tests.unit.service_capture.capture_bench import batch
 from tests.unit.service_capture.test_recovery import crashed
 

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
-from service.clock import SystemClock
-from service.events import ProgressSink
-from service.scheduler.job import CheckJob
-from service.scheduler.keep import StoreLedger, StoreShelf
-from service.scheduler.slots import Schedule
-from service.scheduler.station import Station
-from service.scheduler.store import ServiceStore
+from abbe.service.clock import SystemClock
+from abbe.service.events import ProgressSink
+from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.keep import StoreLedger, StoreShelf
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.station import Station
+from abbe.service.scheduler.store import ServiceStore
 
 QUICK = Schedule("quick", "*/1 * * * *", "UTC", "quick-check")
 FIRST = datetime(2026, 11, 22, 9, tzinfo=UTC)

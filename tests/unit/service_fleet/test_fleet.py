@@ -15,15 +15,15 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.book import AuditBook
-from service.audit.chain import Event
-from service.cli import run
-from service.scheduler.fleet import HEADINGS, Stand, fleet, row, stands, state_of
-from service.scheduler.slots import Schedule
-from service.scheduler.station import SILENT_AFTER, Station
-from service.scheduler.store import ServiceStore
-from service.storage.owner import Owner, this_process
-from service.storage.records import StationRecord
+from abbe.service.audit.book import AuditBook
+from abbe.service.audit.chain import Event
+from abbe.service.cli import run
+from abbe.service.scheduler.fleet import HEADINGS, Stand, fleet, row, stands, state_of
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.station import SILENT_AFTER, Station
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.owner import Owner, this_process
+from abbe.service.storage.records import StationRecord
 from tests.bench.history_case import START, History, build
 from tests.unit.service_serve.fakes import FakeClock
 

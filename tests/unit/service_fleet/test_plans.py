@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event
 
-from service.scheduler.fleet import fleet
-from service.scheduler.store import ServiceStore
-from service.storage.records import VerificationRecord
-from service.workflows.trend_table import trends
+from abbe.service.scheduler.fleet import fleet
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.records import VerificationRecord
+from abbe.service.workflows.trend_table import trends
 from tests.bench.history_case import START, History, build
 
 HISTORY = History(machines=3, days=4, checks_a_day=2, runs=120)

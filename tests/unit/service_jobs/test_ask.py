@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from service.cli.ask import console_ask
-from service.errors import ConfigError
+from abbe.service.cli.ask import console_ask
+from abbe.service.errors import ConfigError
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from service.errors import TableRefused
-from service.push.limits import PushLimits
-from service.workflows.proposals import check_before_runs
+from abbe.service.errors import TableRefused
+from abbe.service.push.limits import PushLimits
+from abbe.service.workflows.proposals import check_before_runs
 
 DOC = {"name": "mill"}
 SITE: Any = SimpleNamespace(doc=DOC, limits=PushLimits(), temperature_c=(18.0, 24.0))

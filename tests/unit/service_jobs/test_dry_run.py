@@ -12,7 +12,7 @@ import termios
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.app import app
+from abbe.service.cli.app import app
 
 MACHINE_TOML = 'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0.0, 600.0]\nY = [0.0, 500.0]\nZ = [0.0, 450.0]\n'
 DEVICES = """[devices]
@@ -176,7 +176,7 @@ def on_a_terminal(columns: int, words: list[str]) -> str:
     """What a person sees on a terminal of this width."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, columns, 0, 0))
-    program = "from service.cli import main; main()"
+    program = "from abbe.service.cli import main; main()"
     environment = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES")} | {"TERM": "dumb"}
     with subprocess.Popen([sys.executable, "-c", program, *words], stdin=theirs, stdout=theirs, stderr=theirs, env=environment) as process:
         os.close(theirs)

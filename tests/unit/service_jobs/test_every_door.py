@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-import service
-from drivers.errors import LinkDown
-from service.devices import session
-from service.devices.urls import DeviceUrls
-from service.errors import TableMismatch
-from service.site import Site
-from service.workflows import recovered
+import abbe.service
+from abbe.drivers.errors import LinkDown
+from abbe.service.devices import session
+from abbe.service.devices.urls import DeviceUrls
+from abbe.service.errors import TableMismatch
+from abbe.service.site import Site
+from abbe.service.workflows import recovered
 from tests.faults.sequencer_world import MACHINE
 
-ROOT = Path(service.__file__).parent
+ROOT = Path(abbe.service.__file__).parent
 ONLY_LOOKS = {
     ("scheduler/ready.py", "look_at"): "reads the status",
     ("workflows/in_force.py", "look_at_table"): "reads which table is in force",

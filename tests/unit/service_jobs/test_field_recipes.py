@@ -6,15 +6,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from models.geometry.chain import travel_sign
-from models.machine import Machine
-from models.paths.circles import arc_through, circle_points, way_on_sphere
-from models.paths.lines import FACES, cycles_of, face_ends, target_shares
-from service.errors import ConfigError
-from service.sequences.check import dry_run, dry_run_campaign
-from service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
-from service.sequences.setups import shared_setups
-from service.sequences.steps import CampaignPlan, MountBar, MoveTo, ReadBar, ReadLaser, RecordPath, Unmount
+from abbe.models.geometry.chain import travel_sign
+from abbe.models.machine import Machine
+from abbe.models.paths.circles import arc_through, circle_points, way_on_sphere
+from abbe.models.paths.lines import FACES, cycles_of, face_ends, target_shares
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.check import dry_run, dry_run_campaign
+from abbe.service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, ReadBar, ReadLaser, RecordPath, Unmount
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 CUP = (300.0, 250.0, 200.0)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from drivers.api import ControllerStatus, LaserReading
-from models.machine import Machine
-from service.runs.laser_columns import MM_PER_COUNT, laser_columns
-from service.runs.observations import run_data
-from service.sequences.nc.blocks import LASER_DWELL_S
-from service.sequences.recipes import Diagonal, FaceDiagonal, Linear
-from service.sequences.steps import MountLaser
-from service.workflows import listen
-from service.workflows.listen import Heard, row_times, wanted
+from abbe.drivers.api import ControllerStatus, LaserReading
+from abbe.models.machine import Machine
+from abbe.service.runs.laser_columns import MM_PER_COUNT, laser_columns
+from abbe.service.runs.observations import run_data
+from abbe.service.sequences.nc.blocks import LASER_DWELL_S
+from abbe.service.sequences.recipes import Diagonal, FaceDiagonal, Linear
+from abbe.service.sequences.steps import MountLaser
+from abbe.service.workflows import listen
+from abbe.service.workflows.listen import Heard, row_times, wanted
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 COMPENSATED = 1 << 3

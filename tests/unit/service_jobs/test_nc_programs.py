@@ -7,15 +7,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from models.machine import Machine
-from service.errors import ConfigError
-from service.sequences.nc.blocks import Arc, Dwell, Go, Smooth
-from service.sequences.nc.duration import Pace, one_move_s, runtime
-from service.sequences.nc.settings import NcSettings
-from service.sequences.nc.write import NAMES, nc_program
-from service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
-from service.sequences.setups import shared_setups
-from service.sequences.steps import (
+from abbe.models.machine import Machine
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.nc.blocks import Arc, Dwell, Go, Smooth
+from abbe.service.sequences.nc.duration import Pace, one_move_s, runtime
+from abbe.service.sequences.nc.settings import NcSettings
+from abbe.service.sequences.nc.write import NAMES, nc_program
+from abbe.service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import (
     CampaignPlan,
     ChangeBar,
     FollowPath,

@@ -8,22 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from models.machine import Machine
-from models.paths.lines import DIAGONALS
-from models.planning.instruments import Instruments
-from models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
-from models.planning.plan import Step
-from service.cli.app import app
-from service.devices.session import DeviceUrls
-from service.errors import AbbeError, ConfigError
-from service.sequences.check import dry_run, dry_run_campaign
-from service.sequences.recipe_file import parse_recipe, read_recipe, recipe_text
-from service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
-from service.sequences.setups import shared_setups
-from service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
-from service.site import Site, machine_doc
-from service.workflows.plan import plan_for, plan_page, recipe_of, words
-from service.workflows.plan_instruments import read_instruments
+from abbe.models.machine import Machine
+from abbe.models.paths.lines import DIAGONALS
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
+from abbe.models.planning.plan import Step
+from abbe.service.cli.app import app
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.errors import AbbeError, ConfigError
+from abbe.service.sequences.check import dry_run, dry_run_campaign
+from abbe.service.sequences.recipe_file import parse_recipe, read_recipe, recipe_text
+from abbe.service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
+from abbe.service.site import Site, machine_doc
+from abbe.service.workflows.plan import plan_for, plan_page, recipe_of, words
+from abbe.service.workflows.plan_instruments import read_instruments
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 ONE_BAR = Instruments(bar_lengths_mm=(150.0,))

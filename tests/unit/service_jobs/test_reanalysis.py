@@ -7,11 +7,11 @@ import os
 
 import pytest
 
-from service.cli import run
-from service.errors import ConfigError
-from service.storage.store import Store
-from service.workflows.executors import Dask, Executor, Here, Processes
-from service.workflows.reanalysis import Answer, solve_all, tasks_of
+from abbe.service.cli import run
+from abbe.service.errors import ConfigError
+from abbe.service.storage.store import Store
+from abbe.service.workflows.executors import Dask, Executor, Here, Processes
+from abbe.service.workflows.reanalysis import Answer, solve_all, tasks_of
 from tests.conftest import Require
 from tests.many_campaigns import dask_cluster, fill
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from models.solvers.observability_volume import Number
-from models.uncertainty.prediction import Prediction
-from service.workflows.solve_verdict import WORDS, verdict
+from abbe.models.solvers.observability_volume import Number
+from abbe.models.uncertainty.prediction import Prediction
+from abbe.service.workflows.solve_verdict import WORDS, verdict
 
 
 def layout(value: float, word: str) -> Number:

@@ -5,16 +5,16 @@ import copy
 import numpy as np
 import pytest
 
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import step_diagonal
-from service.errors import CampaignRefused
-from service.workflows.campaign_checks import check_files, refuse
-from service.workflows.finding import Finding
-from service.workflows.provenance import campaign_digest, machine_digest, revision, run_digest, versions
-from service.workflows.run_geometry import geometry
-from service.workflows.run_times import times
-from service.workflows.solve import _whole
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import step_diagonal
+from abbe.service.errors import CampaignRefused
+from abbe.service.workflows.campaign_checks import check_files, refuse
+from abbe.service.workflows.finding import Finding
+from abbe.service.workflows.provenance import campaign_digest, machine_digest, revision, run_digest, versions
+from abbe.service.workflows.run_geometry import geometry
+from abbe.service.workflows.run_times import times
+from abbe.service.workflows.solve import _whole
 
 MACHINE = {"chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 

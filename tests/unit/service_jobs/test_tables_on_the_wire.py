@@ -5,12 +5,12 @@ import struct
 import numpy as np
 import pytest
 
-from drivers.cnc.tables import encode
-from models.compensation.tables import NineTables, quantise
-from service.errors import TableRefused
-from service.push.limits import PushLimits
-from service.push.meaning import meaning_of_bytes, meaning_of_tables
-from service.workflows.tables import added, check_limits, table_image
+from abbe.drivers.cnc.tables import encode
+from abbe.models.compensation.tables import NineTables, quantise
+from abbe.service.errors import TableRefused
+from abbe.service.push.limits import PushLimits
+from abbe.service.push.meaning import meaning_of_bytes, meaning_of_tables
+from abbe.service.workflows.tables import added, check_limits, table_image
 
 
 def tables(scale: float = 1.0) -> NineTables:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from models.verification import Figure
-from service.errors import TableRefused
-from service.workflows.verify import Figures, check_before, decide, judge, overall
+from abbe.models.verification import Figure
+from abbe.service.errors import TableRefused
+from abbe.service.workflows.verify import Figures, check_before, decide, judge, overall
 
 NONE = np.zeros(0)
 

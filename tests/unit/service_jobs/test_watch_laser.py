@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from drivers.api import LaserReading
-from drivers.errors import ReplyTimeout
-from service.devices.session import Session
-from service.errors import StatusUnknown
-from service.sequences.interlocks import Watching
-from service.sequences.watch import Watch
+from abbe.drivers.api import LaserReading
+from abbe.drivers.errors import ReplyTimeout
+from abbe.service.devices.session import Session
+from abbe.service.errors import StatusUnknown
+from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.watch import Watch
 
 STEP_S = 0.5
 """What one lost reply takes, by the loop's clock: it is made to jump, so that the tests wait for nothing."""

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from drivers.api import ControllerStatus
-from service.devices.clock_notes import noted
-from service.devices.session import Session
-from service.errors import DoorOpen
-from service.sequences.interlocks import AT_WORK, DOOR, DRIVES, REFERENCED, REMOTE, Watching
-from service.sequences.watch import NOTHING, Watch
+from abbe.drivers.api import ControllerStatus
+from abbe.service.devices.clock_notes import noted
+from abbe.service.devices.session import Session
+from abbe.service.errors import DoorOpen
+from abbe.service.sequences.interlocks import AT_WORK, DOOR, DRIVES, REFERENCED, REMOTE, Watching
+from abbe.service.sequences.watch import NOTHING, Watch
 
 READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
 PERIOD_S = 60.0

@@ -8,16 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from models.machine import Machine
-from models.paths.circles import way_on_sphere
-from service.errors import StrokeError
-from service.sequences.bar_tables import bar_table
-from service.sequences.check import dry_run
-from service.sequences.recipe_file import parse_recipe
-from service.sequences.recipes import Circle
-from service.sequences.rewind import end_of, remounted, rest_of
-from service.sequences.setups import shared_setups
-from service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, RecordPath, TakeBarOut
+from abbe.models.machine import Machine
+from abbe.models.paths.circles import way_on_sphere
+from abbe.service.errors import StrokeError
+from abbe.service.sequences.bar_tables import bar_table
+from abbe.service.sequences.check import dry_run
+from abbe.service.sequences.recipe_file import parse_recipe
+from abbe.service.sequences.recipes import Circle
+from abbe.service.sequences.rewind import end_of, remounted, rest_of
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, RecordPath, TakeBarOut
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))

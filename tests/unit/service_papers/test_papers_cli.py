@@ -9,10 +9,10 @@ from html.parser import HTMLParser
 import pytest
 from rich.console import Console
 
-from service.cli import run
-from service.cli.papers import show
-from service.papers.run import results
-from service.papers.words import lines
+from abbe.service.cli import run
+from abbe.service.cli.papers import show
+from abbe.service.papers.run import results
+from abbe.service.papers.words import lines
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 

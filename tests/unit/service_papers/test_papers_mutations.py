@@ -6,8 +6,8 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from service.papers import kwon_tables
-from service.papers.run import results
+from abbe.service.papers import kwon_tables
+from abbe.service.papers.run import results
 
 NOTICED = {
     "kwon.forward": "kwon",
@@ -29,7 +29,7 @@ NOTICED = {
     "yang_simulation.reading_eq6": "yang",
     "yang_table3.slope_through_origin": "yang",
 }
-"""Function of a module of service.papers, and the paper whose rows must fall."""
+"""Function of a module of abbe.service.papers, and the paper whose rows must fall."""
 
 COARSE = {"pahk.best_assignment": "pahk", "wang.cosine_error": "wang", "wang.reading_mm": "wang"}
 """Behind two digits or a bound: a thousandth cannot be seen there, a tenth must be."""
@@ -72,7 +72,7 @@ CASES = [(name, paper, (1.001, 0.999)) for name, paper in NOTICED.items()] + [(n
 @pytest.mark.parametrize(("name", "paper", "factors"), CASES)
 def test_a_function_that_is_off_is_noticed(monkeypatch, sound, name, paper, factors):
     module_name, function = name.split(".")
-    module = import_module(f"service.papers.{module_name}")
+    module = import_module(f"abbe.service.papers.{module_name}")
     right, fallen = getattr(module, function), set()
     for factor in factors:  # one sense may be hidden by the rounding of the inputs
         monkeypatch.setattr(module, function, lambda *a, factor=factor, **k: off(right(*a, **k), factor))
@@ -82,7 +82,7 @@ def test_a_function_that_is_off_is_noticed(monkeypatch, sound, name, paper, fact
 
 
 def test_a_table_of_yang_falls_with_its_slope(monkeypatch, sound):
-    module = import_module("service.papers.yang_table3")
+    module = import_module("abbe.service.papers.yang_table3")
     laser, bar, difference = module.paper.TABLE2["dxx"]
     wrong = dataclasses.replace(bar, text="-8.7263E-05")
     monkeypatch.setitem(module.paper.TABLE2, "dxx", (laser, wrong, difference))

@@ -2,8 +2,8 @@
 
 import pytest
 
-from service.papers.row import Row
-from service.papers.run import TITLES, results
+from abbe.service.papers.row import Row
+from abbe.service.papers.run import TITLES, results
 
 
 @pytest.fixture(scope="module")

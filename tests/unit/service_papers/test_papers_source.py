@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from service.papers.run import results
+from abbe.service.papers.run import results
 
 FILES = {"pahk": "000_*.txt", "kwon": "001_*.txt", "yang": "002_*.txt", "wang": "004_*.txt"}
 

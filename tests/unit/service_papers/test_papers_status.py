@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.papers.check import Check
-from service.papers.compare import Computed, agrees, computed_from
-from service.papers.printed import Printed
-from service.papers.row import Erratum, Row
-from service.papers.words import check_lines, digits_like, lines, note
+from abbe.service.papers.check import Check
+from abbe.service.papers.compare import Computed, agrees, computed_from
+from abbe.service.papers.printed import Printed
+from abbe.service.papers.row import Erratum, Row
+from abbe.service.papers.words import check_lines, digits_like, lines, note
 
 
 def row(text: str, computed: float | None, **more) -> Row:

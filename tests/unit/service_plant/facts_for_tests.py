@@ -7,8 +7,8 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from service.errors import StoreError
-from service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce
+from abbe.service.errors import StoreError
+from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
 RUNNING = Running("weekly", "quick-check", NOON, "helix", "revolution 3 of 10", 30.0, 42.0)

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from service.plant.facts import UNITS
-from service.plant.gather import Gatherer, table_in_force
-from service.plant.opcua.picture import picture_of
-from service.scheduler.store import ServiceStore
-from service.storage.records import PushEntryRecord
-from service.web.board import Board
-from service.web.view import View
+from abbe.service.plant.facts import UNITS
+from abbe.service.plant.gather import Gatherer, table_in_force
+from abbe.service.plant.opcua.picture import picture_of
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.records import PushEntryRecord
+from abbe.service.web.board import Board
+from abbe.service.web.view import View
 from tests.unit.service_plant.facts_for_tests import NOON, facts
 from tests.unit.service_serve.fakes import STEP, FakeClock
 

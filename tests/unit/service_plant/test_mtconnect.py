@@ -11,8 +11,8 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from service.plant.mtconnect import ITEMS, Agent
-from service.web.mtconnect import add_mtconnect
+from abbe.service.plant.mtconnect import ITEMS, Agent
+from abbe.service.web.mtconnect import add_mtconnect
 from tests.unit.service_plant.facts_for_tests import NOON, RUNNING, Source, check, facts
 
 HEADER = {"creationTime", "sender", "instanceId", "version", "bufferSize", "deviceModelChangeTime"}

@@ -20,11 +20,11 @@ from asyncua.server.address_space import NodeData, NodeManagementService
 from asyncua.server.standard_address_space import standard_address_space
 from asyncua.ua.uaerrors import UaStatusCodeError
 
-from service.clock import SystemClock
-from service.errors import ConfigError
-from service.plant.opcua import server as served
-from service.plant.opcua.server import OpcUaServer
-from service.plant.opcua.setup import OpcUaSetup
+from abbe.service.clock import SystemClock
+from abbe.service.errors import ConfigError
+from abbe.service.plant.opcua import server as served
+from abbe.service.plant.opcua.server import OpcUaServer
+from abbe.service.plant.opcua.setup import OpcUaSetup
 from tests.certificates import Signed, issued
 from tests.unit.service_plant.facts_for_tests import RUNNING, Source, check, facts
 

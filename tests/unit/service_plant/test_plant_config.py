@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.serve import setup_of
-from service.config import load_machine
-from service.errors import ConfigError
+from abbe.service.cli.serve import setup_of
+from abbe.service.config import load_machine
+from abbe.service.errors import ConfigError
 from tests.certificates import authority, issued
 
 HEAD = """name = "mill-7"

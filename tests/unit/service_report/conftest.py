@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.report import (
+from abbe.service.report import (
     ArrowField,
     Contribution,
     DemoReport,

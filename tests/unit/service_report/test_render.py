@@ -9,8 +9,18 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from service.report import ArrowField, Contribution, DemoReport, ParameterRow, PolarTrace, ResidualSeries, RunRow, SummaryRow, TableCurve
-from service.report.html import render_report
+from abbe.service.report import (
+    ArrowField,
+    Contribution,
+    DemoReport,
+    ParameterRow,
+    PolarTrace,
+    ResidualSeries,
+    RunRow,
+    SummaryRow,
+    TableCurve,
+)
+from abbe.service.report.html import render_report
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 HOSTILE = "</title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\x00\x07\ud800"

@@ -6,7 +6,7 @@ import json
 import sys
 from datetime import UTC, datetime, timedelta
 
-from service.scheduler.store import ServiceStore
+from abbe.service.scheduler.store import ServiceStore
 
 FIRST = datetime(2026, 6, 1, tzinfo=UTC)
 

@@ -11,25 +11,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import LinkDown
-from service.audit.book import AuditBook
-from service.cli import run
-from service.errors import StoreError
-from service.push.entries import GENESIS
-from service.scheduler import record
-from service.scheduler.desk import AlarmDesk, Duties, Telling
-from service.scheduler.job import CheckJob
-from service.scheduler.keep import StoreShelf
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.sequences.control import Control
-from service.storage.base import utc_text
-from service.storage.records import PushEntryRecord, VerificationRecord
-from service.workflows.alarm_signals import Terms, found_in
-from service.workflows.alarm_states import NO_ALARM, Alarm, Kind
-from service.workflows.alarms import acknowledge, alarms_of, open_alarms, series_begins
-from service.workflows.investigate import Note
-from service.workflows.push_approved import Outcome
+from abbe.drivers.errors import LinkDown
+from abbe.service.audit.book import AuditBook
+from abbe.service.cli import run
+from abbe.service.errors import StoreError
+from abbe.service.push.entries import GENESIS
+from abbe.service.scheduler import record
+from abbe.service.scheduler.desk import AlarmDesk, Duties, Telling
+from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.keep import StoreShelf
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.control import Control
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.records import PushEntryRecord, VerificationRecord
+from abbe.service.workflows.alarm_signals import Terms, found_in
+from abbe.service.workflows.alarm_states import NO_ALARM, Alarm, Kind
+from abbe.service.workflows.alarms import acknowledge, alarms_of, open_alarms, series_begins
+from abbe.service.workflows.investigate import Note
+from abbe.service.workflows.push_approved import Outcome
 from tests.unit.service_serve.fakes import FakeClock, FakeWatcher, Result, utc
 
 START = utc(2026, 3, 1, 5)

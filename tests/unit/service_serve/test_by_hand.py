@@ -10,19 +10,19 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import LinkDown
-from service.channel.messages import MOST_JOBS, Answer, How, StartJob, SteerJob
-from service.core.jobs import JobBook
-from service.core.open_ends import AGAIN_S, LOOK_S, NAME, OpenEnds
-from service.core.rights import may_measure
-from service.errors import MachineInUse, StillActive, StoreError
-from service.scheduler.loop import Scheduler
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.sequences.control import Control, State
-from service.users.passwords import Passwords
-from service.users.people import People
-from service.users.roles import ALLOWED, Permission, Role
+from abbe.drivers.errors import LinkDown
+from abbe.service.channel.messages import MOST_JOBS, Answer, How, StartJob, SteerJob
+from abbe.service.core.jobs import JobBook
+from abbe.service.core.open_ends import AGAIN_S, LOOK_S, NAME, OpenEnds
+from abbe.service.core.rights import may_measure
+from abbe.service.errors import MachineInUse, StillActive, StoreError
+from abbe.service.scheduler.loop import Scheduler
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.control import Control, State
+from abbe.service.users.passwords import Passwords
+from abbe.service.users.people import People
+from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
 NOON = utc(2026, 6, 1, 12)

@@ -16,15 +16,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.channel import messages as m
-from service.channel.wire import FULL_B, Wire
-from service.clock import SystemClock
-from service.core import web_process
-from service.core.web_process import WebProcess
-from service.errors import ChannelBroken, CoreSilent
-from service.scheduler.store import ServiceStore
-from service.web import walls
-from service.web.core_line import QUEUE, SILENT_S, CoreLine
+from abbe.service.channel import messages as m
+from abbe.service.channel.wire import FULL_B, Wire
+from abbe.service.clock import SystemClock
+from abbe.service.core import web_process
+from abbe.service.core.web_process import WebProcess
+from abbe.service.errors import ChannelBroken, CoreSilent
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.web import walls
+from abbe.service.web.core_line import QUEUE, SILENT_S, CoreLine
 from tests.unit.service_serve.fakes import FakeClock, settle, utc
 
 NOW = utc(2026, 11, 22, 6)
@@ -257,9 +257,9 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
 def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
     """In a fresh interpreter: everything that the process loads, and what it is refused afterwards."""
     program = (
-        "import sys\nfrom service.web import walls, process\nwalls.build()\nimport service.web.serving, service.logs\n"
+        "import sys\nfrom abbe.service.web import walls, process\nwalls.build()\nimport abbe.service.web.serving, abbe.service.logs\n"
         "bad = [name for name in sys.modules if walls.behind(name)]\nassert not bad, bad\n"
-        "for name in ('drivers.registry', 'pymodbus.client', 'serial', 'service.workflows.pushing', 'service.push.adapter'):\n"
+        "for name in ('abbe.drivers.registry', 'pymodbus.client', 'serial', 'abbe.service.push.adapter', 'abbe.service.push.conduct'):\n"
         "    try:\n        __import__(name)\n    except ImportError as error:\n        assert 'does not import' in str(error), error\n"
         "    else:\n        raise AssertionError(name)\nprint('shut')\n"
     )
@@ -269,7 +269,8 @@ def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
 
 def test_the_wall_knows_parts_from_beginnings() -> None:
     assert [
-        walls.behind(name) for name in ("drivers.registry", "drivers.api", "serial", "serialise", "service.web", "service.core.jobs")
+        walls.behind(name)
+        for name in ("abbe.drivers.registry", "abbe.drivers.api", "serial", "serialise", "abbe.service.web", "abbe.service.core.jobs")
     ] == [
         True,
         False,

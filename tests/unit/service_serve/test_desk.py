@@ -14,29 +14,29 @@ from typing import Any, cast
 
 import pytest
 
-from service.audit.book import AuditBook
-from service.channel.messages import How, JobSeen, SteerJob
-from service.core.jobs import JobBook
-from service.devices.alone import ENVIRONMENT
-from service.errors import StillActive, StoreError, TableRefused
-from service.events import ProgressSink
-from service.push.book import StoreBook
-from service.push.states import State as Push
-from service.scheduler.desk import AlarmDesk, Duties, Telling
-from service.scheduler.loop import Scheduler, Terms
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.sequences.control import Control, State
-from service.sequences.steps import CampaignPlan
-from service.storage.records import AlarmEntryRecord
-from service.workflows import push_approved
-from service.workflows.alarm_states import NO_ALARM, Alarm, Kind
-from service.workflows.alarms import alarms_of
-from service.workflows.at_start import push_is_open
-from service.workflows.investigate import Bench as Investigation
-from service.workflows.investigate import Note, investigate
-from service.workflows.push_approved import Approved, Order
-from service.workflows.push_word import Outcome, by_journal, open_push
+from abbe.service.audit.book import AuditBook
+from abbe.service.channel.messages import How, JobSeen, SteerJob
+from abbe.service.core.jobs import JobBook
+from abbe.service.devices.alone import ENVIRONMENT
+from abbe.service.errors import StillActive, StoreError, TableRefused
+from abbe.service.events import ProgressSink
+from abbe.service.push.book import StoreBook
+from abbe.service.push.states import State as Push
+from abbe.service.scheduler.desk import AlarmDesk, Duties, Telling
+from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.storage.records import AlarmEntryRecord
+from abbe.service.workflows import push_approved
+from abbe.service.workflows.alarm_states import NO_ALARM, Alarm, Kind
+from abbe.service.workflows.alarms import alarms_of
+from abbe.service.workflows.at_start import push_is_open
+from abbe.service.workflows.investigate import Bench as Investigation
+from abbe.service.workflows.investigate import Note, investigate
+from abbe.service.workflows.push_approved import Approved, Order
+from abbe.service.workflows.push_word import Outcome, by_journal, open_push
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, utc
 
 NOON = utc(2026, 6, 1, 12)
@@ -225,7 +225,7 @@ async def test_a_push_is_a_job_and_is_not_paused_while_a_table_is_not_verified(b
         return Outcome("refused", "not today")
 
     bench.push = push
-    from service.scheduler.ports import Errand
+    from abbe.service.scheduler.ports import Errand
 
     def work(control: Control) -> Awaitable[str]:
         return bench.desk._pushed(Approved(4, 9, NO_ALARM), YEARLY, control)
@@ -256,7 +256,7 @@ async def test_work_that_ends_by_itself_is_not_touched_by_an_abort() -> None:
 
 HOLDER = """
 import sys
-from service.devices.alone import alone
+from abbe.service.devices.alone import alone
 with alone(sys.argv[1]):
     print("has it", flush=True)
     sys.stdin.readline()
@@ -373,7 +373,7 @@ async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(be
     bench.push = push
     bench.clock.sleep = lambda s: asyncio.sleep(0)  # type: ignore[method-assign]
     with monkeypatch.context() as patch:
-        patch.setattr("service.scheduler.desk.by_journal", _unreadable)
+        patch.setattr("abbe.service.scheduler.desk.by_journal", _unreadable)
         with pytest.raises(StoreError):
             await bench.pushed()
     assert [line.kind for line in bench.lines()] == [Kind.PUSHING]

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import LinkDown
-from service.errors import MeasurementFault
-from service.scheduler.job import CheckJob
-from service.scheduler.slots import Schedule
-from service.sequences.control import Control
+from abbe.drivers.errors import LinkDown
+from abbe.service.errors import MeasurementFault
+from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.sequences.control import Control
 from tests.unit.service_serve.fakes import STEP, FakeClock, FakeShelf, FakeWatcher, Result, settle, utc
 
 SCHEDULE = Schedule("weekly", "0 6 * * 1", "Europe/Berlin", "verify")

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import LinkDown
-from service.errors import StoreError
-from service.scheduler import record
-from service.scheduler.keep import PAUSES_S, StoreLedger, StoreShelf
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
+from abbe.drivers.errors import LinkDown
+from abbe.service.errors import StoreError
+from abbe.service.scheduler import record
+from abbe.service.scheduler.keep import PAUSES_S, StoreLedger, StoreShelf
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
 from tests.unit.service_serve.fakes import FakeClock, Result, utc
 
 SLOT = utc(2026, 6, 1, 4)

@@ -8,11 +8,11 @@ from base64 import b64decode
 
 import numpy as np
 
-from service.capture.live import LiveFeed
-from service.channel.messages import LivePath, LiveSamples, from_core
-from service.channel.wire import Wire
-from service.clock import SystemClock
-from service.core.live import show_live
+from abbe.service.capture.live import LiveFeed
+from abbe.service.channel.messages import LivePath, LiveSamples, from_core
+from abbe.service.channel.wire import Wire
+from abbe.service.clock import SystemClock
+from abbe.service.core.live import show_live
 from tests.unit.service_capture.test_live import QUARTER, SETUP, batch
 
 

@@ -9,8 +9,8 @@ from datetime import datetime, timedelta
 
 import pytest
 
-from service.scheduler.loop import MAX_BACKLOG, Scheduler
-from service.scheduler.slots import Schedule, slots_between
+from abbe.service.scheduler.loop import MAX_BACKLOG, Scheduler
+from abbe.service.scheduler.slots import Schedule, slots_between
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
 Job = Callable[[Schedule, datetime], Awaitable[str]]

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import pytest
 from structlog.testing import capture_logs
 
-from service.errors import ConfigError
-from service.mqtt.broker import parse
-from service.mqtt.outbox import with_id
-from service.mqtt.publisher import Publisher
-from service.mqtt.topics import Topics, client_id, level
+from abbe.service.errors import ConfigError
+from abbe.service.mqtt.broker import parse
+from abbe.service.mqtt.outbox import with_id
+from abbe.service.mqtt.publisher import Publisher
+from abbe.service.mqtt.topics import Topics, client_id, level
 from tests.unit.service_serve.fakes import FakeClock, utc
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from service.mqtt.outbox import DROPPED, StoreOutbox
-from service.mqtt.topics import Topics
-from service.scheduler.store import ServiceStore
+from abbe.service.mqtt.outbox import DROPPED, StoreOutbox
+from abbe.service.mqtt.topics import Topics
+from abbe.service.scheduler.store import ServiceStore
 from tests.unit.service_serve.fakes import FakeClock, utc
 
 TOPICS = Topics("abbe", "mill-7")

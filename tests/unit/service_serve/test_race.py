@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from service.scheduler.store import ServiceStore
+from abbe.service.scheduler.store import ServiceStore
 from tests.unit.service_serve import racing_child
 from tests.unit.service_serve.racing_child import FIRST
 

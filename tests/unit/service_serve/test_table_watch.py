@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.errors import LinkDown
-from service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWatch
-from service.push.entries import Entry
-from service.push.states import State
-from service.workflows.in_force import InForce
-from service.workflows.push_history import wanted_by
+from abbe.drivers.errors import LinkDown
+from abbe.service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWatch
+from abbe.service.push.entries import Entry
+from abbe.service.push.states import State
+from abbe.service.workflows.in_force import InForce
+from abbe.service.workflows.push_history import wanted_by
 from tests.unit.service_serve.fakes import FakeClock, FakeShelf, settle, utc
 
 OURS = InForce(0, 0xA, 0xA)

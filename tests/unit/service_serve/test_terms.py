@@ -10,12 +10,12 @@ from datetime import datetime, time, timedelta
 
 import pytest
 
-from drivers.api import ControllerStatus
-from drivers.errors import LinkDown
-from service.scheduler.loop import Scheduler, Terms
-from service.scheduler.ready import Ready, Seen
-from service.scheduler.slots import Needs, Schedule, cron_in_words, next_slot, previous_slot, slots_between
-from service.scheduler.windows import Window
+from abbe.drivers.api import ControllerStatus
+from abbe.drivers.errors import LinkDown
+from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.ready import Ready, Seen
+from abbe.service.scheduler.slots import Needs, Schedule, cron_in_words, next_slot, previous_slot, slots_between
+from abbe.service.scheduler.windows import Window
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
 HOURLY = Schedule("hourly", "0 * * * *", "UTC", "r")

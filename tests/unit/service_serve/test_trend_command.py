@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.cli import run
-from service.scheduler import record
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
+from abbe.service.cli import run
+from abbe.service.scheduler import record
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
 from tests.unit.service_serve.fakes import Result, utc
 
 START = utc(2026, 3, 1, 5)

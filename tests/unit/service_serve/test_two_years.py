@@ -20,9 +20,9 @@ from zlib import crc32
 import pytest
 import structlog
 
-from service.scheduler.loop import Scheduler, Terms
-from service.scheduler.slots import FIRST_UTC, Needs, Schedule, slots_between
-from service.scheduler.windows import Window, covering
+from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.slots import FIRST_UTC, Needs, Schedule, slots_between
+from abbe.service.scheduler.windows import Window, covering
 from tests.unit.service_serve.cron_oracle import Minutes
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 

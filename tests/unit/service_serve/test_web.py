@@ -11,19 +11,19 @@ from xml.etree import ElementTree
 import httpx
 import pytest
 
-from drivers.errors import LinkDown
-from service.errors import StoreError
-from service.scheduler import record
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.web import words
-from service.web.app import create_app
-from service.web.board import Board
-from service.web.headers import HEADERS
-from service.web.page import figure_verdict
-from service.web.schemas import Verification
-from service.web.trend import Point, trend_svg
-from service.web.view import View
+from abbe.drivers.errors import LinkDown
+from abbe.service.errors import StoreError
+from abbe.service.scheduler import record
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.web import words
+from abbe.service.web.app import create_app
+from abbe.service.web.board import Board
+from abbe.service.web.headers import HEADERS
+from abbe.service.web.page import figure_verdict
+from abbe.service.web.schemas import Verification
+from abbe.service.web.trend import Point, trend_svg
+from abbe.service.web.view import View
 from tests.unit.service_serve.fakes import STEP, FakeClock, Result, utc
 
 NOW = utc(2026, 11, 21, 9)

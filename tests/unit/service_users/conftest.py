@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.book import AuditBook
-from service.scheduler.store import ServiceStore
-from service.users.passwords import Passwords
-from service.users.people import People
+from abbe.service.audit.book import AuditBook
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.passwords import Passwords
+from abbe.service.users.people import People
 
 PHRASE = "correct horse battery staple"
 

@@ -12,17 +12,17 @@ import pytest
 from fastapi import FastAPI, WebSocket
 from fastapi.responses import PlainTextResponse
 
-from service.errors import ConfigError
-from service.scheduler.slots import Schedule
-from service.users.roles import ALLOWED, Permission, Role
-from service.web.access import MUTATING, PUBLIC, Open, cells, needs
-from service.web.app import create_app
-from service.web.board import Board
-from service.web.door import COOKIE, Door, csrf_token
-from service.web.guard import CSRF_HEADER
-from service.web.headers import HEADERS
-from service.web.listening import check_exposure
-from service.web.view import View
+from abbe.service.errors import ConfigError
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.users.roles import ALLOWED, Permission, Role
+from abbe.service.web.access import MUTATING, PUBLIC, Open, cells, needs
+from abbe.service.web.app import create_app
+from abbe.service.web.board import Board
+from abbe.service.web.door import COOKIE, Door, csrf_token
+from abbe.service.web.guard import CSRF_HEADER
+from abbe.service.web.headers import HEADERS
+from abbe.service.web.listening import check_exposure
+from abbe.service.web.view import View
 from tests.unit.service_users.conftest import PHRASE, World
 
 BASE = "http://127.0.0.1:8080"

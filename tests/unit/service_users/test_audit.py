@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.book import AuditBook
-from service.audit.chain import Event, anchor_of, digest_of, faults, follow, mac_of
-from service.errors import AuditBroken, StoreError
-from service.push.entries import GENESIS
-from service.storage.store import Store
-from service.storage.store_audit import AuditRecord
+from abbe.service.audit.book import AuditBook
+from abbe.service.audit.chain import Event, anchor_of, digest_of, faults, follow, mac_of
+from abbe.service.errors import AuditBroken, StoreError
+from abbe.service.push.entries import GENESIS
+from abbe.service.storage.store import Store
+from abbe.service.storage.store_audit import AuditRecord
 from tests.unit.service_users.conftest import World
 
 KEY = bytes(range(32))
@@ -151,8 +151,8 @@ def test_writers_do_not_fork_the_chain(world: World) -> None:
 
 def test_two_processes_do_not_fork_the_chain(world: World) -> None:
     program = (
-        "import sys\nfrom service.audit.book import AuditBook\nfrom service.audit.chain import Event\n"
-        "from service.storage.store import Store\n"
+        "import sys\nfrom abbe.service.audit.book import AuditBook\nfrom abbe.service.audit.chain import Event\n"
+        "from abbe.service.storage.store import Store\n"
         "with Store.open(sys.argv[1]) as store:\n    book = AuditBook(store, sys.argv[1])\n"
         "    for n in range(15): book.write(Event('w', 'a', str(n), 'done', {}))\n"
     )

@@ -16,15 +16,15 @@ from pathlib import Path
 import pytest
 import typer
 
-from service.audit.book import AuditBook
-from service.audit.chain import Event, follow
-from service.cli import run
-from service.cli.audited import record_all
-from service.cli.common import print_table
-from service.errors import AuditBroken, StoreError
-from service.storage.migrate import downgrade, upgrade
-from service.storage.private import private_file, seen_by_others
-from service.storage.store import Store
+from abbe.service.audit.book import AuditBook
+from abbe.service.audit.chain import Event, follow
+from abbe.service.cli import run
+from abbe.service.cli.audited import record_all
+from abbe.service.cli.common import print_table
+from abbe.service.errors import AuditBroken, StoreError
+from abbe.service.storage.migrate import downgrade, upgrade
+from abbe.service.storage.private import private_file, seen_by_others
+from abbe.service.storage.store import Store
 from tests.unit.service_users.conftest import World
 
 URL = "sqlite:///abbe.sqlite3"
@@ -104,7 +104,7 @@ def test_ready_leaves_nothing_behind_and_sees_each_file(world: World) -> None:
 
 
 def test_ready_sees_a_database_that_takes_no_writes(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.storage.engine.BUSY_TIMEOUT_MS", 50)
+    monkeypatch.setattr("abbe.service.storage.engine.BUSY_TIMEOUT_MS", 50)
     with Store.open(world.url) as store, closing(sqlite3.connect(world.book.key_file.parent / "abbe.sqlite3")) as other:
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreError, match="locked"):

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import typer
 
-from service.cli import run
-from service.cli.app import app
-from service.cli.audited import commands, outcome_of, record_all
-from service.cli.declared import CHANGES, READS, RECORDS_ITSELF, is_recorded
-from service.storage.store import Store
+from abbe.service.cli import run
+from abbe.service.cli.app import app
+from abbe.service.cli.audited import commands, outcome_of, record_all
+from abbe.service.cli.declared import CHANGES, READS, RECORDS_ITSELF, is_recorded
+from abbe.service.storage.store import Store
 from tests.unit.service_users.conftest import PHRASE
 
 URL = "sqlite:///abbe.sqlite3"

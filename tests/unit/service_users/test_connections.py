@@ -14,9 +14,9 @@ import pytest
 from fastapi import FastAPI, Request
 from fastapi.responses import PlainTextResponse
 
-from service.web import connections, problems, server
-from service.web.listening import bind
-from service.web.server import Server, make_server
+from abbe.service.web import connections, problems, server
+from abbe.service.web.listening import bind
+from abbe.service.web.server import Server, make_server
 from tests.system.test_serve_users import certificate
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import PasswordRefused, StoreError, UserRefused
-from service.users.lockout import MOST, Buckets, Came, Lockout
-from service.users.passwords import AT_A_TIME, Passwords
-from service.users.people import NOBODY, digest_of
-from service.users.roles import ALLOWED, Permission, Role
+from abbe.service.errors import PasswordRefused, StoreError, UserRefused
+from abbe.service.users.lockout import MOST, Buckets, Came, Lockout
+from abbe.service.users.passwords import AT_A_TIME, Passwords
+from abbe.service.users.people import NOBODY, digest_of
+from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.unit.service_users.conftest import PHRASE, World
 
 

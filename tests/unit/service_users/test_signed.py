@@ -14,11 +14,11 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
-from service.cli import run
-from service.errors import KeyRefused, SignatureRefused
-from service.signed.container import Expected, check, claims_of, sign
-from service.signed.keys import new_key, public_of, read_key
-from service.storage.store import Store
+from abbe.service.cli import run
+from abbe.service.errors import KeyRefused, SignatureRefused
+from abbe.service.signed.container import Expected, check, claims_of, sign
+from abbe.service.signed.keys import new_key, public_of, read_key
+from abbe.service.storage.store import Store
 from tests.formats.test_choice import _document, _known
 
 NOW = datetime(2026, 11, 22, 9, tzinfo=UTC)

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from service.errors import FileFormatError
-from service.vectors.case import Case
-from service.vectors.checks import Checks
-from service.vectors.run import check_file, vector_files
+from abbe.service.errors import FileFormatError
+from abbe.service.vectors.case import Case
+from abbe.service.vectors.checks import Checks
+from abbe.service.vectors.run import check_file, vector_files
 
 
 def case(doc) -> Case:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import FileFormatError
-from service.runs.json_text import strict_json
+from abbe.service.errors import FileFormatError
+from abbe.service.runs.json_text import strict_json
 
 FILE = Path("a.json")
 

@@ -12,9 +12,9 @@ from urllib.parse import quote
 import httpx
 import pytest
 
-from service.users.roles import ALLOWED, Role
-from service.web.access import MUTATING, PUBLIC, cells
-from service.web.problems import MEDIA_TYPE
+from abbe.service.users.roles import ALLOWED, Role
+from abbe.service.web.access import MUTATING, PUBLIC, cells
+from abbe.service.web.problems import MEDIA_TYPE
 from tests.unit.service_web.api_bench import Plant, app_of, served
 
 BASE = "http://127.0.0.1:8080"

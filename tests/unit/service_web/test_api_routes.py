@@ -11,8 +11,8 @@ import httpx
 import numpy as np
 import pytest
 
-from service.runs.columns import load_run
-from service.web.catalogue import entries, page
+from abbe.service.runs.columns import load_run
+from abbe.service.web.catalogue import entries, page
 from tests.unit.service_web.api_bench import CHECKS, SAMPLES, Plant, bar_samples
 from tests.unit.test_project import ROOT
 
@@ -203,4 +203,6 @@ async def test_codes_are_one_catalogue_and_one_page(client):
     assert [one["code"] for one in told] == [one.code for one in entries()]
     assert len(told) == len({one["code"] for one in told}) > 60
     assert all(one["meaning"] for one in told)
-    assert (ROOT / "docs" / "error-codes.md").read_text(encoding="utf-8") == page(), "python -m service.web.catalogue > docs/error-codes.md"
+    assert (ROOT / "docs" / "error-codes.md").read_text(encoding="utf-8") == page(), (
+        "python -m abbe.service.web.catalogue > docs/error-codes.md"
+    )

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from service.storage.store import Store
-from service.storage.store_decisions import RejectionRecord
-from service.storage.store_pages import LISTINGS
+from abbe.service.storage.store import Store
+from abbe.service.storage.store_decisions import RejectionRecord
+from abbe.service.storage.store_pages import LISTINGS
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

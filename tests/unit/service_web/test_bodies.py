@@ -7,9 +7,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from service.web.access import MUTATING, cells
-from service.web.bodies import LONGEST_B
-from service.web.problems import MEDIA_TYPE
+from abbe.service.web.access import MUTATING, cells
+from abbe.service.web.bodies import LONGEST_B
+from abbe.service.web.problems import MEDIA_TYPE
 from tests.system.test_serve_bodies import BY_FORM
 from tests.unit.service_web.api_bench import Plant
 from tests.unit.service_web.test_table_orders import BODY, PATH, Desk, desk

@@ -13,15 +13,15 @@ from typing import Any
 import httpx
 import pytest
 
-from service.channel.messages import Answer, DoneByHand, Jobs, JobSeen, Moment, Outcome, StartJob, from_web
-from service.channel.wire import Wire
-from service.clock import SystemClock
-from service.users.roles import ALLOWED, Permission, Role
-from service.web.app import Parts, create_app
-from service.web.core_line import CoreLine
-from service.web.pages.rehearsal import CAMPAIGN, Rehearsals
-from service.web.problems import MEDIA_TYPE
-from service.web.view import View
+from abbe.service.channel.messages import Answer, DoneByHand, Jobs, JobSeen, Moment, Outcome, StartJob, from_web
+from abbe.service.channel.wire import Wire
+from abbe.service.clock import SystemClock
+from abbe.service.users.roles import ALLOWED, Permission, Role
+from abbe.service.web.app import Parts, create_app
+from abbe.service.web.core_line import CoreLine
+from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
+from abbe.service.web.problems import MEDIA_TYPE
+from abbe.service.web.view import View
 from tests.unit.service_serve.test_channel import MOMENT
 from tests.unit.service_web.api_bench import NAME, Plant
 from tests.unit.service_web_pages.test_rehearsal import TOLD

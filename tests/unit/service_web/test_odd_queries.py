@@ -12,18 +12,18 @@ import httpx
 import pytest
 from starlette.routing import Route
 
-from service.audit.book import AuditBook
-from service.clock import SystemClock
-from service.scheduler.slots import Schedule
-from service.scheduler.store import ServiceStore
-from service.users.passwords import Passwords
-from service.users.people import People
-from service.web.api.sources import Sources
-from service.web.app import create_app
-from service.web.board import Board
-from service.web.door import COOKIE, Door, csrf_token
-from service.web.guard import CSRF_HEADER
-from service.web.view import View
+from abbe.service.audit.book import AuditBook
+from abbe.service.clock import SystemClock
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.users.passwords import Passwords
+from abbe.service.users.people import People
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.app import create_app
+from abbe.service.web.board import Board
+from abbe.service.web.door import COOKIE, Door, csrf_token
+from abbe.service.web.guard import CSRF_HEADER
+from abbe.service.web.view import View
 
 PHRASE = "correct horse battery staple"
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.cli import run
+from abbe.service.cli import run
 from tests.unit.service_web.api_bench import Plant
 
 

@@ -9,9 +9,9 @@ from base64 import b64encode
 import numpy as np
 import pytest
 
-from service.channel.messages import LivePath, LiveSamples
-from service.errors import ChannelBroken
-from service.web.sample_board import HEAD, KEPT_FRAMES, MOST_EACH, MOST_LISTENERS, QUEUE, SampleBoard
+from abbe.service.channel.messages import LivePath, LiveSamples
+from abbe.service.errors import ChannelBroken
+from abbe.service.web.sample_board import HEAD, KEPT_FRAMES, MOST_EACH, MOST_LISTENERS, QUEUE, SampleBoard
 
 PATH = LivePath("path", 3, "helix1", "ballbar_helix", 150.0, 2000.0, 1000, 84.2, (0.0, 90.0))
 

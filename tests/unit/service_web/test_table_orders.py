@@ -13,18 +13,18 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from service.channel.messages import Answer, Jobs, JobSeen, Outcome, PushNow, RollBack, from_web
-from service.channel.wire import Wire
-from service.clock import SystemClock
-from service.users.roles import ALLOWED, Permission, Role
-from service.web.access import cells
-from service.web.api.once import REPLAYED
-from service.web.api.sources import Sources
-from service.web.app import Parts, create_app
-from service.web.board import Board
-from service.web.core_line import CoreLine
-from service.web.problems import MEDIA_TYPE
-from service.web.view import View
+from abbe.service.channel.messages import Answer, Jobs, JobSeen, Outcome, PushNow, RollBack, from_web
+from abbe.service.channel.wire import Wire
+from abbe.service.clock import SystemClock
+from abbe.service.users.roles import ALLOWED, Permission, Role
+from abbe.service.web.access import cells
+from abbe.service.web.api.once import REPLAYED
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.app import Parts, create_app
+from abbe.service.web.board import Board
+from abbe.service.web.core_line import CoreLine
+from abbe.service.web.problems import MEDIA_TYPE
+from abbe.service.web.view import View
 from tests.unit.service_serve.test_channel import MOMENT
 from tests.unit.service_web.api_bench import NAME, Plant
 

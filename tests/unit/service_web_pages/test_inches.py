@@ -16,21 +16,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.report.numbers import MM, Unit
-from service.runs.observations import run_data
-from service.web import frame, language
-from service.web.frame import Frame
-from service.web.page import environment
-from service.web.pages.compare import pictures
-from service.web.pages.live import script_words
-from service.web.pages.rehearsal import CAMPAIGN
-from service.web.pages.runs import run_document
-from service.web.pages.whatif import forecast
-from service.web.schemas import Job
-from service.web.units import INCH, METRIC
-from service.workflows.compare_runs import Curve, Difference, Loaded, curve, figure_rows
-from service.workflows.report_parts import Rules
-from service.workflows.solution_field import stored_field
+from abbe.service.report.numbers import MM, Unit
+from abbe.service.runs.observations import run_data
+from abbe.service.web import frame, language
+from abbe.service.web.frame import Frame
+from abbe.service.web.page import environment
+from abbe.service.web.pages.compare import pictures
+from abbe.service.web.pages.live import script_words
+from abbe.service.web.pages.rehearsal import CAMPAIGN
+from abbe.service.web.pages.runs import run_document
+from abbe.service.web.pages.whatif import forecast
+from abbe.service.web.schemas import Job
+from abbe.service.web.units import INCH, METRIC
+from abbe.service.workflows.compare_runs import Curve, Difference, Loaded, curve, figure_rows
+from abbe.service.workflows.report_parts import Rules
+from abbe.service.workflows.solution_field import stored_field
 from tests.pages_world import Served, as_user
 from tests.unit.service_web_pages.test_rehearsal import PLANS, TOLD
 from tests.unit.service_web_pages.test_result_screens import observed, runs_of

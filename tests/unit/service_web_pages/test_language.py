@@ -9,8 +9,8 @@ from string import Formatter
 
 import pytest
 
-from service.web import frame, language
-from service.web.page import HERE
+from abbe.service.web import frame, language
+from abbe.service.web.page import HERE
 
 LANGUAGES = list(language.NAMES)
 TEMPLATES = sorted((HERE / "templates").glob("*.html"))

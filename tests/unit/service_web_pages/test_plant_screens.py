@@ -12,15 +12,15 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.clock import SystemClock
-from service.scheduler.fleet import Figure, MachineLine
-from service.scheduler.store import ServiceStore
-from service.web.app import create_app
-from service.web.pages.blanking import HIDDEN, blanked, blanked_doc, blanked_line
-from service.web.pages.devices import device_screen
-from service.web.pages.fleet import Asked, FleetLine, fleet_csv, fleet_lines
-from service.web.schemas import Device
-from service.web.view import View
+from abbe.service.clock import SystemClock
+from abbe.service.scheduler.fleet import Figure, MachineLine
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.web.app import create_app
+from abbe.service.web.pages.blanking import HIDDEN, blanked, blanked_doc, blanked_line
+from abbe.service.web.pages.devices import device_screen
+from abbe.service.web.pages.fleet import Asked, FleetLine, fleet_csv, fleet_lines
+from abbe.service.web.schemas import Device
+from abbe.service.web.view import View
 from tests.pages_world import Served
 from tests.unit.service_web_pages.test_screens import as_user
 

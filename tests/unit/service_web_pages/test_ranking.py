@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from models.geometry.chain import design
-from models.machine import Machine
-from models.volumetric import remove_rigid, volume_grid
-from service.site import machine_from_doc
-from service.web.pages.ranking import NODES, Ranked, ranking
-from service.workflows.stored_prediction import stored_prediction
+from abbe.models.geometry.chain import design
+from abbe.models.machine import Machine
+from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.site import machine_from_doc
+from abbe.service.web.pages.ranking import NODES, Ranked, ranking
+from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.pages_world import solved_campaign
 
 POINTS_ALONE = ("EYY", "ECZ", "EXX", "C0Y")

@@ -8,18 +8,18 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from service.channel.messages import MachineTold, RulesTold
-from service.clock import SystemClock
-from service.errors import ConfigError
-from service.sequences.check import dry_run_campaign
-from service.site import machine_from_doc
-from service.web.core_line import CoreLine
-from service.web.jobs import add_jobs
-from service.web.page import HERE, environment
-from service.web.pages.new import expired
-from service.web.pages.rehearsal import CAMPAIGN, Rehearsals
-from service.web.schemas_jobs import LONGEST_RECIPE
-from service.workflows.shipped import RATES_HZ, named, parted, recipe_plan
+from abbe.service.channel.messages import MachineTold, RulesTold
+from abbe.service.clock import SystemClock
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.check import dry_run_campaign
+from abbe.service.site import machine_from_doc
+from abbe.service.web.core_line import CoreLine
+from abbe.service.web.jobs import add_jobs
+from abbe.service.web.page import HERE, environment
+from abbe.service.web.pages.new import expired
+from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
+from abbe.service.web.schemas_jobs import LONGEST_RECIPE
+from abbe.service.workflows.shipped import RATES_HZ, named, parted, recipe_plan
 from tests.unit.service_serve.fakes import utc
 
 STROKES = {"X": (0.0, 600.0), "Y": (0.0, 500.0), "Z": (0.0, 450.0)}

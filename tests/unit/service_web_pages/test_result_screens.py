@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from models.functions.motions import motion_names
-from models.uncertainty.frame import field, volume_frame
-from models.verification import U_REPEAT_MM
-from service.runs.observations import run_data
-from service.site import machine_from_doc
-from service.web.api.field import Motion
-from service.web.pages.runs import run_document
-from service.workflows.compare_runs import Difference, Loaded, curve, difference, remarks
-from service.workflows.report_parts import Rules
-from service.workflows.stored_prediction import stored_prediction
+from abbe.models.functions.motions import motion_names
+from abbe.models.uncertainty.frame import field, volume_frame
+from abbe.models.verification import U_REPEAT_MM
+from abbe.service.runs.observations import run_data
+from abbe.service.site import machine_from_doc
+from abbe.service.web.api.field import Motion
+from abbe.service.web.pages.runs import run_document
+from abbe.service.workflows.compare_runs import Difference, Loaded, curve, difference, remarks
+from abbe.service.workflows.report_parts import Rules
+from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.pages_world import Served, as_user
 
 

@@ -7,13 +7,13 @@ import re
 import httpx
 import pytest
 
-from service.clock import SystemClock
-from service.users.roles import ALLOWED, Permission, Role
-from service.web.access import cells
-from service.web.app import create_app
-from service.web.guard import CSRF_HEADER
-from service.web.page import HERE
-from service.web.view import View
+from abbe.service.clock import SystemClock
+from abbe.service.users.roles import ALLOWED, Permission, Role
+from abbe.service.web.access import cells
+from abbe.service.web.app import create_app
+from abbe.service.web.guard import CSRF_HEADER
+from abbe.service.web.page import HERE
+from abbe.service.web.view import View
 from tests.pages_world import PROPOSER, USERS, Filled, Served, as_user, screens
 
 SVG = re.compile(r"<svg.*?</svg>", re.DOTALL)

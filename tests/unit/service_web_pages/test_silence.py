@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import httpx
 
-from service.clock import SystemClock
-from service.errors import CoreSilent
-from service.web.api.sources import Sources
-from service.web.app import create_app
-from service.web.schemas import Status, Verification
+from abbe.service.clock import SystemClock
+from abbe.service.errors import CoreSilent
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.app import create_app
+from abbe.service.web.schemas import Status, Verification
 from tests.pages_world import Served
 from tests.unit.service_web_pages.test_screens import as_user
 

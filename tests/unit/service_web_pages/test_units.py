@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from service.report.numbers import MM, placed
-from service.web.pages.budget import _interval
-from service.web.units import INCH, METRIC, converted, drawn_in, rounded, shown, unit_in
+from abbe.service.report.numbers import MM, placed
+from abbe.service.web.pages.budget import _interval
+from abbe.service.web.units import INCH, METRIC, converted, drawn_in, rounded, shown, unit_in
 
 
 @pytest.mark.parametrize(

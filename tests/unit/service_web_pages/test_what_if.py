@@ -8,21 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.geometry.bases import term_values
-from models.geometry.chain import design, deviation_mm
-from models.machine import Machine
-from models.paths.helix import helix_points
-from models.paths.lines import DIAGONALS, diagonal_ends, straight_line
-from models.solvers.observations import RunData
-from models.solvers.observe import Setup, predict
-from models.uncertainty.coverage import apart_from_zero
-from models.uncertainty.known_field import KnownField, field_map
-from models.uncertainty.what_if import Outcome, check_figures, diagonal_figures, expected_rms, helix_figure, volume_figures, what_if
-from models.verification import diagonal_figure
-from models.verification import helix_figure as measured_helix
-from models.volumetric import remove_rigid, volume_grid
-from service.site import machine_from_doc
-from service.workflows.stored_prediction import stored_prediction
+from abbe.models.geometry.bases import term_values
+from abbe.models.geometry.chain import design, deviation_mm
+from abbe.models.machine import Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import Setup, predict
+from abbe.models.uncertainty.coverage import apart_from_zero
+from abbe.models.uncertainty.known_field import KnownField, field_map
+from abbe.models.uncertainty.what_if import Outcome, check_figures, diagonal_figures, expected_rms, helix_figure, volume_figures, what_if
+from abbe.models.verification import diagonal_figure
+from abbe.models.verification import helix_figure as measured_helix
+from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.site import machine_from_doc
+from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.pages_world import solved_campaign
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from simulators.scenario import Scenario, from_dict
-from simulators.world import World
+from abbe.simulators.scenario import Scenario, from_dict
+from abbe.simulators.world import World
 
 QUIET = {
     "scale_sd_um_per_m": 0.0,
@@ -65,7 +65,7 @@ class Running:
 def running(*arguments: str) -> Iterator[Running]:
     """A simulator process that ends with the block."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "simulators", "--watch-stdin", *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-m", "abbe.simulators", "--watch-stdin", *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert process.stdin is not None
     assert process.stdout is not None

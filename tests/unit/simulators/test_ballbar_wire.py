@@ -5,9 +5,9 @@ import struct
 import numpy as np
 import pytest
 
-from simulators.ballbar.device import BallbarDevice, Samples
-from simulators.ballbar.wire import BallbarWire, Parser, crc16, encode, encode_ack, encode_info, encode_samples
-from simulators.world import World
+from abbe.simulators.ballbar.device import BallbarDevice, Samples
+from abbe.simulators.ballbar.wire import BallbarWire, Parser, crc16, encode, encode_ack, encode_info, encode_samples
+from abbe.simulators.world import World
 
 EXAMPLES = {
     "IDENTIFY": "A5 5A 81 02 01 00 1D 72",

@@ -6,7 +6,7 @@ import zlib
 import numpy as np
 import pytest
 
-from simulators.cnc.bank import ImageError, checksum, empty_image, parse
+from abbe.simulators.cnc.bank import ImageError, checksum, empty_image, parse
 
 
 def image(kind: int, counts, start, step, body, *, length: int | None = None, magic=0xABBE, fmt=1, lsb=100) -> list[int]:

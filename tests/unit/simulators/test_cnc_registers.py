@@ -6,11 +6,11 @@ import zlib
 import numpy as np
 import pytest
 
-from simulators.cnc.bank import empty_image
-from simulators.cnc.device import Controller
-from simulators.cnc.wire import CncRegisters
-from simulators.scenario import MachineConfig
-from simulators.truth.machine import Geometry
+from abbe.simulators.cnc.bank import empty_image
+from abbe.simulators.cnc.device import Controller
+from abbe.simulators.cnc.wire import CncRegisters
+from abbe.simulators.scenario import MachineConfig
+from abbe.simulators.truth.machine import Geometry
 
 MOVE, PATH_CLEAR, PATH_START, RESET = 1, 2, 3, 4
 

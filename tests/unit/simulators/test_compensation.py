@@ -2,8 +2,8 @@ import struct
 
 import pytest
 
-from simulators.cnc.bank import checksum, empty_image
-from simulators.cnc.compensation import BankState, Compensation, CompResult
+from abbe.simulators.cnc.bank import checksum, empty_image
+from abbe.simulators.cnc.compensation import BankState, Compensation, CompResult
 
 ME, OTHER = 11, 22
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from simulators.cnc.device import ALARM_ESTOP, FIFO_SIZE, Controller, Hold, Result
-from simulators.scenario import MachineConfig
-from simulators.truth.machine import Geometry
+from abbe.simulators.cnc.device import ALARM_ESTOP, FIFO_SIZE, Controller, Hold, Result
+from abbe.simulators.scenario import MachineConfig
+from abbe.simulators.truth.machine import Geometry
 
 START = [300.0, 250.0, 225.0]
 

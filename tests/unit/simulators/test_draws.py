@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from simulators.scenario import from_dict
-from simulators.truth.draws import Draws, describe, draw_machine
+from abbe.simulators.scenario import from_dict
+from abbe.simulators.truth.draws import Draws, describe, draw_machine
 
 SEEDS = range(200)
 STROKES = ([0, 600], [0, 500], [0, 450])

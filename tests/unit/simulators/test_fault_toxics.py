@@ -7,10 +7,10 @@ import sys
 
 import pytest
 
-from simulators.faults.modbus_frames import MBAP, RTU, Cutter, Frame, answer, crc16, parts
-from simulators.faults.modbus_proxy import ModbusProxy, refusing
-from simulators.faults.modbus_toxics import KINDS, Toxics
-from simulators.faults.scenario import Fault, FaultScenario, FaultScenarioError, from_dict, load, scenario
+from abbe.simulators.faults.modbus_frames import MBAP, RTU, Cutter, Frame, answer, crc16, parts
+from abbe.simulators.faults.modbus_proxy import ModbusProxy, refusing
+from abbe.simulators.faults.modbus_toxics import KINDS, Toxics
+from abbe.simulators.faults.scenario import Fault, FaultScenario, FaultScenarioError, from_dict, load, scenario
 
 READ = Frame(1, bytes.fromhex("0300640002"), tid=7)
 REPLY = Frame(1, bytes.fromhex("030400640065"), tid=7)
@@ -136,7 +136,7 @@ def test_a_black_hole_swallows_everything_from_there_on():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_is_described(kind):
-    import simulators.faults.modbus_toxics as module
+    import abbe.simulators.faults.modbus_toxics as module
 
     assert kind in (module.__doc__ or "")
 
@@ -208,7 +208,7 @@ async def test_the_proxy_as_a_program(tmp_path):
     host, port = server.sockets[0].getsockname()
     faults = tmp_path / "faults.toml"
     faults.write_text('[[fault]]\nkind = "set_unit"\nvalue = 9\n')
-    words = (sys.executable, "-m", "simulators.faults.modbus_proxy", f"{host}:{port}", str(faults))
+    words = (sys.executable, "-m", "abbe.simulators.faults.modbus_proxy", f"{host}:{port}", str(faults))
     process = await asyncio.create_subprocess_exec(*words, stdout=asyncio.subprocess.PIPE)
     assert process.stdout is not None
     url = (await process.stdout.readline()).decode()

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simulators.arrays import F
-from simulators.hidden import cases
-from simulators.hidden.draws import CATALOGUE, OUTSIDE, RANDOM, config_of
-from simulators.hidden.effect import Hidden
-from simulators.hidden.plans import Machinery, Run, runs_of
-from simulators.hidden.rig import PerfectMachine, Rig
-from simulators.hidden.thermal import warmth
-from simulators.hidden.track import follow
-from simulators.scenario import Scenario
-from simulators.truth.draws import draw_machine
-from simulators.truth.machine import Geometry, Machine
+from abbe.simulators.arrays import F
+from abbe.simulators.hidden import cases
+from abbe.simulators.hidden.draws import CATALOGUE, OUTSIDE, RANDOM, config_of
+from abbe.simulators.hidden.effect import Hidden
+from abbe.simulators.hidden.plans import Machinery, Run, runs_of
+from abbe.simulators.hidden.rig import PerfectMachine, Rig
+from abbe.simulators.hidden.thermal import warmth
+from abbe.simulators.hidden.track import follow
+from abbe.simulators.scenario import Scenario
+from abbe.simulators.truth.draws import draw_machine
+from abbe.simulators.truth.machine import Geometry, Machine
 
 assert cases.ALL_EFFECTS
 CHAIN = "w-X-b-Y-Z-t"

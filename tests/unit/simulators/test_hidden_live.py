@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulators.hidden.picks import packaged, picked, winner
-from simulators.scenario import Scenario, ScenarioError, from_dict, load
-from simulators.sealed import truth
-from simulators.world import World
+from abbe.simulators.hidden.picks import packaged, picked, winner
+from abbe.simulators.scenario import Scenario, ScenarioError, from_dict, load
+from abbe.simulators.sealed import truth
+from abbe.simulators.world import World
 from tests.unit.simulators.conftest import QUIET
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.runs.cases import case_of
-from service.runs.exchange import read_folder
-from service.site import machine_from_doc
-from simulators.__main__ import main
-from simulators.hidden.cases import Case, make_case
-from simulators.hidden.draws import KINDS
-from simulators.hidden.plans import PLANS, Machinery, runs_of
-from simulators.hidden.suite import campaign, kinds_of, make_suite, run_file, sealed, write_case
+from abbe.service.runs.cases import case_of
+from abbe.service.runs.exchange import read_folder
+from abbe.service.site import machine_from_doc
+from abbe.simulators.__main__ import main
+from abbe.simulators.hidden.cases import Case, make_case
+from abbe.simulators.hidden.draws import KINDS
+from abbe.simulators.hidden.plans import PLANS, Machinery, runs_of
+from abbe.simulators.hidden.suite import campaign, kinds_of, make_suite, run_file, sealed, write_case
 
 TRUTH_KEYS = {"format", "case", "kind", "forms", "plan", "level", "verdict", "effects", "noise", "known_setup", "gap", "sealed_runs"}
 EFFECT_KEYS = {

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from simulators.laser.device import LaserResult
-from simulators.scenario import Scenario
-from simulators.world import World
+from abbe.simulators.laser.device import LaserResult
+from abbe.simulators.scenario import Scenario
+from abbe.simulators.world import World
 
 TOOL = np.array([0.0, 0.0, -120.0])
 

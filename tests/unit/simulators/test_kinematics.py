@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from simulators.scenario import AXES, from_dict
-from simulators.truth.draws import draw_machine
-from simulators.truth.machine import Geometry, Machine, rotate
+from abbe.simulators.scenario import AXES, from_dict
+from abbe.simulators.truth.draws import draw_machine
+from abbe.simulators.truth.machine import Geometry, Machine, rotate
 
 CHAINS = ["-".join(["w", *order, "t"]) for order in itertools.permutations("XYZb")]
 PIVOTS = {"X": [300, 250, -150], "Y": [100, 50, -250], "Z": [30, 320, 260]}

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from simulators.laser.wire import LaserRegisters
+from abbe.simulators.laser.wire import LaserRegisters
 
 
 @pytest.fixture

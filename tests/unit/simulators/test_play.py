@@ -1,6 +1,6 @@
 import numpy as np
 
-from simulators.truth.play import Play
+from abbe.simulators.truth.play import Play
 
 
 def test_lost_motion_and_hysteresis() -> None:

@@ -3,8 +3,8 @@ import tomllib
 
 import pytest
 
-from simulators import scenario
-from simulators.scenario import Scenario, ScenarioError, from_dict, load, parse_chain
+from abbe.simulators import scenario
+from abbe.simulators.scenario import Scenario, ScenarioError, from_dict, load, parse_chain
 
 
 def test_packaged_file_states_every_default() -> None:

@@ -282,7 +282,7 @@ def test_ends_with_its_parent(start) -> None:
 
 
 def refused(*arguments: str) -> str:
-    done = subprocess.run([sys.executable, "-m", "simulators", *arguments], capture_output=True, text=True, check=False, timeout=20)
+    done = subprocess.run([sys.executable, "-m", "abbe.simulators", *arguments], capture_output=True, text=True, check=False, timeout=20)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1
     return done.stderr

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from simulators.scenario import from_dict
-from simulators.truth import figures
-from simulators.truth.draws import draw_machine
-from simulators.truth.machine import Geometry, Machine
+from abbe.simulators.scenario import from_dict
+from abbe.simulators.truth import figures
+from abbe.simulators.truth.draws import draw_machine
+from abbe.simulators.truth.machine import Geometry, Machine
 
 
 def machine(scenario) -> Machine:
@@ -64,7 +64,7 @@ def test_body_diagonals_tell_the_sign_of_squareness(scenario) -> None:
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "simulators", "truth", *arguments], capture_output=True, text=True, check=False)
+    return subprocess.run([sys.executable, "-m", "abbe.simulators", "truth", *arguments], capture_output=True, text=True, check=False)
 
 
 def test_command_with_and_without_a_bank(tmp_path) -> None:

@@ -5,9 +5,9 @@ import struct
 import numpy as np
 import pytest
 
-from simulators.scenario import Scenario, from_dict
-from simulators.truth.figures import deviation
-from simulators.world import World
+from abbe.simulators.scenario import Scenario, from_dict
+from abbe.simulators.truth.figures import deviation
+from abbe.simulators.world import World
 
 OWNER = 7
 
