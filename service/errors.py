@@ -35,12 +35,12 @@ class FileFormatError(AbbeError):
 
 
 class StoreError(AbbeError):
-    """The database cannot be opened, is of another version, or does not hold what was asked for."""
+    """The database cannot be opened, is of another version, or holds what cannot be."""
 
     code = "STO-001"
 
 
-class NotStored(AbbeError):
+class NotStored(StoreError):
     """The database holds nothing under the number or name that was asked for."""
 
     code = "STO-002"
@@ -50,6 +50,12 @@ class Unusable(AbbeError):
     """What is stored cannot be shown as it was asked for: it is not complete enough, damaged, or of another kind."""
 
     code = "STO-003"
+
+
+class JournalChanged(StoreError):
+    """The push journal is not what was written: an entry was changed, removed or swapped."""
+
+    code = "STO-005"
 
 
 class BackupRefused(AbbeError):

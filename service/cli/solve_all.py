@@ -27,7 +27,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
 ) -> None:
     """Solve many campaigns of a database anew, each exactly as abbe solve does; exit code 1 if one was refused."""
     from abbe.service.cli.common import database_url, open_store
-    from abbe.service.errors import StoreError
+    from abbe.service.errors import NotStored
     from abbe.service.workflows.reanalysis import HEADINGS, row, tasks_of
     from abbe.service.workflows.reanalysis import solve_all as run
 
@@ -35,7 +35,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     with open_store(url) as store:
         tasks = tasks_of(store, url, pattern, model.value)
         if not tasks:
-            raise StoreError(f"no campaign matches {pattern!r} in {store.url}", "`abbe runs` lists what there is")
+            raise NotStored(f"no campaign matches {pattern!r} in {store.url}", "`abbe runs` lists what there is")
         answers = list(run(tasks, _executor(workers, dask), store if store_solutions else None))
     if as_json:
         print_json([answer.doc or {"campaign": answer.campaign, "refused": answer.refused} for answer in answers])

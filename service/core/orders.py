@@ -23,7 +23,7 @@ from abbe.service.channel.messages import Answer, PushNow, RollBack
 from abbe.service.channel.messages import Outcome as Word
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import BY_HAND, JobBook, Wish
-from abbe.service.errors import AbbeError, Aborted, Stopped, StoreError, TableRefused
+from abbe.service.errors import AbbeError, Aborted, NotStored, Stopped, TableRefused
 from abbe.service.events import Progress
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
@@ -143,9 +143,7 @@ class Orders(Patient):
             return refused
         try:
             against, after = await asyncio.to_thread(self._not_approved, asked.proposal)
-        except StoreError as error:
-            if not error.detail.startswith("no "):
-                raise
+        except NotStored as error:
             return _answer(asked.request, "unknown", error.detail)
         if against:
             return _answer(asked.request, "conflict", against)

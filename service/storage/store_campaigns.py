@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Insert, Select, insert, select
 
-from abbe.service.errors import StoreError
+from abbe.service.errors import NotStored, StoreError
 from abbe.service.storage.base import StoreBase
 from abbe.service.storage.records import CampaignRecord, Doc, MachineRecord
 from abbe.service.storage.tables import campaigns, machines
@@ -68,12 +68,12 @@ class CampaignStore(StoreBase):
 
         Raises
         ------
-        StoreError
+        NotStored
             If there is none.
         """
         found = self._read(lambda connection: connection.execute(select(machines).where(machines.c.id == machine_id)).first())
         if found is None:
-            raise StoreError(f"no machine {machine_id} in {self.url}")
+            raise NotStored(f"no machine {machine_id} in {self.url}")
         return MachineRecord(*found)
 
     def machines(self) -> list[MachineRecord]:
@@ -127,7 +127,7 @@ class CampaignStore(StoreBase):
 
         Raises
         ------
-        StoreError
+        NotStored
             If there is none.
         """
         text = str(name_or_id)
@@ -136,7 +136,7 @@ class CampaignStore(StoreBase):
         for query in (select(campaigns).where(condition) for condition in wanted):
             if found := self._campaigns(query):
                 return found[0]
-        raise StoreError(f"no campaign {name_or_id!r} in {self.url}", "`abbe runs` lists what there is")
+        raise NotStored(f"no campaign {name_or_id!r} in {self.url}", "`abbe runs` lists what there is")
 
     def campaigns(self) -> list[CampaignRecord]:
         """List all campaigns, oldest first.

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, func, insert, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql import Select
 
-from abbe.service.errors import ModelMovedOn, StoreError
+from abbe.service.errors import ModelMovedOn, NotStored, StoreError
 from abbe.service.storage.base import StoreBase
 from abbe.service.storage.records import DiscoveryRecord, Doc, ModelRecord, NewVersion, StepRecord
 from abbe.service.storage.store_campaigns import new_id
@@ -51,12 +51,12 @@ class DiscoveryStore(StoreBase):
 
         Raises
         ------
-        StoreError
+        NotStored
             If there is none.
         """
         found = self._rows(select(discoveries).where(discoveries.c.id == discovery_id))
         if not found:
-            raise StoreError(f"no discovery {discovery_id} in {self.url}")
+            raise NotStored(f"no discovery {discovery_id} in {self.url}")
         return DiscoveryRecord(*found[0])
 
     def discovery_steps(self, discovery_id: int) -> list[StepRecord]:

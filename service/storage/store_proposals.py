@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import insert, select
 
-from abbe.service.errors import StoreError
+from abbe.service.errors import NotStored
 from abbe.service.storage.base import StoreBase
 from abbe.service.storage.records import ApprovalRecord, Doc, ProposalRecord
 from abbe.service.storage.store_campaigns import new_id
@@ -37,11 +37,11 @@ class ProposalStore(StoreBase):
         return self._write(lambda connection: new_id(connection, insert(proposals).values(values)))
 
     def proposal(self, proposal_id: int) -> ProposalRecord:
-        """Read one proposal; StoreError if there is none."""
+        """Read one proposal; NotStored if there is none."""
         query = select(proposals).where(proposals.c.id == proposal_id)
         found = self._read(lambda connection: connection.execute(query).first())
         if found is None:
-            raise StoreError(f"no proposal {proposal_id} in {self.url}", "abbe comp show lists them")
+            raise NotStored(f"no proposal {proposal_id} in {self.url}", "abbe comp show lists them")
         return ProposalRecord(*found)
 
     def proposals(self, machine: str | None = None) -> list[ProposalRecord]:

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import insert, select, update
 from sqlalchemy.sql import Select
 
-from abbe.service.errors import StoreError
+from abbe.service.errors import NotStored
 from abbe.service.storage.base import StoreBase
 from abbe.service.storage.records import Doc, PushRecord, SolutionRecord, TableRecord, VerificationRecord
 from abbe.service.storage.store_campaigns import new_id
@@ -128,12 +128,12 @@ class ResultStore(StoreBase):
 
         Raises
         ------
-        StoreError
+        NotStored
             If there is no such push.
         """
         statement = update(pushes).where(pushes.c.id == push_id).values(state=state, doc=doc, updated_utc=self._now())
         if self._write(lambda connection: connection.execute(statement).rowcount) != 1:
-            raise StoreError(f"no push {push_id} in {self.url}")
+            raise NotStored(f"no push {push_id} in {self.url}")
 
     def pushes(self, machine_id: int | None = None) -> list[PushRecord]:
         """List pushes (into one machine), oldest first."""
@@ -204,5 +204,5 @@ class ResultStore(StoreBase):
     def _one(self, query: Select[Any], what: str) -> Any:
         found = self._read(lambda connection: connection.execute(query).first())
         if found is None:
-            raise StoreError(f"no {what} in {self.url}")
+            raise NotStored(f"no {what} in {self.url}")
         return found

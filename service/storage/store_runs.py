@@ -7,7 +7,7 @@ import zlib
 from sqlalchemy import Connection, Row, Select, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from abbe.service.errors import StoreError
+from abbe.service.errors import NotStored, StoreError
 from abbe.service.storage.owner import Owner, this_process
 from abbe.service.storage.records import FINISHED, RUNNING, ChunkRecord, Doc, ImportedRun, RunRecord
 from abbe.service.storage.store_campaigns import new_id
@@ -172,8 +172,10 @@ class RunStore(ChunkStore):
 
         Raises
         ------
+        NotStored
+            If there is none.
         StoreError
-            If there is none, or more than one.
+            If there is more than one.
         """
         text = str(id_or_label)
         name = campaigns.c.name + "/" + runs.c.label
@@ -181,7 +183,7 @@ class RunStore(ChunkStore):
         if not found and text.isdecimal():
             found = self._select(_runs_query().where(runs.c.id == int(text)))
         if not found:
-            raise StoreError(f"no run {text!r} in {self.url}", "`abbe runs` lists what there is")
+            raise NotStored(f"no run {text!r} in {self.url}", "`abbe runs` lists what there is")
         if len(found) > 1:
             names = ", ".join(f"{one.campaign}/{one.label}" for one in found)
             raise StoreError(f"run {text!r} exists more than once", f"write one of {names}")
@@ -268,7 +270,7 @@ def insert_imported(connection: Connection, campaign_id: int, run: ImportedRun, 
 def _require_running(connection: Connection, run_id: int) -> None:
     status = connection.execute(select(runs.c.status).where(runs.c.id == run_id)).scalar()
     if status is None:
-        raise StoreError(f"no run {run_id} in the database")
+        raise NotStored(f"no run {run_id} in the database")
     if status != RUNNING:
         raise StoreError(f"run {run_id} is closed ({status}): nothing can be added to it")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abbe.service.errors import StoreError, TableMismatch, TableRefused
+from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
 from abbe.service.push.entries import WORD, Entry, Journal, JournalBroken, check_chain, facts
 from abbe.service.push.states import TERMINAL, State
 
@@ -16,13 +16,13 @@ def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
 
     Raises
     ------
-    StoreError
+    JournalChanged
         The chain is broken: an entry was changed, removed or swapped.
     """
     try:
         check_chain(entries)
     except JournalBroken as error:
-        raise StoreError(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
+        raise JournalChanged(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
     numbers = sorted({e.push for e in entries} - {WORD})
     return {n: tuple(e for e in entries if e.push == n) for n in numbers}
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from abbe.service.config_schema import MachineFile
-from abbe.service.errors import FileFormatError, StoreError
+from abbe.service.errors import FileFormatError, NotStored, StoreError
 from abbe.service.report.document import Document
 from abbe.service.report.document_data import document_csv, document_json
 from abbe.service.report.document_page import document_html, document_pdf
@@ -46,8 +46,10 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
 
     Raises
     ------
+    NotStored
+        There is none.
     StoreError
-        There is none, or several machines have a push of this number.
+        Several machines have a push of this number.
     """
     if what == "discovery":
         return discovery_report(store, number, rules)
@@ -57,8 +59,9 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
     chains = {store.push_chain(n): n for n in names}  # machines that were renamed share one
     having = [n for chain, n in chains.items() if any(e.push == number for e in store.push_entries_of(chain))]
     if len(having) != 1:
-        told = f"machines {', '.join(having)} each have a push {number}" if having else f"no push {number} in the database"
-        raise StoreError(told, "say of which machine: --of NAME" if having else "abbe correct pushes tables; pushes count from 1")
+        if not having:
+            raise NotStored(f"no push {number} in the database", "abbe correct pushes tables; pushes count from 1")
+        raise StoreError(f"machines {', '.join(having)} each have a push {number}", "say of which machine: --of NAME")
     return push_report(store, having[0], number, rules)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from abbe.models.compensation.tables import NineTables
-from abbe.service.errors import StoreError, TableMismatch
+from abbe.service.errors import NotStored, TableMismatch
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import WORD, Entry, JournalBroken, check_chain, facts
 from abbe.service.push.states import TERMINAL, State
@@ -46,12 +46,12 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
 
     Raises
     ------
-    StoreError
+    NotStored
         There is none of this number.
     """
     record = next((v for v in store.verifications(limit=MANY) if v.id == number), None)
     if record is None:
-        raise StoreError(f"no verification {number} in the database", "abbe serve and abbe correct store verifications; count from 1")
+        raise NotStored(f"no verification {number} in the database", "abbe serve and abbe correct store verifications; count from 1")
     machine = store.machine(record.machine_id)
     campaign = None if record.campaign_id is None else from_store(store, store.campaign(record.campaign_id).name)
     runs = [] if campaign is None else campaign.runs
@@ -113,13 +113,13 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
 
     Raises
     ------
-    StoreError
+    NotStored
         The machine has no push of this number.
     """
     entries = read_entries(store, machine)
     journal = tuple(e for e in entries if e.push == number != WORD)
     if not journal:
-        raise StoreError(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {WORD})}, counted from 1")
+        raise NotStored(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {WORD})}, counted from 1")
     known = facts(journal)
     machine = str(known.get("machine", machine))  # as it was called then
     doc = _machine_doc(store, machine)

@@ -271,7 +271,7 @@ def test_a_journal_that_somebody_changed_is_told_on_the_report(stored, tmp_path)
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("nothing-of-that-name",), "STO-001"),
+        (("nothing-of-that-name",), "STO-002"),
         (("push",), "which push?"),
         (("push", "77"), "no push 77"),
         (("discovery", "77"), "no discovery 77"),

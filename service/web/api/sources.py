@@ -108,6 +108,8 @@ def as_stored() -> Iterator[None]:
     """
     try:
         yield
+    except NotStored:
+        raise
     except StoreError as error:
         if isinstance(error.__cause__, SQLAlchemyError):
             raise

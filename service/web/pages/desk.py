@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
-from abbe.service.errors import StoreError
+from abbe.service.errors import NotStored
 from abbe.service.storage.store import Store
 from abbe.service.web import words
 from abbe.service.web.api.sources import storable
@@ -110,7 +110,5 @@ def found(work: Callable[[int], T], number: int) -> T | None:
     """What the store has under a number; None where it has nothing. That it cannot be read is still an error."""
     try:
         return work(number)
-    except StoreError as error:
-        if error.detail.startswith("no "):
-            return None
-        raise
+    except NotStored:
+        return None

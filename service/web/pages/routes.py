@@ -12,7 +12,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 from pydantic import AfterValidator
 
-from abbe.service.errors import StoreError, TableRefused
+from abbe.service.errors import NotStored, StoreError, TableRefused
 from abbe.service.report.document_data import shown
 from abbe.service.report.palette import style_rules
 from abbe.service.users.roles import Permission
@@ -150,10 +150,8 @@ def _add_approval(app: FastAPI, desk: Desk) -> None:
             await desk.read(approve_as, desk.store, number, name, account, hours)
         except TableRefused as error:
             return problem(409, str(error), error.code)
-        except StoreError as error:
-            if error.detail.startswith("no "):
-                return problem(404, error.detail, error.code)
-            raise
+        except NotStored as error:
+            return problem(404, error.detail, error.code)
         return RedirectResponse(f"/proposal?id={number}", 303)
 
 

@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
-from abbe.service.errors import StoreError
+from abbe.service.errors import JournalChanged
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import needs
 from abbe.service.web.api.sources import Sources
@@ -37,9 +37,7 @@ def add_table_screen(app: FastAPI, env: Environment, door: Door, source: Source,
     async def table() -> HTMLResponse:
         try:
             told = await desk.read(story, sources.store, sources.machine, sources.control)
-        except StoreError as error:
-            if not error.detail.startswith("the push journal is not"):
-                raise
+        except JournalChanged as error:
             return await desk.show("table.html", 409, broken=error.detail, told=None)
         status = await source.status()
         return await desk.show(

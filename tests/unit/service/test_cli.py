@@ -114,8 +114,8 @@ def test_check_config_mistakes(abbe: Abbe, machine: Path) -> None:
         (["runs", "--db", "sqlite://", "--machine", "m.toml"], "error CFG-001: --db and --machine both name a database"),
         (["runs", "--machine", "m.toml"], "error CFG-001: machine file m.toml does not exist"),
         (["runs", "--db", "postgresql://me:topsecret@127.0.0.1:1/x"], "me:***@127.0.0.1:1/x"),
-        (["show", "r01", "--db", "sqlite://"], "error STO-001: no run 'r01' in sqlite://"),
-        (["export", "c1", "out", "--db", "sqlite://"], "error STO-001: no campaign 'c1' in sqlite://"),
+        (["show", "r01", "--db", "sqlite://"], "error STO-002: no run 'r01' in sqlite://"),
+        (["export", "c1", "out", "--db", "sqlite://"], "error STO-002: no campaign 'c1' in sqlite://"),
         (["import", "nowhere", "--db", "sqlite://"], "error FMT-001: nowhere/campaign.json: no such file"),
     ],
 )

@@ -86,7 +86,7 @@ def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[An
 
 def test_bad_input_is_one_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:
     for words, told in (
-        (["solve-all", "july-*", "--store", url], "error STO-001: no campaign matches 'july-*'"),
+        (["solve-all", "july-*", "--store", url], "error STO-002: no campaign matches 'july-*'"),
         (["solve-all", "--workers", "2", "--dask", "tcp://127.0.0.1:1", "--store", url], "error CFG-001: --workers and --dask both say"),
     ):
         assert run(words) == 2
