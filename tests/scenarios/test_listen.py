@@ -6,7 +6,6 @@ import threading
 import numpy as np
 import pytest
 
-from abbe.service.cli import run
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store
 from tests.unit.service_jobs.nc_reader import read_gcode
@@ -46,13 +45,14 @@ def sections(text):
     return out
 
 
-def test_a_program_that_the_operator_starts_gives_the_same_readings(abbe, start_sims, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    sims = start_sims("--seed", "4", "--speed", "5")
+def test_a_program_that_the_operator_starts_gives_the_same_readings(abbe, start_sims, tmp_path):
+    sims = start_sims("--seed", "4", "--speed", "3")  # a standstill has to last some polls beside other tests, too
     machine = str(sims.machine_file)
     (tmp_path / "r.toml").write_text(RECIPE)
     for words in (("--nc", "linuxcnc", "--out", "r.ngc"), ("--name", "driven")):
-        assert run(["measure", machine, "--recipe", "r.toml", *words]) == 0
+        process = abbe("measure", machine, "--recipe", "r.toml", *words)
+        assert process.communicate(timeout=200) is not None
+        assert process.returncode == 0
     to_line, line, to_diagonal, diagonal, rest = sections((tmp_path / "r.ngc").read_text())
     assert rest == []
     gone = [k for k, block in enumerate(diagonal) if block[0] == "rest"][3]  # the operator's program has lost one dwell

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.progress import REPEATED_S, Progress, read_seconds
+from tests.progress import REPEATED_S, Progress, in_turn, read_seconds
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -23,6 +23,18 @@ def counting(out: io.StringIO) -> Progress:
     progress = Progress(out, {"slow.py": 80.0, "quick.py": 20.0}, clock=0.0)
     progress.expect(["slow.py::a", "quick.py::a", "quick.py::b"])
     return progress
+
+
+def test_slow_files_come_first_and_those_that_talk_to_devices_are_spread_over_the_run() -> None:
+    seconds = {
+        "tests/system/a.py": 30.0,
+        "tests/push/b.py": 10.0,
+        "tests/system/c.py": 20.0,
+        "tests/unit/x.py": 40.0,
+        "tests/unit/y.py": 20.0,
+    }
+    wanted = ["tests/system/a.py", "tests/unit/x.py", "tests/system/c.py", "tests/unit/y.py", "tests/push/b.py"]
+    assert in_turn(sorted(seconds), seconds) == wanted
 
 
 def test_what_is_left_is_told_from_what_the_files_took_before() -> None:
