@@ -45,8 +45,8 @@ from abbe.service.workflows.base_table import Base
 from abbe.service.workflows.campaign_folder import from_folder
 from abbe.service.workflows.candidates import Promise, candidate_of
 from abbe.service.workflows.discover import discover, prepare
-from abbe.service.workflows.discovery_engine import catalogue
 from abbe.service.workflows.discovery_store import journal_of
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.workflows.report_parts import Rules
 from abbe.service.workflows.solve import Solved, solve_runs

@@ -76,8 +76,8 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
     """The job and where it stands."""
     from abbe.service.workflows.changed_since import since_of
     from abbe.service.workflows.discover import Journal, prepare
-    from abbe.service.workflows.discovery_engine import catalogue
     from abbe.service.workflows.discovery_store import journal_of
+    from abbe.service.workflows.effect_catalogue import catalogue
     from abbe.service.workflows.model_book import current
     from abbe.service.workflows.table_out import NO_TABLE, table_then
 

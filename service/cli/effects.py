@@ -15,7 +15,7 @@ def effects(
 ) -> None:
     """The catalogue of physical effects: how each looks, what shows it, how large it usually is, what to do about it."""
     from abbe.service.workflows.axis_test import SLOW_DRIFT
-    from abbe.service.workflows.discovery_engine import catalogue, effect_named, plugins
+    from abbe.service.workflows.effect_catalogue import catalogue, effect_named, plugins
     from abbe.service.workflows.effect_pages import HEADINGS, effect_doc, effect_lines, effect_row
 
     for broken in plugins().broken:

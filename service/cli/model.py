@@ -72,8 +72,8 @@ def diff_models(
 ) -> None:
     """Show what one version has more, less or of another size than another."""
     from abbe.service.report.numbers import with_uncertainty
-    from abbe.service.workflows.discovery_engine import catalogue
     from abbe.service.workflows.discovery_words import unit
+    from abbe.service.workflows.effect_catalogue import catalogue
     from abbe.service.workflows.model_book import differences, version
 
     with open_store(database_url(db, machine_file)) as store:

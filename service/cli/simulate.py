@@ -30,7 +30,7 @@ def simulate(
     from abbe.service.cli.progress import display
     from abbe.service.events import Progress
     from abbe.service.workflows.discover import prepare
-    from abbe.service.workflows.discovery_engine import catalogue
+    from abbe.service.workflows.effect_catalogue import catalogue
     from abbe.service.workflows.model_book import current
     from abbe.service.workflows.simulate import simulate as work
     from abbe.service.workflows.simulate import simulation_doc

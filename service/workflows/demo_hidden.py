@@ -23,8 +23,9 @@ from abbe.service.workflows.commission import commission
 from abbe.service.workflows.correct import Correction, correct
 from abbe.service.workflows.demo import bar_rate_hz, demo_site, write_machine_file
 from abbe.service.workflows.discover import Job, Journal, discover, prepare
-from abbe.service.workflows.discovery_engine import catalogue, search
+from abbe.service.workflows.discovery_engine import search
 from abbe.service.workflows.discovery_store import journal_of
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.measure import measure
 from abbe.service.workflows.model_book import current
 from abbe.service.workflows.new_measurement import NewMeasurement, judged_anew

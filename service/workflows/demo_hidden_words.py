@@ -7,8 +7,8 @@ from typing import Any
 
 from abbe.service.report.numbers import plain
 from abbe.service.workflows.demo_hidden import HiddenDemo
-from abbe.service.workflows.discovery_engine import catalogue
 from abbe.service.workflows.discovery_words import book_lines, effect_lines, next_of, verdict_of
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.new_measurement import NewGap
 
 FORMAT = "abbe-hidden-demo/1"

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from abbe.models.compensation.summary import SCALE_NOTE, mean_linear
 from abbe.models.compensation.tables import NineTables
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability import observability_of
 from abbe.service.report.model import (
     ArrowField,
-    Contribution,
     DemoReport,
-    ParameterRow,
     ResidualSeries,
     RunRow,
     SummaryRow,
@@ -24,6 +21,7 @@ from abbe.service.report.model import (
 )
 from abbe.service.workflows.correct import Correction
 from abbe.service.workflows.demo import DemoResult
+from abbe.service.workflows.solve_pages import contributions, parameter_rows
 from abbe.service.workflows.verify import Figures, figure_rows
 
 TRUTH = "sealed truth of the simulator"
@@ -79,48 +77,6 @@ def _title(name: str) -> str:
     if name == "body_diagonal_um":
         return "Largest body diagonal"
     return f"Body diagonal {name.removeprefix('diagonal_').removesuffix('_um')}"
-
-
-def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
-    """The parameters people ask for, with standard uncertainty: scales, squareness, lost motion, then the cups, bars and mirrors."""
-    e = joint.estimate
-    rows = []
-    for p in mean_linear(joint):
-        scale = p.name[0] == "E"
-        unit, note = ("µm/m", f"scale error, mean over the volume, {SCALE_NOTE}") if scale else ("µrad", "squareness, mean over the volume")
-        rows.append(ParameterRow(p.name, p.value * 1e6, p.u * 1e6, unit, note))
-    rows += [
-        ParameterRow(f"backlash {a}", v * 1e3, u * 1e3, "µm", "lost motion, not compensated") for a, (v, u) in joint.backlash_mm().items()
-    ]
-    for n in e.names:
-        if n.startswith(("cup_", "bar_length_")):
-            rows.append(ParameterRow(n.replace("_", " "), e.value(n) * 1e3, e.u(n) * 1e3, "µm", "set-up"))
-        elif n.startswith("tilt_"):
-            rows.append(ParameterRow(n.replace("_", " "), e.value(n) * 1e6, e.u(n) * 1e6, "µrad", "set-up"))
-    return rows
-
-
-def contributions(joint: JointSolution) -> list[Contribution]:
-    """Rms over its stroke of every translation and squareness, largest first (angles act through levers and are left to the map)."""
-    weights: dict[str, list[tuple[int, float]]] = {}
-    for k, term in enumerate(joint.terms):
-        if term.order == 0:
-            weights.setdefault(term.motion, []).append((k, float(joint.machine.length_mm[term.axis]) ** 2 / 12.0))
-        elif term.component < 3:
-            weights.setdefault(term.motion, []).append((k, 1.0 / (2 * term.order + 1)))
-    found = [_rms_of(joint, name, parts) for name, parts in weights.items()]
-    found += [Contribution(f"backlash {a}", abs(v) / 2 * 1e3, u / 2 * 1e3) for a, (v, u) in joint.backlash_mm().items()]
-    return sorted(found, key=lambda c: -(c.value_um or 0.0))
-
-
-def _rms_of(joint: JointSolution, name: str, parts: list[tuple[int, float]]) -> Contribution:
-    """Rms = sqrt(sum w c^2) and its standard uncertainty by propagation."""
-    index, w = [k for k, _ in parts], np.array([v for _, v in parts])
-    c = joint.coefficients[index]
-    rms = float(np.sqrt(np.sum(w * c**2)))
-    gradient = w * c / rms if rms > 0 else np.zeros_like(c)
-    u = float(np.sqrt(gradient @ joint.term_covariance[np.ix_(index, index)] @ gradient))
-    return Contribution(name, rms * 1e3, u * 1e3)
 
 
 def _arrows(truth: dict[str, Any]) -> ArrowField | None:

@@ -31,10 +31,11 @@ from abbe.service.workflows.changed_since import since_of
 from abbe.service.workflows.changed_words import changed_words
 from abbe.service.workflows.correct import check_promise
 from abbe.service.workflows.discover import discover, prepare
-from abbe.service.workflows.discovery_engine import catalogue, search
+from abbe.service.workflows.discovery_engine import search
 from abbe.service.workflows.discovery_states import entering
 from abbe.service.workflows.discovery_store import journal_of
 from abbe.service.workflows.discovery_words import size_text, verdict_of
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.linear_change import linear_words
 from abbe.service.workflows.measure import Manner, measure
 from abbe.service.workflows.model_book import REMEDIES, current, name_of

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from abbe.models.compensation.summary import SCALE_NOTE, mean_linear
 from abbe.models.geometry.bases import term_values
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
-from abbe.service.report.model import SETUP_NOTE, ParameterRow, ResidualSeries, RunRow
+from abbe.service.report.model import SETUP_NOTE, Contribution, ParameterRow, ResidualSeries, RunRow
 from abbe.service.report.solution_model import BudgetRow, Correlations, MotionCurve, MotionShare, Slice, SolutionPage, TableLine
 from abbe.service.site import Site
-from abbe.service.workflows.demo_report import contributions, parameter_rows
 from abbe.service.workflows.solve_report import HIDDEN_NOTE, Account, judged, noise_lines, outlier_lines, residual_lines, worst_line
 from abbe.service.workflows.solve_verdict import layout_line
 
@@ -155,3 +155,45 @@ def _provenance(doc: dict[str, Any], made: str) -> dict[str, str]:
         if doc["same_as"]:
             out["same readings and model as"] = "solution " + ", ".join(map(str, doc["same_as"]))
     return out
+
+
+def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
+    """The parameters people ask for, with standard uncertainty: scales, squareness, lost motion, then the cups, bars and mirrors."""
+    e = joint.estimate
+    rows = []
+    for p in mean_linear(joint):
+        scale = p.name[0] == "E"
+        unit, note = ("µm/m", f"scale error, mean over the volume, {SCALE_NOTE}") if scale else ("µrad", "squareness, mean over the volume")
+        rows.append(ParameterRow(p.name, p.value * 1e6, p.u * 1e6, unit, note))
+    rows += [
+        ParameterRow(f"backlash {a}", v * 1e3, u * 1e3, "µm", "lost motion, not compensated") for a, (v, u) in joint.backlash_mm().items()
+    ]
+    for n in e.names:
+        if n.startswith(("cup_", "bar_length_")):
+            rows.append(ParameterRow(n.replace("_", " "), e.value(n) * 1e3, e.u(n) * 1e3, "µm", "set-up"))
+        elif n.startswith("tilt_"):
+            rows.append(ParameterRow(n.replace("_", " "), e.value(n) * 1e6, e.u(n) * 1e6, "µrad", "set-up"))
+    return rows
+
+
+def contributions(joint: JointSolution) -> list[Contribution]:
+    """Rms over its stroke of every translation and squareness, largest first (angles act through levers and are left to the map)."""
+    weights: dict[str, list[tuple[int, float]]] = {}
+    for k, term in enumerate(joint.terms):
+        if term.order == 0:
+            weights.setdefault(term.motion, []).append((k, float(joint.machine.length_mm[term.axis]) ** 2 / 12.0))
+        elif term.component < 3:
+            weights.setdefault(term.motion, []).append((k, 1.0 / (2 * term.order + 1)))
+    found = [_rms_of(joint, name, parts) for name, parts in weights.items()]
+    found += [Contribution(f"backlash {a}", abs(v) / 2 * 1e3, u / 2 * 1e3) for a, (v, u) in joint.backlash_mm().items()]
+    return sorted(found, key=lambda c: -(c.value_um or 0.0))
+
+
+def _rms_of(joint: JointSolution, name: str, parts: list[tuple[int, float]]) -> Contribution:
+    """Rms = sqrt(sum w c^2) and its standard uncertainty by propagation."""
+    index, w = [k for k, _ in parts], np.array([v for _, v in parts])
+    c = joint.coefficients[index]
+    rms = float(np.sqrt(np.sum(w * c**2)))
+    gradient = w * c / rms if rms > 0 else np.zeros_like(c)
+    u = float(np.sqrt(gradient @ joint.term_covariance[np.ix_(index, index)] @ gradient))
+    return Contribution(name, rms * 1e3, u * 1e3)

@@ -12,7 +12,7 @@ from abbe.models.effects.effect import Effect
 from abbe.service.runs.cases import case_of
 from abbe.service.storage.store import Store
 from abbe.service.workflows.campaign_folder import Campaign
-from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.known_effects import applies, readings_of
 from abbe.service.workflows.model_book import current, no_table_lines
 from abbe.service.workflows.provenance import changed, machine_digest

@@ -11,8 +11,8 @@ from abbe.service.cli.solve import _print
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import InstrumentsDisagree
 from abbe.service.site import Site, machine_doc
-from abbe.service.workflows.demo_report import parameter_rows
 from abbe.service.workflows.solve import Solved, solve_runs
+from abbe.service.workflows.solve_pages import parameter_rows
 from abbe.service.workflows.solve_report import account, solution_doc
 from tests.physics.truth import MACHINE, Truth
 

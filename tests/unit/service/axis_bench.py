@@ -12,7 +12,8 @@ from abbe.service.events import ignore_progress
 from abbe.service.runs.cases import case_of
 from abbe.service.site import machine_from_doc
 from abbe.service.workflows.discovery_doc import finding_doc
-from abbe.service.workflows.discovery_engine import catalogue, search
+from abbe.service.workflows.discovery_engine import search
+from abbe.service.workflows.effect_catalogue import catalogue
 
 Doc = dict[str, Any]
 MACHINE: Doc = {

@@ -16,7 +16,7 @@ from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.storage.store import Store
 from abbe.service.workflows.campaign_folder import from_folder, from_store
 from abbe.service.workflows.discover import prepare
-from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.model_book import current, no_table_lines
 from abbe.service.workflows.table_out import NO_TABLE
 from abbe.service.workflows.taken_out import taken_out

@@ -23,11 +23,11 @@ from abbe.service.storage.store import Store
 from abbe.service.workflows.campaign_folder import from_folder
 from abbe.service.workflows.discover import Job, Journal, discover, prepare
 from abbe.service.workflows.discovery_doc import finite
-from abbe.service.workflows.discovery_engine import catalogue
 from abbe.service.workflows.discovery_pages import discovery_page, gap_rows
 from abbe.service.workflows.discovery_states import closed, entering, judge, not_entered, taken_back
 from abbe.service.workflows.discovery_store import StoredJournal, journal_of
 from abbe.service.workflows.discovery_words import lines_of, next_of, rival_lines, verdict_of
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.model_book import current
 from abbe.service.workflows.simulate import gap_doc, simulate
 from tests.unit.service.discovery_bench import Search, write_case

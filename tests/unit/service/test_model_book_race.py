@@ -21,8 +21,8 @@ from abbe.service.storage.records import Doc, NewVersion
 from abbe.service.storage.store import Store
 from abbe.service.workflows.campaign_folder import from_folder
 from abbe.service.workflows.discover import Job, discover, prepare
-from abbe.service.workflows.discovery_engine import catalogue
 from abbe.service.workflows.discovery_store import StoredJournal, journal_of
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.model_book import current, revert
 from tests.unit.service.discovery_bench import Search, write_case
 

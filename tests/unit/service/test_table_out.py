@@ -21,7 +21,7 @@ from abbe.service.storage.store import Store
 from abbe.service.workflows.base_table import Base
 from abbe.service.workflows.campaign_folder import from_folder, from_store
 from abbe.service.workflows.discover import prepare
-from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.proposals import check_same_table
 from abbe.service.workflows.simulate import simulate
 from abbe.service.workflows.table_out import NO_TABLE, STAYS, TABLE_OUT, Taken, as_left, less, table_line, table_then

@@ -14,8 +14,8 @@ from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.workflows import thinned as module
 from abbe.service.workflows.campaign_folder import from_folder
 from abbe.service.workflows.discover import Journal, discover, prepare
-from abbe.service.workflows.discovery_engine import catalogue
 from abbe.service.workflows.discovery_pages import discovery_page, page_facts
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.thinned import picked, thinned, thinning
 from tests.unit.service.discovery_bench import Search, circle, write_case
 

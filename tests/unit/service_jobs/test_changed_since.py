@@ -24,7 +24,7 @@ from abbe.service.workflows.campaign_folder import from_store, keep
 from abbe.service.workflows.changed_since import since_of
 from abbe.service.workflows.changed_words import changed_lines, changed_words
 from abbe.service.workflows.discover import Journal, discover, prepare
-from abbe.service.workflows.discovery_engine import catalogue
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.solve import solve_runs
 from abbe.service.workflows.solve_report import solution_doc
 from abbe.service.workflows.tables import table_image

@@ -37,8 +37,8 @@ from abbe.service.web.view import View
 from abbe.service.workflows.base_table import Base
 from abbe.service.workflows.campaign_folder import from_store
 from abbe.service.workflows.discover import discover, prepare
-from abbe.service.workflows.discovery_engine import catalogue
 from abbe.service.workflows.discovery_store import journal_of
+from abbe.service.workflows.effect_catalogue import catalogue
 from abbe.service.workflows.proposal_doc import digest_of_doc, doc_of, load
 from abbe.service.workflows.proposals import Gathered, make
 from tests.unit.service.discovery_bench import MACHINE, Search, write_case

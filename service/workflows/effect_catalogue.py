@@ -1,18 +1,22 @@
-"""A user's own effects: other packages offer them under the entry-point group ``abbe.effects`` (docs/how-to/own-effect.md)."""
+"""All effects that are known by name: ours, and those that other packages offer (docs/how-to/own-effect.md)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 import numpy as np
 
+from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.effect import Effect
 from abbe.models.effects.probe_paths import probe_paths
 from abbe.models.effects.self_test import declaration_faults, signal_faults
-from abbe.service.errors import EffectPluginBroken
+from abbe.service.errors import EffectPluginBroken, EffectUnknown
+from abbe.service.workflows.axis_test import SLOW_DRIFT
 
 GROUP = "abbe.effects"
 
@@ -23,6 +27,34 @@ class Plugins:
 
     effects: tuple[Effect, ...]
     broken: tuple[EffectPluginBroken, ...]
+
+
+def catalogue() -> tuple[Effect, ...]:
+    """All effects that are known by name: ours, then those of other packages that passed the self-test."""
+    return CATALOGUE + plugins().effects
+
+
+@cache
+def plugins() -> Plugins:
+    """Effects of other packages, looked up once per process, and why some were left out."""
+    return installed(e.name for e in CATALOGUE)
+
+
+def effect_named(name: str) -> Effect:
+    """One effect of the catalogue.
+
+    Raises
+    ------
+    EffectUnknown
+        There is none; what is spelt alike is told.
+    """
+    found = {e.name: e for e in (*catalogue(), SLOW_DRIFT)}
+    if name not in found:
+        close = get_close_matches(name, found, n=3, cutoff=0.4)
+        raise EffectUnknown(
+            f"the catalogue has no effect {name!r}", f"did you mean {', '.join(close)}?" if close else "`abbe effects` lists all"
+        )
+    return found[name]
 
 
 def installed(known: Iterable[str]) -> Plugins:
