@@ -23,41 +23,41 @@ import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.audit.chain import Event
+from abbe.service.campaigns.builtin_recipes import parted
 from abbe.service.channel.messages import PROTOCOL, Begin, NeedsTold, RulesTold, ScheduleTold
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.campaigns import Campaigns
 from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
 from abbe.service.core.jobs import JobBook
-from abbe.service.core.moment import Moments
-from abbe.service.core.open_ends import OpenEnds
 from abbe.service.core.orders import Ground, Hands, Orders
+from abbe.service.core.push_recovery import OpenEnds
 from abbe.service.core.rights import may, may_measure
 from abbe.service.core.setup import Setup
+from abbe.service.core.snapshot import Moments
 from abbe.service.core.systemd import notify
 from abbe.service.core.table_watch import TableWatch
 from abbe.service.core.watch import BoardWatch, StateTeller, VerifiedWatch
 from abbe.service.core.web_process import WebProcess
 from abbe.service.errors import ConfigError
+from abbe.service.jobs.at_start import push_is_open
 from abbe.service.mqtt.outbox import StoreOutbox
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.plant.gather import Gatherer
-from abbe.service.scheduler.desk import AlarmDesk, Telling
+from abbe.service.scheduler.alarm_manager import AlarmManager, Telling
+from abbe.service.scheduler.heartbeat import Station
 from abbe.service.scheduler.job import CheckJob
-from abbe.service.scheduler.keep import StoreLedger, StoreShelf
 from abbe.service.scheduler.loop import Scheduler, Terms
 from abbe.service.scheduler.ports import JobWatcher
-from abbe.service.scheduler.station import Station
+from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.engine import parse_url
 from abbe.service.storage.private import database_seen_by_others
+from abbe.service.tables.push_outcome import open_push
 from abbe.service.users.roles import Permission
+from abbe.service.verification.verified_by import verified_by
 from abbe.service.web.board import Board
 from abbe.service.web.listening import bind, check_certificate, check_exposure
 from abbe.service.web.view import View
-from abbe.service.workflows.at_start import push_is_open
-from abbe.service.workflows.push_word import open_push
-from abbe.service.workflows.shipped import parted
-from abbe.service.workflows.verified_by import verified_by
 
 if TYPE_CHECKING:
     from abbe.service.plant.opcua.server import OpcUaServer
@@ -154,12 +154,12 @@ class Service:
         view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock, setup.control)
         return OpcUaServer(setup.opcua, Gatherer(view.status, self._store, setup.control), self._clock, setup.machine, version("abbe"))
 
-    def _make_desk(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmDesk | None:
+    def _make_desk(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmManager | None:
         setup = self._setup
         if setup.duties is None:
             return None
         telling = Telling(setup.topics.alarm if self._publisher is not None else None, self._posted, book, watchers)
-        return AlarmDesk(self._store, self._clock, setup.machine, setup.schedules, setup.duties(self._store), telling)
+        return AlarmManager(self._store, self._clock, setup.machine, setup.schedules, setup.duties(self._store), telling)
 
     def _make_orders(self, book: AuditBook, watchers: list[JobWatcher]) -> Orders:
         setup, store = self._setup, self._store

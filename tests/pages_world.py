@@ -22,36 +22,36 @@ from abbe.drivers.cnc.tables import crc32, encode
 from abbe.drivers.errors import LinkDown
 from abbe.models.compensation.tables import NineTables, nine_tables, predict_residual, quantise
 from abbe.service.audit.book import AuditBook
+from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.candidates import Promise, candidate_of
+from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from abbe.service.discovery.discover import discover, prepare
+from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
+from abbe.service.identification.solve import Solved, solve_runs
+from abbe.service.identification.solve_report import solution_doc
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler import record
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.site import Site
 from abbe.service.storage.base import utc_text
+from abbe.service.tables.base_table import Base
+from abbe.service.tables.nine_tables import table_image
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
+from abbe.service.web.auth_middleware import CSRF_HEADER
+from abbe.service.web.authentication import COOKIE, Door, csrf_token
 from abbe.service.web.board import Board
-from abbe.service.web.door import COOKIE, Door, csrf_token
-from abbe.service.web.guard import CSRF_HEADER
 from abbe.service.web.listening import bind
 from abbe.service.web.logtail import LogTail
 from abbe.service.web.server import make_server
 from abbe.service.web.view import View
-from abbe.service.workflows.base_table import Base
-from abbe.service.workflows.campaign_folder import from_folder
-from abbe.service.workflows.candidates import Promise, candidate_of
-from abbe.service.workflows.discover import discover, prepare
-from abbe.service.workflows.discovery_store import journal_of
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
-from abbe.service.workflows.report_parts import Rules
-from abbe.service.workflows.solve import Solved, solve_runs
-from abbe.service.workflows.solve_report import solution_doc
-from abbe.service.workflows.tables import table_image
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.scenarios.campaign_files import measured
 from tests.system.serve_check import Result

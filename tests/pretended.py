@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abbe.drivers.api import Controller
 from abbe.drivers.registry import open_controller
+from abbe.service.compensation.commission import KIND
+from abbe.service.compensation.proved_levels import KIND as LEVELS
+from abbe.service.compensation.proved_levels import flags_of, identity
 from abbe.service.push.levels import Capabilities
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.workflows.commission import KIND
-from abbe.service.workflows.proved_levels import KIND as LEVELS
-from abbe.service.workflows.proved_levels import flags_of, identity
 
 NAME = f"{KIND} pretended"
 

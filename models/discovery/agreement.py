@@ -13,7 +13,7 @@ from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.case import CaseRun
 from abbe.models.discovery.noise import lone, unscaled
 from abbe.models.discovery.prediction import Solved, free_columns, left_over
-from abbe.models.discovery.scene import Scene
+from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.probability import f_above
 
 LAGS = 10

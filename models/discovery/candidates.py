@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.scene import Scene
-from abbe.models.discovery.space import rows_of
+from abbe.models.discovery.projection import rows_of
+from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.effects.effect import Effect, Form, Values
 
 UNNAMED = "unnamed_"

@@ -11,21 +11,21 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.agreement import agreements
 from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict, Where
+from abbe.models.discovery.experiment_design import Suspect, propose
+from abbe.models.discovery.experiment_unnamed import propose_unnamed
 from abbe.models.discovery.generic import is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
-from abbe.models.discovery.next_test import Suspect, propose
-from abbe.models.discovery.next_unnamed import propose_unnamed
+from abbe.models.discovery.localization import locate
 from abbe.models.discovery.prediction import Solved, left_over, predictions
 from abbe.models.discovery.residue import residues
 from abbe.models.discovery.rivals import EXCLUDED, Rival
-from abbe.models.discovery.scene import Scene
 from abbe.models.discovery.selection import Found
+from abbe.models.discovery.signal_localization import where_of_signal
 from abbe.models.discovery.strength import as_plain, shape_of, strength_of, true_to_form
 from abbe.models.discovery.unnamed import Structure, lacking, structures, told_of
 from abbe.models.discovery.unseen import unseen
 from abbe.models.discovery.variance import VarianceFinding
-from abbe.models.discovery.where import locate
-from abbe.models.discovery.where_signal import where_of_signal
+from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.probability import chi2_above
 
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6

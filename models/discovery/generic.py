@@ -14,7 +14,7 @@ from abbe.models.discovery.answer import Where
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.generic_scan import PERIODS_S, PITCHES_MM, Seen, bumps, bursts, periods, pitches, step_moments
 from abbe.models.discovery.generic_shapes import SIGNALS, lobe_latitude, place_at
-from abbe.models.discovery.where_signal import where_of_signal
+from abbe.models.discovery.signal_localization import where_of_signal
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES

@@ -2,7 +2,8 @@
 
 The search finds shapes that it knows, and a noise that is estimated from what is left holds those it does not. So the noise is asked of
 repeats where there are any, and "nothing is missing" is said only of residuals that agree with it: all together, run by run, and against
-position, direction, time, feed and temperature (`abbe.models.discovery.where.locate`); and of runs never fitted only if they agree, too.
+position, direction, time, feed and temperature (`abbe.models.discovery.localization.locate`); and of runs never fitted only if they agree,
+too.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Agreement, Where
 from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.discovery.localization import locate
 from abbe.models.discovery.noise import CLEARLY
-from abbe.models.discovery.scene import Scene
-from abbe.models.discovery.where import locate
+from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.machine import AXES
 from abbe.models.probability import f_above
 

@@ -12,7 +12,7 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.candidates import Pick, with_values
 from abbe.models.discovery.case import CaseRun
-from abbe.models.discovery.scene import Scene, ordered
+from abbe.models.discovery.whitened_problem import Scene, ordered
 from abbe.models.effects.effect import Signal
 
 STEPS = 2

@@ -9,7 +9,7 @@ from scipy import optimize
 
 from abbe.models.arrays import F2
 from abbe.models.discovery.candidates import Pick, gain_of, with_values
-from abbe.models.discovery.scene import Scene
+from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.effects.effect import Parameter
 
 SWEEPS = 2

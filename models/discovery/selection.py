@@ -12,7 +12,7 @@ from abbe.models.arrays import F2
 from abbe.models.discovery.candidates import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of
 from abbe.models.discovery.generic import generic_rivals
 from abbe.models.discovery.refine import refined
-from abbe.models.discovery.scene import Scene
+from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.effects.effect import Effect
 
 MOST_EFFECTS = 5

@@ -8,7 +8,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.candidates import Pick
-from abbe.models.discovery.scene import Scene
+from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.effects.effect import Effect, Family
 
 TRUE_TO_FORM: dict[Family, float] = {"drive": 0.03, "structure": 0.03, "thermal": 0.12, "instrument": 0.05, "geometry": 0.1}

@@ -15,11 +15,11 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Where
 from abbe.models.discovery.noise import Colour
+from abbe.models.discovery.signal_localization import where_of_signal
 from abbe.models.discovery.variance_mixture import contaminated
 from abbe.models.discovery.variance_places import NEAR_MM, bound_to_places
 from abbe.models.discovery.variance_rough import gated_roughness, loud_windows
 from abbe.models.discovery.variance_spectrum import fast, line_of_axis
-from abbe.models.discovery.where_signal import where_of_signal
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 

@@ -23,7 +23,7 @@ def list_alarms(
     """Alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
     from abbe.service.cli.common import open_store
     from abbe.service.config import load_machine
-    from abbe.service.workflows.alarms import alarm_doc, alarms_of, open_alarms
+    from abbe.service.verification.alarms import alarm_doc, alarms_of, open_alarms
 
     loaded = load_machine(machine)
     with open_store(loaded.database_url) as store:
@@ -47,9 +47,9 @@ def acknowledge(
 ) -> None:
     """Note that a person has seen an alarm. It stays active until a check clears it."""
     from abbe.service.cli.common import open_store
+    from abbe.service.compensation.proposals import login
     from abbe.service.config import load_machine
-    from abbe.service.workflows.alarms import acknowledge as work
-    from abbe.service.workflows.proposals import login
+    from abbe.service.verification.alarms import acknowledge as work
 
     loaded = load_machine(machine)
     with open_store(loaded.database_url) as store:

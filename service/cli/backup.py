@@ -10,7 +10,7 @@ import typer
 from abbe.service.cli.common import JsonOption, print_json
 
 if TYPE_CHECKING:
-    from abbe.service.workflows.backup import Source
+    from abbe.service.backup.backup import Source
 
 StoreOption = Annotated[
     str | None, typer.Option("--store", "--db", metavar="URL", help="Database, instead of a machine file's.", show_default=False)
@@ -26,8 +26,8 @@ def backup(
     as_json: JsonOption = False,
 ) -> None:
     """Copy database, samples that it does not have yet and audit into a new folder, while the service goes on. The copy is checked."""
+    from abbe.service.backup.backup import back_up
     from abbe.service.clock import SystemClock
-    from abbe.service.workflows.backup import back_up
 
     source, target = _places(places, store, "TARGET")
     doc = back_up(source, target, SystemClock().utc, with_key=not without_key)
@@ -57,8 +57,8 @@ def restore(
     as_json: JsonOption = False,
 ) -> None:
     """Bring a backup back, after its files, its schema and its audit were checked. Refused over a database that exists or is in use."""
+    from abbe.service.backup.restore import restore as bring_back
     from abbe.service.clock import SystemClock
-    from abbe.service.workflows.restore import restore as bring_back
 
     into, folder = _places(places, store, "BACKUP")
     done = bring_back(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
@@ -77,11 +77,11 @@ def restore(
 
 def _places(places: list[Path], store: str | None, last: str) -> tuple[Source, Path]:
     """Database and folder that the words name."""
+    from abbe.service.backup.backup import Source
     from abbe.service.capture.settings import CaptureSettings
     from abbe.service.config import load_machine
     from abbe.service.errors import ConfigError
     from abbe.service.site import site_of
-    from abbe.service.workflows.backup import Source
 
     if len(places) != (2 if store is None else 1):
         raise ConfigError("a database and one folder are needed", f"write MACHINE.toml {last}, or --store URL {last}")

@@ -64,8 +64,8 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
 ) -> None:
     """Write the best tables that a control can hold, with what each kind of table would leave."""
     from abbe.service.clock import SystemClock
-    from abbe.service.workflows.comp_export import control_for, export, formats_in, identified, reference_of, write_files
-    from abbe.service.workflows.comp_signed import Seal, check_signing, sign_files
+    from abbe.service.compensation.comp_export import control_for, export, formats_in, identified, reference_of, write_files
+    from abbe.service.compensation.comp_signed import Seal, check_signing, sign_files
 
     doc = _solution(solution, db, machine)
     known = identified(doc)
@@ -108,9 +108,9 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     and how they differ from a solution's.
     """
     from abbe.service.clock import SystemClock
+    from abbe.service.compensation.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
+    from abbe.service.compensation.comp_signed import Asked, standing
     from abbe.service.formats.compare import check_same
-    from abbe.service.workflows.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
-    from abbe.service.workflows.comp_signed import Asked, standing
 
     control, known, at = control_for(form), None, reference_of(reference)
     if solution is not None:
@@ -137,7 +137,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
 
 
 def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, Any]:
-    from abbe.service.workflows.comp_export import solution_document
+    from abbe.service.compensation.comp_export import solution_document
 
     def stored(number: int) -> dict[str, Any]:
         with open_store(database_url(db, machine)) as store:
@@ -148,8 +148,8 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
 
 def _fresh(source: str, db: str | None, machine: Path | None, *, said_so: bool) -> bool:
     """Whether a solution is known to have been measured without a correction; refused where there was one."""
-    from abbe.service.workflows.comp_export import solution_document
-    from abbe.service.workflows.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
+    from abbe.service.compensation.comp_export import solution_document
+    from abbe.service.tables.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
 
     if not source.isdigit():
         return check_fresh(tables_of(solution_document(source, lambda _: {})), no_images, said_so=said_so)

@@ -10,9 +10,9 @@ from abbe.service.cli.common import JsonOption, print_json, print_table
 from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session
 
 if TYPE_CHECKING:
+    from abbe.service.compensation.commission import Proved
+    from abbe.service.compensation.commission_levels import Levels
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.commission import Proved
-    from abbe.service.workflows.commission_levels import Levels
 
 ALLOWED = {3: "unattended pushes", 2: "pushes that a person attends", 1: "no push", 0: "no push: read and export only"}
 
@@ -36,12 +36,12 @@ def commission(
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
     from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.compensation.commission import commission as work_commission
+    from abbe.service.compensation.commission_levels import commission_levels
+    from abbe.service.compensation.proved_levels import check_level
     from abbe.service.config import load_machine
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.commission import commission as work_commission
-    from abbe.service.workflows.commission_levels import commission_levels
-    from abbe.service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)

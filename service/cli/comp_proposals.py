@@ -11,9 +11,9 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, databas
 from abbe.service.cli.measure import MachineArgument, ready_session
 
 if TYPE_CHECKING:
+    from abbe.service.compensation.proposal_doc import Proposed
+    from abbe.service.compensation.proposals import Made
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.proposal_doc import Proposed
-    from abbe.service.workflows.proposals import Made
 
 ProposalArgument = Annotated[int, typer.Argument(metavar="PROPOSAL", help="Number of a proposal; abbe comp show lists them.")]
 
@@ -28,11 +28,11 @@ def propose(
 
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
+    from abbe.service.compensation.proposals import gather, make
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.proposals import gather, make
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
@@ -71,7 +71,7 @@ def show_proposals(
     as_json: JsonOption = False,
 ) -> None:
     """Proposals: what they promise, with uncertainty, where they stand, what spoke against them."""
-    from abbe.service.workflows.proposal_doc import load
+    from abbe.service.compensation.proposal_doc import load
 
     with open_store(database_url(db, machine)) as store:
         if proposal is None:
@@ -94,8 +94,8 @@ def show_proposals(
 
 
 def _print_list(store: Store, *, as_json: bool) -> None:
+    from abbe.service.compensation.proposal_doc import load
     from abbe.service.errors import StoreError
-    from abbe.service.workflows.proposal_doc import load
 
     rows: list[dict[str, Any]] = []
     for record in store.proposals():
@@ -122,9 +122,9 @@ def diff(
     as_json: JsonOption = False,
 ) -> None:
     """What a proposal changes: each of the nine tables in numbers, and as a picture."""
-    from abbe.service.report.page_file import write_page
-    from abbe.service.workflows.proposal_diff import HEADINGS, compare, diff_html, diff_json, largest, rows
-    from abbe.service.workflows.proposal_doc import load
+    from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_html, diff_json, largest, rows
+    from abbe.service.compensation.proposal_doc import load
+    from abbe.service.rendering.page_file import write_page
 
     with open_store(database_url(db, machine)) as store:
         found = compare(store, proposal, other)
@@ -149,12 +149,12 @@ def approve(
 ) -> None:
     """Approve exactly this table on exactly this base, for this machine, under these limits (exit code 1: it cannot be approved)."""
     from abbe.service.clock import SystemClock
+    from abbe.service.compensation.proposal_checks import approve as work_approve
+    from abbe.service.compensation.proposal_doc import load
+    from abbe.service.compensation.proposal_states import check_waiting
+    from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
-    from abbe.service.workflows.proposal_checks import approve as work_approve
-    from abbe.service.workflows.proposal_doc import load
-    from abbe.service.workflows.proposal_states import check_waiting
-    from abbe.service.workflows.proposals import login
-    from abbe.service.workflows.push_word import open_pushes
+    from abbe.service.tables.push_outcome import open_pushes
 
     with open_store(database_url(db, machine)) as store:
         proposed = load(store, proposal)
@@ -188,11 +188,11 @@ def reject(
 ) -> None:
     """Reject a proposal for good: it cannot be approved or pushed any more (exit code 1: it cannot be rejected any more)."""
     from abbe.service.clock import SystemClock
+    from abbe.service.compensation.proposal_checks import reject as work_reject
+    from abbe.service.compensation.proposal_doc import load
+    from abbe.service.compensation.proposal_states import check_waiting
+    from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
-    from abbe.service.workflows.proposal_checks import reject as work_reject
-    from abbe.service.workflows.proposal_doc import load
-    from abbe.service.workflows.proposal_states import check_waiting
-    from abbe.service.workflows.proposals import login
 
     with open_store(database_url(db, machine)) as store:
         try:
@@ -215,8 +215,8 @@ def _row(store: Store, number: int, proposed: Proposed) -> dict[str, Any]:
     from datetime import UTC, datetime
 
     from abbe.service.clock import SystemClock
+    from abbe.service.compensation.proposal_states import standing
     from abbe.service.storage.base import utc_text
-    from abbe.service.workflows.proposal_states import standing
 
     now = standing(store, number, proposed, SystemClock().utc().timestamp())
     p, c = proposed.predicted, proposed.candidate

@@ -10,9 +10,9 @@ from abbe.service.cli.comp_proposals import ProposalArgument
 from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session, verification_before
 
 if TYPE_CHECKING:
+    from abbe.service.compensation.correct import Correction
+    from abbe.service.compensation.rollback import Back
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.correct import Correction
-    from abbe.service.workflows.rollback import Back
 
 
 def push(
@@ -30,14 +30,14 @@ def push(
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
     from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.compensation.commission import check_commissioned
+    from abbe.service.compensation.correct import push as work_push
+    from abbe.service.compensation.correct import reasons_now
+    from abbe.service.compensation.proved_levels import check_level
     from abbe.service.config import load_machine
     from abbe.service.errors import TableRefused
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.commission import check_commissioned
-    from abbe.service.workflows.correct import push as work_push
-    from abbe.service.workflows.correct import reasons_now
-    from abbe.service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
@@ -84,6 +84,7 @@ def rollback(
     from dataclasses import replace
 
     from abbe.service.cli.running import run_job
+    from abbe.service.compensation.rollback import rollback as work_rollback
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
     from abbe.service.errors import ConfigError
@@ -91,8 +92,7 @@ def rollback(
     from abbe.service.push.states import TERMINAL
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.rollback import rollback as work_rollback
-    from abbe.service.workflows.verified_by import measure_now
+    from abbe.service.verification.verified_by import measure_now
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)

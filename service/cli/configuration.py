@@ -16,11 +16,11 @@ def check_config(
     as_json: JsonOption = False,
 ) -> None:
     """Check a machine file and print its effective values and where each comes from; exit code 2 where something cannot work."""
+    from abbe.service.campaigns.plausibility import doubts
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.errors import ConfigError
     from abbe.service.secrets import mask_secrets, visible
-    from abbe.service.workflows.plausible import doubts
 
     loaded = load_machine(file)
     found = doubts(loaded.machine, loaded.path.resolve().parent, SystemClock().utc().date())

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from abbe.service.workflows.demo import DemoResult
-    from abbe.service.workflows.demo_hidden import HiddenDemo
+    from abbe.service.demo.demo import DemoResult
+    from abbe.service.demo.demo_hidden import HiddenDemo
 
 DEFAULT_FOLDER = "abbe-demo"
 
@@ -47,10 +47,10 @@ def demo(
 
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
-    from abbe.service.report.html import render_report
-    from abbe.service.workflows.demo import run_demo
-    from abbe.service.workflows.demo_report import demo_json, demo_report
-    from abbe.service.workflows.demo_serve import run_served_demo
+    from abbe.service.demo.demo import run_demo
+    from abbe.service.demo.demo_report import demo_json, demo_report
+    from abbe.service.demo.demo_serve import run_served_demo
+    from abbe.service.rendering.html import render_report
 
     folder = _folder(keep)
 
@@ -75,9 +75,9 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
 
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
-    from abbe.service.report.page_file import write_page
-    from abbe.service.workflows.demo_hidden import run_hidden_demo
-    from abbe.service.workflows.demo_hidden_words import hidden_json, story
+    from abbe.service.demo.demo_hidden import run_hidden_demo
+    from abbe.service.demo.demo_hidden_words import hidden_json, story
+    from abbe.service.rendering.page_file import write_page
 
     folder = _folder(keep)
     with display() as sink, work_folder(folder, keep) as work:
@@ -94,8 +94,8 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
 
 def hidden_page(result: HiddenDemo) -> str:
     """The report of what was found, as HTML; the truth is not in it, nobody at a real machine has one."""
-    from abbe.service.report.discovery_page import render_discovery
-    from abbe.service.workflows.discovery_pages import discovery_page, page_facts
+    from abbe.service.rendering.discovery_page import render_discovery
+    from abbe.service.report.discovery_pages import discovery_page, page_facts
 
     assert result.job is not None
     assert result.journal is not None
@@ -140,7 +140,7 @@ def print_result(out: Console, result: DemoResult) -> None:
     """Before and after as a table, then the verdict."""
     from rich.table import Table
 
-    from abbe.service.workflows.demo_report import demo_json, summary_rows
+    from abbe.service.demo.demo_report import demo_json, summary_rows
 
     table = Table(title=f"Simulated machine {result.seed}: before and after")
     for name in ("figure", "before", "after", "factor", "source"):

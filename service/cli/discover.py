@@ -16,11 +16,11 @@ from abbe.service.cli.solve import stored_campaign
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from abbe.service.campaign_data.campaign_folder import Campaign
+    from abbe.service.discovery.discover import Job, Journal
+    from abbe.service.discovery.discover_live import Added
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.campaign_folder import Campaign
-    from abbe.service.workflows.discover import Job, Journal
-    from abbe.service.workflows.discover_live import Added
 
 
 def discover(  # noqa: PLR0913 - one argument for each option
@@ -60,7 +60,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
 @contextmanager
 def opened(campaign: str, db: str | None, machine: Path | None, without: list[str]) -> Iterator[tuple[Campaign, Store | None]]:
     """A campaign and the store it belongs to; a folder's is None where no database is named."""
-    from abbe.service.workflows.campaign_folder import from_folder, is_folder
+    from abbe.service.campaign_data.campaign_folder import from_folder, is_folder
 
     if is_folder(campaign):
         found = from_folder(Path(campaign)).without(without)
@@ -74,12 +74,12 @@ def opened(campaign: str, db: str | None, machine: Path | None, without: list[st
 
 def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
     """The job and where it stands."""
-    from abbe.service.workflows.changed_since import since_of
-    from abbe.service.workflows.discover import Journal, prepare
-    from abbe.service.workflows.discovery_store import journal_of
-    from abbe.service.workflows.effect_catalogue import catalogue
-    from abbe.service.workflows.model_book import current
-    from abbe.service.workflows.table_out import NO_TABLE, table_then
+    from abbe.service.discovery.changed_since import since_of
+    from abbe.service.discovery.discover import Journal, prepare
+    from abbe.service.discovery.discovery_store import journal_of
+    from abbe.service.effects.effect_catalogue import catalogue
+    from abbe.service.effects.model_book import current
+    from abbe.service.identification.table_removal import NO_TABLE, table_then
 
     base = None if store is None else current(store, campaign.site.name)
     table = NO_TABLE if store is None else table_then(store, campaign)
@@ -90,8 +90,8 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
 
 def _live_needs(campaign: str, machine: Path | None) -> None:
     """Before anything is read: --live needs a machine and a campaign that was measured on it."""
+    from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.errors import ConfigError
-    from abbe.service.workflows.campaign_folder import is_folder
 
     if machine is None:
         raise ConfigError("--live needs the machine", "give --machine FILE")
@@ -107,10 +107,10 @@ def _gone_on(
 
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
+    from abbe.service.discovery.discover_live import ROUNDS, added, next_search, rounds
+    from abbe.service.discovery.discovery_store import StoredJournal
+    from abbe.service.discovery.experiment_recipes import next_plan
     from abbe.service.site import site_of
-    from abbe.service.workflows.discover_live import ROUNDS, added, next_search, rounds
-    from abbe.service.workflows.discovery_store import StoredJournal
-    from abbe.service.workflows.next_recipes import next_plan
 
     site = site_of(load_machine(machine).machine)
     job, journal, finding = at
@@ -144,7 +144,7 @@ def _measured(store: Store, site: Site, campaign: Campaign, what: Added, *, acce
     from abbe.service.cli.measure import ready_session
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
-    from abbe.service.workflows.discover_live import measure_added
+    from abbe.service.discovery.discover_live import measure_added
 
     if what.begun is not None:
         done = len(what.plan.tests) - (0 if what.left is None else len(what.left.tests))
@@ -167,8 +167,8 @@ def _measured(store: Store, site: Site, campaign: Campaign, what: Added, *, acce
 def _searched(job: Job, journal: Journal) -> dict[str, Any]:
     """The finding, with progress on stderr; Ctrl-C says what is kept."""
     from abbe.service.cli.progress import display
-    from abbe.service.workflows.discover import discover as work
-    from abbe.service.workflows.discovery_engine import search
+    from abbe.service.discovery.discover import discover as work
+    from abbe.service.discovery.discovery_engine import search
 
     with display() as sink:
         try:
@@ -187,9 +187,9 @@ def _searched(job: Job, journal: Journal) -> dict[str, Any]:
 def _written(job: Job, journal: Journal, finding: dict[str, Any], json_file: Path | None, report: Path | None) -> None:
     """Files that were asked for, each whole or not at all."""
     from abbe.service.clock import SystemClock
-    from abbe.service.report.discovery_page import render_discovery
-    from abbe.service.report.page_file import write_page
-    from abbe.service.workflows.discovery_pages import discovery_page, page_facts
+    from abbe.service.rendering.discovery_page import render_discovery
+    from abbe.service.rendering.page_file import write_page
+    from abbe.service.report.discovery_pages import discovery_page, page_facts
 
     if json_file is not None:
         text = json.dumps(finding["answer"], ensure_ascii=False) + "\n"
@@ -200,7 +200,7 @@ def _written(job: Job, journal: Journal, finding: dict[str, Any], json_file: Pat
 
 
 def _print(job: Job, journal: Journal, finding: dict[str, Any]) -> None:
-    from abbe.service.workflows.discovery_words import lines_of
+    from abbe.service.discovery.discovery_words import lines_of
 
     typer.echo(f"campaign {job.campaign.name}: {len(finding['runs'])} runs, {len(job.effects)} effects in the catalogue")
     for line in job.flags:

@@ -14,9 +14,9 @@ def effects(
     as_json: JsonOption = False,
 ) -> None:
     """The catalogue of physical effects: how each looks, what shows it, how large it usually is, what to do about it."""
-    from abbe.service.workflows.axis_test import SLOW_DRIFT
-    from abbe.service.workflows.effect_catalogue import catalogue, effect_named, plugins
-    from abbe.service.workflows.effect_pages import HEADINGS, effect_doc, effect_lines, effect_row
+    from abbe.service.discovery.effect_pages import HEADINGS, effect_doc, effect_lines, effect_row
+    from abbe.service.effects.axis_test import SLOW_DRIFT
+    from abbe.service.effects.effect_catalogue import catalogue, effect_named, plugins
 
     for broken in plugins().broken:
         typer.echo(f"{broken.code}: {broken}", err=True)

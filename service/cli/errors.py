@@ -11,7 +11,7 @@ import typer
 from abbe.service.cli.common import JsonOption, print_table
 
 if TYPE_CHECKING:
-    from abbe.service.workflows.deviations import Deviations
+    from abbe.service.verification.deviations import Deviations
 
 ROWS = 20
 
@@ -24,7 +24,7 @@ def errors(
     as_json: JsonOption = False,
 ) -> None:
     """Deviation of the tool at points, for a machine whose error functions are known. Points outside the strokes are refused."""
-    from abbe.service.workflows.deviations import deviations, deviations_json
+    from abbe.service.verification.deviations import deviations, deviations_json
 
     found = deviations(machine, errors_file, points, exact=exact)
     if as_json:
@@ -36,7 +36,7 @@ def errors(
 
 
 def _print(found: Deviations) -> None:
-    from abbe.service.workflows.deviations import MEANING
+    from abbe.service.verification.deviations import MEANING
 
     count, norm, u = len(found.points.lines), found.norm_mm, found.u_mm
     headings = ["x", "y", "z", "dX", "dY", "dZ", "norm"]

@@ -21,6 +21,7 @@ def listen(
     accept_table: AcceptTable = False,
 ) -> None:
     """Listen to the laser while the operator runs the NC program of a recipe; its standstills become the readings."""
+    from abbe.service.campaigns import listen_campaign
     from abbe.service.cli.running import run_job
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
@@ -29,7 +30,6 @@ def listen(
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.workflows import listen_campaign
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)

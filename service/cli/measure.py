@@ -97,10 +97,10 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
 
     from abbe.service.clock import SystemClock
     from abbe.service.errors import MeasurementFault
+    from abbe.service.jobs.check import judged
     from abbe.service.runs.columns import load_run
     from abbe.service.scheduler.record import Occasion, found
     from abbe.service.scheduler.slots import Schedule
-    from abbe.service.workflows.check import judged
 
     record = store.campaign(campaign)
     started = datetime.fromisoformat(record.created_utc)
@@ -119,9 +119,9 @@ def _said_before(loaded: Loaded, site: Site, plan: CampaignPlan, *, dry: bool) -
 
     With a controller `measure` refuses it, after what an interrupted push left there is taken back.
     """
+    from abbe.service.campaigns.plausibility import certificates, unattended
     from abbe.service.clock import SystemClock
     from abbe.service.sequences.needed import check_configured, needed_by
-    from abbe.service.workflows.plausible import certificates, unattended
 
     needed = needed_by(plan, air=site.watching.air_c is not None)
     if dry or site.urls.cnc is None:
@@ -142,11 +142,11 @@ class ByHand:
 
 async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: dict[str, Any], said: ByHand) -> None:
     """The measurement itself, from the beginning or from where it was broken off."""
+    from abbe.service.campaigns.measure import Manner
+    from abbe.service.campaigns.measure import measure as work
+    from abbe.service.campaigns.resume import resume as find
     from abbe.service.cli.ask import console_confirm
     from abbe.service.cli.progress import display
-    from abbe.service.workflows.measure import Manner
-    from abbe.service.workflows.measure import measure as work
-    from abbe.service.workflows.resume import resume as find
 
     async def yes(_: str) -> bool:
         return True
@@ -173,7 +173,7 @@ def _source(recipe: str, helix: str, rate_hz: int) -> dict[str, Any]:
 
 def _begun(store: Store, campaign: str) -> dict[str, Any]:
     """What the plan of a campaign was made of that was broken off."""
-    from abbe.service.workflows.resume import begun_source
+    from abbe.service.campaigns.resume import begun_source
 
     return begun_source(store, campaign)
 
@@ -190,15 +190,15 @@ def correct(
     """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import run_job
     from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.compensation.commission import check_commissioned
+    from abbe.service.compensation.correct import Correction
+    from abbe.service.compensation.correct import correct as work_correct
+    from abbe.service.compensation.proposals import check_certificates
+    from abbe.service.compensation.proved_levels import check_level
     from abbe.service.config import load_machine
     from abbe.service.errors import TakenBack
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.commission import check_commissioned
-    from abbe.service.workflows.correct import Correction
-    from abbe.service.workflows.correct import correct as work_correct
-    from abbe.service.workflows.proposals import check_certificates
-    from abbe.service.workflows.proved_levels import check_level
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
@@ -234,11 +234,11 @@ def correct(
 
 async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[dict[str, Any]]:
     """Runs of a verification with the present table: of a campaign in the store, or measured now where none is named."""
+    from abbe.service.campaigns.measure import measure as work_measure
     from abbe.service.clock import SystemClock
+    from abbe.service.compensation.proposals import load_runs
     from abbe.service.sequences.campaigns import verification
     from abbe.service.sequences.check import paced
-    from abbe.service.workflows.measure import measure as work_measure
-    from abbe.service.workflows.proposals import load_runs
 
     if campaign:
         ids = [r.id for r in store.runs(campaign) if r.visible_status == "complete"]
@@ -255,9 +255,9 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
     ``accept_table``: the person at the console vouches for a table in force that this database did not push.
     """
     from abbe.service.cli.ask import whoever_is_there
-    from abbe.service.devices.alone import alone
-    from abbe.service.workflows.proposals import by_whom
-    from abbe.service.workflows.recovered import recovered_session
+    from abbe.service.compensation.proposals import by_whom
+    from abbe.service.compensation.recovered_session import recovered_session
+    from abbe.service.devices.machine_lock import alone
 
     def told(text: str) -> None:
         typer.echo(text, err=True)
@@ -274,7 +274,7 @@ def warn_of_open_push(url: str, site: Site) -> None:
     """
     from abbe.service.cli.common import open_store
     from abbe.service.errors import StoreError
-    from abbe.service.workflows.push_word import open_pushes
+    from abbe.service.tables.push_outcome import open_pushes
 
     try:
         store = open_store(url)

@@ -44,8 +44,8 @@ def show_model(
     as_json: JsonOption = False,
 ) -> None:
     """Show one version: its effects with their size, what takes them out, and the runs they came from."""
-    from abbe.service.workflows.discovery_words import size_text
-    from abbe.service.workflows.model_book import REMEDIES, name_of
+    from abbe.service.discovery.discovery_words import size_text
+    from abbe.service.effects.model_book import REMEDIES, name_of
 
     with open_store(database_url(db, machine_file)) as store:
         found = _version(store, machine, version)
@@ -71,10 +71,10 @@ def diff_models(
     as_json: JsonOption = False,
 ) -> None:
     """Show what one version has more, less or of another size than another."""
-    from abbe.service.report.numbers import with_uncertainty
-    from abbe.service.workflows.discovery_words import unit
-    from abbe.service.workflows.effect_catalogue import catalogue
-    from abbe.service.workflows.model_book import differences, version
+    from abbe.service.discovery.discovery_words import unit
+    from abbe.service.effects.effect_catalogue import catalogue
+    from abbe.service.effects.model_book import differences, version
+    from abbe.service.rendering.numbers import with_uncertainty
 
     with open_store(database_url(db, machine_file)) as store:
         a, b = version(store, machine, first), _version(store, machine, second)
@@ -101,7 +101,7 @@ def revert_model(
     machine_file: MachineOption = None,
 ) -> None:
     """Make an older version current again. Nothing is deleted: it is appended as a new version."""
-    from abbe.service.workflows.model_book import revert
+    from abbe.service.effects.model_book import revert
 
     with open_store(database_url(db, machine_file)) as store:
         number = revert(store, machine, version)
@@ -110,7 +110,7 @@ def revert_model(
 
 def _version(store: Any, machine: str, number: int | None) -> ModelRecord:
     """A version, or the current one."""
-    from abbe.service.workflows.model_book import current, version
+    from abbe.service.effects.model_book import current, version
 
     newest = current(store, machine)
     return version(store, machine, number if number is not None else (newest.version if newest is not None else 0))

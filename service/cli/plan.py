@@ -10,7 +10,7 @@ import typer
 from abbe.service.cli.common import JsonOption, print_json, print_table
 
 if TYPE_CHECKING:
-    from abbe.service.workflows.plan import Planned
+    from abbe.service.campaigns.plan import Planned
 
 HEADINGS = ("no", "label", "measurement", "min", "until min", "worst U µm", "mean U µm")
 
@@ -31,12 +31,12 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
+    from abbe.service.campaigns.plan import plan_doc, plan_for, plan_page
+    from abbe.service.campaigns.plan_instruments import read_instruments
     from abbe.service.cli.progress import display
     from abbe.service.config import load_machine
-    from abbe.service.report.page_file import write_page
+    from abbe.service.rendering.page_file import write_page
     from abbe.service.site import site_of
-    from abbe.service.workflows.plan import plan_doc, plan_for, plan_page
-    from abbe.service.workflows.plan_instruments import read_instruments
 
     site = site_of(load_machine(machine).machine)
     tools = read_instruments(instruments)
@@ -70,7 +70,7 @@ def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None,
 
 
 def _print(planned: Planned, out: Path | None, picture: Path | None) -> None:
-    from abbe.service.workflows.plan import BOUND_NOTE, goal_words, step_rows, temperature_words
+    from abbe.service.campaigns.plan import BOUND_NOTE, goal_words, step_rows, temperature_words
 
     print_table(HEADINGS, step_rows(planned.plan), f"{planned.plan.minutes:.0f} minutes, set-ups included")
     typer.echo(BOUND_NOTE)

@@ -55,9 +55,9 @@ class Rehearsal:
 
     def run(self, site: Site, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> None:
         """Print, draw or write it."""
-        from abbe.service.report.page_file import write_page
+        from abbe.service.rendering.page_file import write_page
+        from abbe.service.report.dry_run_page import dry_page
         from abbe.service.sequences.nc.write import nc_program
-        from abbe.service.workflows.dry_page import dry_page
 
         if self.nc and self.out is not None:
             made = nc_program(site.name, site.machine, plan, self.nc, site.nc)

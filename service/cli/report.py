@@ -10,8 +10,8 @@ import typer
 from abbe.service.cli.common import DbOption, MachineOption, database_url, open_store, run_or_campaign
 
 if TYPE_CHECKING:
-    from abbe.service.report.document import Document
-    from abbe.service.workflows.report_parts import Rules
+    from abbe.service.rendering.document import Document
+    from abbe.service.report.report_parts import Rules
 
 
 def report(
@@ -43,7 +43,7 @@ def report(
     the same data give the same bytes.
     """
     from abbe.service.config import load_machine
-    from abbe.service.workflows.report import default_name, form_of, rules_of, write_report
+    from abbe.service.report.report import default_name, form_of, rules_of, write_report
 
     for target in out or []:
         form_of(target)  # before the work: a wrong ending is told at once
@@ -59,9 +59,9 @@ def report(
 
 
 def _document(what: str, number: int | None, of: str | None, url: str, rules: Rules) -> Document:
+    from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.errors import ConfigError
-    from abbe.service.workflows.campaign_folder import is_folder
-    from abbe.service.workflows.report import NUMBERED, folder_report, numbered_report, stored_report
+    from abbe.service.report.report import NUMBERED, folder_report, numbered_report, stored_report
 
     if what in NUMBERED:
         if number is None:

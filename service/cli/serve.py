@@ -14,26 +14,26 @@ if TYPE_CHECKING:
 
     from abbe.service.capture.live import LiveFeed
     from abbe.service.channel.messages import MachineTold
+    from abbe.service.compensation.ordered_rollback import BackOrder
+    from abbe.service.compensation.push_approved import Order
     from abbe.service.config import Loaded
     from abbe.service.config_timetable import AlarmSection
     from abbe.service.core.campaigns import CampaignOrder, MeasureCampaign
     from abbe.service.core.orders import Hands
     from abbe.service.core.setup import Setup
     from abbe.service.events import ProgressSink
+    from abbe.service.jobs.guided_campaign import Led
+    from abbe.service.jobs.investigate import Note
     from abbe.service.mqtt.broker import Broker
     from abbe.service.plant.opcua.setup import OpcUaSetup
-    from abbe.service.scheduler.desk import Duties
+    from abbe.service.scheduler.alarm_manager import Duties
     from abbe.service.scheduler.ports import Check, CheckResult
     from abbe.service.scheduler.store import ServiceStore
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site
-    from abbe.service.workflows.alarm_states import Alarm
-    from abbe.service.workflows.bring_back import BackOrder
-    from abbe.service.workflows.investigate import Note
-    from abbe.service.workflows.led_campaign import Led
-    from abbe.service.workflows.push_approved import Order
-    from abbe.service.workflows.push_word import Outcome
+    from abbe.service.tables.push_outcome import Outcome
+    from abbe.service.verification.alarm_states import Alarm
 
 
 LONGEST_NAME = 180
@@ -73,21 +73,21 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
         A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: better now than at
         the first slot, at night.
     """
+    from abbe.service.campaigns.builtin_recipes import RECIPES, campaign_plan
+    from abbe.service.campaigns.plausibility import check_unattended, doubts
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
     from abbe.service.core.setup import Setup
+    from abbe.service.jobs.at_start import recover_at_start
+    from abbe.service.jobs.check import run_check
     from abbe.service.mqtt.topics import Topics
+    from abbe.service.report.report import rules_of
     from abbe.service.scheduler.ready import Ready, look_at
     from abbe.service.scheduler.timetable import schedules_of, windows_of
     from abbe.service.sequences.check import dry_run_campaign, paced
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import site_of
-    from abbe.service.workflows.at_start import recover_at_start
-    from abbe.service.workflows.check import run_check
-    from abbe.service.workflows.in_force import look_at_table
-    from abbe.service.workflows.plausible import check_unattended, doubts
-    from abbe.service.workflows.report import rules_of
-    from abbe.service.workflows.shipped import RECIPES, campaign_plan
+    from abbe.service.tables.in_force import look_at_table
 
     config = loaded.machine
     check_unattended(config, loaded.path.resolve().parent)
@@ -180,9 +180,9 @@ def duties_on(
     ``plan``: the full campaign; ``rate_hz``: of verifications; ``live``: is shown what the campaign's paths read.
     """
     from abbe.service.clock import SystemClock
-    from abbe.service.scheduler.desk import Duties
-    from abbe.service.workflows.investigate import Bench, investigate
-    from abbe.service.workflows.push_approved import push_approved
+    from abbe.service.compensation.push_approved import push_approved
+    from abbe.service.jobs.investigate import Bench, investigate
+    from abbe.service.scheduler.alarm_manager import Duties
 
     def duties(store: ServiceStore) -> Duties:
         clock = SystemClock()
@@ -201,9 +201,9 @@ def duties_on(
 def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]:
     """Return what a person can order of tables, given the service's store: a push only where the service does not push by itself."""
     from abbe.service.clock import SystemClock
+    from abbe.service.compensation.ordered_rollback import bring_back
+    from abbe.service.compensation.push_approved import push_approved
     from abbe.service.core.orders import Hands
-    from abbe.service.workflows.bring_back import bring_back
-    from abbe.service.workflows.push_approved import push_approved
 
     def on(store: ServiceStore) -> Hands:
         async def back(order: BackOrder) -> Outcome:
@@ -220,8 +220,8 @@ def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[ServiceStore], MeasureCampaign]:
     """Return how a full campaign is measured that a person starts, given the service's store."""
     from abbe.service.clock import SystemClock
-    from abbe.service.workflows.investigate import Bench
-    from abbe.service.workflows.led_campaign import full_campaign, led_campaign, named_now
+    from abbe.service.jobs.guided_campaign import full_campaign, led_campaign, named_now
+    from abbe.service.jobs.investigate import Bench
 
     def on(store: ServiceStore) -> MeasureCampaign:
         async def measure(order: CampaignOrder) -> Led:
@@ -236,9 +236,9 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
 
 def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
     """The full campaigns that can be started on this machine: the shipped one, and what the machine file names for alarms."""
+    from abbe.service.campaigns.builtin_recipes import IDENTIFICATION
+    from abbe.service.jobs.guided_campaign import full_campaign
     from abbe.service.sequences.check import dry_run_campaign, paced
-    from abbe.service.workflows.led_campaign import full_campaign
-    from abbe.service.workflows.shipped import IDENTIFICATION
 
     def fits(name: str) -> bool:
         try:
@@ -258,8 +258,8 @@ def _beside(machine_file: Path, name: str) -> str:
 
 def _fits(recipe: str, site: Site) -> bool:
     """Whether a recipe can be offered on this machine at all: its paths lie inside the strokes."""
+    from abbe.service.campaigns.builtin_recipes import recipe_plan
     from abbe.service.sequences.check import dry_run_campaign
-    from abbe.service.workflows.shipped import recipe_plan
 
     try:
         dry_run_campaign(site.machine, recipe_plan(recipe, site.machine), site.max_feed_mm_min)

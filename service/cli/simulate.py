@@ -11,8 +11,8 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, print_j
 from abbe.service.cli.discover import opened
 
 if TYPE_CHECKING:
-    from abbe.service.workflows.discover import Job
-    from abbe.service.workflows.simulate import Simulation
+    from abbe.service.discovery.discover import Job
+    from abbe.service.discovery.simulate import Simulation
 
 
 def simulate(
@@ -28,13 +28,13 @@ def simulate(
     The present model is what the campaign says, with the effects of the machine's model book.
     """
     from abbe.service.cli.progress import display
+    from abbe.service.discovery.discover import prepare
+    from abbe.service.discovery.simulate import simulate as work
+    from abbe.service.discovery.simulate import simulation_doc
+    from abbe.service.effects.effect_catalogue import catalogue
+    from abbe.service.effects.model_book import current
     from abbe.service.events import Progress
-    from abbe.service.workflows.discover import prepare
-    from abbe.service.workflows.effect_catalogue import catalogue
-    from abbe.service.workflows.model_book import current
-    from abbe.service.workflows.simulate import simulate as work
-    from abbe.service.workflows.simulate import simulation_doc
-    from abbe.service.workflows.table_out import NO_TABLE, table_then
+    from abbe.service.identification.table_removal import NO_TABLE, table_then
 
     with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
         sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
@@ -56,11 +56,11 @@ def simulate(
 
 def _write_report(job: Job, told: Simulation, target: Path) -> None:
     from abbe.service.clock import SystemClock
-    from abbe.service.report.discovery_page import render_discovery
-    from abbe.service.report.page_file import write_page
-    from abbe.service.workflows.discover import Journal
-    from abbe.service.workflows.discovery_pages import discovery_page, page_facts
-    from abbe.service.workflows.simulate import simulated_finding, verdict_line
+    from abbe.service.discovery.discover import Journal
+    from abbe.service.discovery.simulate import simulated_finding, verdict_line
+    from abbe.service.rendering.discovery_page import render_discovery
+    from abbe.service.rendering.page_file import write_page
+    from abbe.service.report.discovery_pages import discovery_page, page_facts
 
     facts, said = page_facts(job, Journal(), SystemClock().utc().isoformat(timespec="seconds"))
     finding = simulated_finding(job, told)
@@ -69,8 +69,8 @@ def _write_report(job: Job, told: Simulation, target: Path) -> None:
 
 
 def _print(doc: dict[str, Any]) -> None:
-    from abbe.service.report.numbers import plain
-    from abbe.service.workflows.simulate import verdict_line
+    from abbe.service.discovery.simulate import verdict_line
+    from abbe.service.rendering.numbers import plain
 
     version = (
         "" if doc["model_version"] is None else f", model version {doc['model_version']} ({', '.join(doc['known_effects']) or 'no effect'})"

@@ -15,10 +15,10 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, databas
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from abbe.service.campaign_data.campaign_folder import Campaign
+    from abbe.service.identification.solve import Solved
+    from abbe.service.identification.solve_report import Account
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.campaign_folder import Campaign
-    from abbe.service.workflows.solve import Solved
-    from abbe.service.workflows.solve_report import Account
 
 
 STAGES = 10
@@ -67,9 +67,9 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 
     A folder's result is stored only if --db or --machine names a database. A run that cannot be what it says is refused (exit code 2).
     """
-    from abbe.service.workflows.campaign_folder import from_folder, is_folder, keep
-    from abbe.service.workflows.table_out import table_then
-    from abbe.service.workflows.taken_out import taken_out
+    from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, keep
+    from abbe.service.identification.effect_removal import taken_out
+    from abbe.service.identification.table_removal import table_then
 
     wanted = _Wanted(model, tables, grid, nodes, unit_um * 1e-3, trials)
     if is_folder(campaign):
@@ -111,8 +111,8 @@ class _Wanted:
 @contextmanager
 def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
     """The store and its campaign of that name; what is neither a folder nor in the store is said in one line."""
+    from abbe.service.campaign_data.campaign_folder import from_store
     from abbe.service.errors import StoreError
-    from abbe.service.workflows.campaign_folder import from_store
 
     with ExitStack() as stack:
         try:
@@ -129,8 +129,8 @@ def _solved(campaign: Campaign, wanted: _Wanted) -> tuple[Account, dict[str, Any
     """The solution and its document, with progress on stderr."""
     from abbe.service.cli.progress import display
     from abbe.service.events import Progress
-    from abbe.service.workflows.solve import solve_runs
-    from abbe.service.workflows.solve_report import account, solution_doc
+    from abbe.service.identification.solve import solve_runs
+    from abbe.service.identification.solve_report import account, solution_doc
 
     with display() as sink:
         stages = iter(range(1, STAGES))
@@ -151,8 +151,8 @@ def _more(told: Account, wanted: _Wanted, say: Callable[[str], None]) -> dict[st
     out: dict[str, Any] = {}
     if not (wanted.tables or wanted.grid or wanted.trials):
         return out
-    from abbe.service.report.page_file import write_page
-    from abbe.service.workflows.solve_tables import grid_text, machine_grid, monte_carlo, table_rows
+    from abbe.service.identification.solve_tables import grid_text, machine_grid, monte_carlo, table_rows
+    from abbe.service.rendering.page_file import write_page
 
     if wanted.grid is not None:
         say(f"grid of {wanted.nodes} x {wanted.nodes} x {wanted.nodes} nodes")
@@ -167,17 +167,17 @@ def _more(told: Account, wanted: _Wanted, say: Callable[[str], None]) -> dict[st
 
 def _write_report(told: Account, doc: dict[str, Any], campaign: Campaign, target: Path) -> None:
     from abbe.service.clock import SystemClock
-    from abbe.service.report.page_file import write_page
-    from abbe.service.report.solution_page import render_solution
-    from abbe.service.workflows.solve_pages import solution_page
+    from abbe.service.rendering.page_file import write_page
+    from abbe.service.rendering.solution_page import render_solution
+    from abbe.service.report.solve_pages import solution_page
 
     made = SystemClock().utc().isoformat(timespec="seconds")
     write_page(render_solution(solution_page(told, doc, campaign.site, made)), target)
 
 
 def _print(told: Account, doc: dict[str, Any]) -> None:
-    from abbe.service.workflows.solve_report import noise_lines, outlier_lines, residual_lines, worst_line
-    from abbe.service.workflows.table_out import TABLE_OUT, table_line
+    from abbe.service.identification.solve_report import noise_lines, outlier_lines, residual_lines, worst_line
+    from abbe.service.identification.table_removal import TABLE_OUT, table_line
 
     typer.echo(f"campaign {doc['campaign']}: model {doc['model']}, {len(doc['runs'])} runs")
     _lines("look at these runs:", doc["flags"])
@@ -213,7 +213,7 @@ def _lines(heading: str, lines: list[str]) -> None:
 
 def _parameters(told: Account) -> None:
     from abbe.models.compensation.summary import SCALE_NOTE
-    from abbe.service.workflows.solve_report import HIDDEN_NOTE
+    from abbe.service.identification.solve_report import HIDDEN_NOTE
 
     status = {m.name: m.status for m in told.observability.motions}
     rows: list[list[str]] = []
@@ -230,7 +230,7 @@ def _parameters(told: Account) -> None:
 
 
 def _comparison(told: Account) -> None:
-    from abbe.service.workflows.solve import HELIX_NOTE, STEP_NOTE
+    from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE
 
     solved = told.solved
     labels = list(solved.helices)

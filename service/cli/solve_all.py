@@ -10,7 +10,7 @@ from abbe.service.cli.common import JsonOption, MachineOption, print_json, print
 from abbe.service.cli.solve import ModelName
 
 if TYPE_CHECKING:
-    from abbe.service.workflows.executors import Executor
+    from abbe.service.identification.executors import Executor
 
 
 def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
@@ -28,8 +28,8 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     """Solve many campaigns of a database anew, each exactly as abbe solve does; exit code 1 if one was refused."""
     from abbe.service.cli.common import database_url, open_store
     from abbe.service.errors import NotStored
-    from abbe.service.workflows.reanalysis import HEADINGS, row, tasks_of
-    from abbe.service.workflows.reanalysis import solve_all as run
+    from abbe.service.identification.reanalysis import HEADINGS, row, tasks_of
+    from abbe.service.identification.reanalysis import solve_all as run
 
     url = database_url(db, machine)
     with open_store(url) as store:
@@ -46,7 +46,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
 
 def _executor(workers: int, dask: str | None) -> Executor:
     from abbe.service.errors import ConfigError
-    from abbe.service.workflows.executors import Dask, Here, Processes
+    from abbe.service.identification.executors import Dask, Here, Processes
 
     if dask is None:
         return Here() if workers == 1 else Processes(workers)

@@ -16,13 +16,13 @@ def accept_table(
     """Say that the active table is right, so that work can go on: after an interrupted push that Abbe could not clear up, under whatever
     name it was begun, or where this database did not push the table. Who and when is kept in the push journal.
     """
+    from abbe.service.compensation.proposals import by_whom
+    from abbe.service.compensation.recover import accept
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls, open_session
     from abbe.service.errors import ConfigError
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.workflows.proposals import by_whom
-    from abbe.service.workflows.recover import accept
 
     if not yes:
         raise ConfigError("nothing was accepted", "look at the controller's active table, then add --yes")

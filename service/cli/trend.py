@@ -29,8 +29,8 @@ def trend(
     from abbe.service.config import load_machine
     from abbe.service.devices.urls import control_of
     from abbe.service.scheduler.store import ServiceStore
-    from abbe.service.workflows.trend_table import HEADINGS, as_doc, row, trends
-    from abbe.service.workflows.verified_by import measure_now, verified_by
+    from abbe.service.verification.trend_table import HEADINGS, as_doc, row, trends
+    from abbe.service.verification.verified_by import measure_now, verified_by
 
     loaded = load_machine(machine)
     since = _moment(after)

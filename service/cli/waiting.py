@@ -25,8 +25,8 @@ async def taken_back_when_safe(session: Session, store: Store, site: Site, wait_
     ends the waiting, with the same consequence.
     """
     from abbe.service.clock import SystemClock
+    from abbe.service.compensation.deferred_rollback import finish_when_safe
     from abbe.service.errors import StillActive
-    from abbe.service.workflows.pending import finish_when_safe
 
     try:
         yield

@@ -19,12 +19,12 @@ from abbe.service.core.jobs import BY_HAND, ByHand, Full
 from abbe.service.core.rights import person
 from abbe.service.errors import AbbeError, Aborted, Stopped
 from abbe.service.events import Progress, ProgressSink
+from abbe.service.jobs.guided_campaign import Led, is_full
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
 from abbe.service.scheduler.ports import JobWatcher, SlotState
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control, State
-from abbe.service.workflows.led_campaign import Led, is_full
 
 log = structlog.get_logger("abbe.campaign")
 

@@ -17,12 +17,12 @@ from typing import Protocol
 
 import structlog
 
+from abbe.service.campaigns.builtin_recipes import parted
 from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, JobSeen, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
 from abbe.service.scheduler.ports import Errand, JobKind, SlotState
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control, State
-from abbe.service.workflows.shipped import parted
 
 log = structlog.get_logger("abbe.jobs")
 

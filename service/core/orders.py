@@ -22,23 +22,23 @@ from abbe.service.audit.chain import Event
 from abbe.service.channel.messages import Answer, PushNow, RollBack
 from abbe.service.channel.messages import Outcome as Word
 from abbe.service.clock import Clock
+from abbe.service.compensation.ordered_rollback import BackOrder
+from abbe.service.compensation.proposal_doc import load
+from abbe.service.compensation.proposal_states import standing
+from abbe.service.compensation.push_approved import Order
+from abbe.service.compensation.rollback import Ordered
 from abbe.service.core.jobs import BY_HAND, JobBook, Wish
 from abbe.service.errors import AbbeError, Aborted, NotStored, Stopped, TableRefused
 from abbe.service.events import Progress
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
-from abbe.service.scheduler.keep import Patient
 from abbe.service.scheduler.ports import Doc, JobKind, JobWatcher, SlotState
+from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
-from abbe.service.workflows.bring_back import BackOrder
-from abbe.service.workflows.proposal_doc import load
-from abbe.service.workflows.proposal_states import standing
-from abbe.service.workflows.push_approved import Order
-from abbe.service.workflows.push_word import STOPPED, Outcome, in_force, last_push, ordered, put_right
-from abbe.service.workflows.rollback import Ordered
-from abbe.service.workflows.table_story import offered
+from abbe.service.tables.push_outcome import STOPPED, Outcome, in_force, last_push, ordered, put_right
+from abbe.service.tables.table_history import offered
 
 log = structlog.get_logger("abbe.orders")
 
@@ -88,7 +88,7 @@ class Ground:
     control: str = ""
 
 
-class Orders(Patient):
+class Orders(RetryingStore):
     """Takes orders and carries them out as jobs of the book.
 
     Parameters

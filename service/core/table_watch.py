@@ -14,9 +14,9 @@ from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
 from abbe.service.errors import AbbeError
 from abbe.service.scheduler.loop import Alarms
-from abbe.service.workflows.in_force import InForce, LookAtTable
-from abbe.service.workflows.table_gate import STRANGE as STRANGE_TABLE
-from abbe.service.workflows.verified_by import STRANGE
+from abbe.service.tables.in_force import InForce, LookAtTable
+from abbe.service.tables.table_gate import STRANGE as STRANGE_TABLE
+from abbe.service.verification.verified_by import STRANGE
 
 log = structlog.get_logger("abbe.table")
 
@@ -25,7 +25,7 @@ AGAIN_S = 1.0
 """A first difference is looked at once more after this: a push of another process may have ended between both readings."""
 CODE = STRANGE
 REMEDY = "find out who wrote it; restore the right table at the controller, or, if this one is right: abbe accept-table MACHINE.toml"
-"""Neither a rollback nor a push: both are refused while such a table is in force (`abbe.service.workflows.table_gate`)."""
+"""Neither a rollback nor a push: both are refused while such a table is in force (`abbe.service.tables.table_gate`)."""
 
 
 class TableWatch:

@@ -13,8 +13,8 @@ from abbe.service.events import Progress
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.scheduler.ports import Doc
 from abbe.service.scheduler.slots import Schedule
+from abbe.service.verification.verified_by import VerifiedBy
 from abbe.service.web.board import Board
-from abbe.service.workflows.verified_by import VerifiedBy
 
 LOOK_S = 5.0
 

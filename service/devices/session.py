@@ -67,7 +67,7 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First 
     ask : callable
         Asks the person at the console.
     first : callable, optional
-        Gets the open controller before any other device is opened (`abbe.service.workflows.recovered`). What it raises ends it.
+        Gets the open controller before any other device is opened (`abbe.service.compensation.recovered_session`). What it raises ends it.
 
     Raises
     ------

@@ -16,10 +16,10 @@ from abbe.service.papers.pictures import figures
 from abbe.service.papers.row import Row
 from abbe.service.papers.run import PaperResult
 from abbe.service.papers.words import NONE, check_cells, computed_cells, note, short
-from abbe.service.report.numbers import printable
-from abbe.service.report.page_file import write_page as write_text
-from abbe.service.report.palette import style_rules
-from abbe.service.report.plots.signed import signed_rules
+from abbe.service.rendering.numbers import printable
+from abbe.service.rendering.page_file import write_page as write_text
+from abbe.service.rendering.palette import style_rules
+from abbe.service.rendering.plots.signed import signed_rules
 
 _MARKS = {"reproduced": "✔", "consistent": "≈", "differs": "≠", "input": "▷", "not reproducible": "○"}
 _CHECK_MARKS = {"holds": "✔", "fails": "✘"}
@@ -56,7 +56,7 @@ def render_page(found: Sequence[PaperResult]) -> str:
 
 @cache
 def _environment() -> Environment:
-    loader = ChoiceLoader([PackageLoader("abbe.service.papers"), PackageLoader("abbe.service.report")])
+    loader = ChoiceLoader([PackageLoader("abbe.service.papers"), PackageLoader("abbe.service.rendering")])
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 

@@ -21,11 +21,11 @@ from abbe.service.papers.probe_example import EXAMPLE, example
 from abbe.service.papers.row import Paper
 from abbe.service.papers.words import minus, short
 from abbe.service.papers.yang_table3 import bar_line_um, restored_x_mm
-from abbe.service.report.plots.comparison import Comparison, comparison_plot
-from abbe.service.report.plots.contours import contour_plot
-from abbe.service.report.plots.deformed import deformed_grid
-from abbe.service.report.plots.facets import Surface, lobing_plot, surface_plot
-from abbe.service.report.plots.signed import SignedScale
+from abbe.service.rendering.plots.comparison import Comparison, comparison_plot
+from abbe.service.rendering.plots.contours import contour_plot
+from abbe.service.rendering.plots.deformed import deformed_grid
+from abbe.service.rendering.plots.facets import Surface, lobing_plot, surface_plot
+from abbe.service.rendering.plots.signed import SignedScale
 
 NODES = 5
 SURFACE_NODES = 41

@@ -14,8 +14,8 @@ from abbe.drivers.errors import DriverError, Rebooted, Refused
 from abbe.service.clock import Clock
 from abbe.service.push import operations as o
 from abbe.service.push.entries import Journal, facts
-from abbe.service.push.meaning import meaning_of_bytes
 from abbe.service.push.operations import Kind, Op, Outcome, Truth
+from abbe.service.push.semantic_digest import meaning_of_bytes
 from abbe.service.sequences.interlocks import MOVING, tripped
 
 LEASE_MS, BEAT_S = 60_000, 20.0

@@ -18,7 +18,7 @@ class Order:
     image : bytes
         As the controller will hold it, with its CRC-32 ``crc``.
     meaning : str
-        Digest of what the table means, computed from the tables and not from the image (`abbe.service.push.meaning`).
+        Digest of what the table means, computed from the tables and not from the image (`abbe.service.push.semantic_digest`).
     limits : str
         Digest of the limits that it was checked against.
     owner : int

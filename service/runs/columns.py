@@ -7,7 +7,7 @@ path's start is taken from the start document: ``path_start_us``, else ``clock.c
 ``path.measured``: first and last point of ``points_mm`` between which readings count; without it all do. A ball-bar run whose
 setup says how many ``samples`` make a reading was read at standstill, point by point: it has no ``path``, and its
 records stand where those of a laser run do.
-``path.pieces`` (run, to_mm) and ``path.offset_mm``: the path was broken off and went on (abbe.service.sequences.onward);
+``path.pieces`` (run, to_mm) and ``path.offset_mm``: the path was broken off and went on (abbe.service.sequences.path_resume);
 ``points_mm`` is its rest, and the readings of the broken runs belong to it up to those lengths. The end document of a broken run says how
 far it came at constant feed: ``path_start_us``, ``good_us``, ``box_boot_id``.
 ``clock_pairs`` of the end document: controller time (us) and arrival (host s) of its statuses; they check the sync line

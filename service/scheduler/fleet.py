@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any
 
-from abbe.service.scheduler.station import SILENT_AFTER
+from abbe.service.scheduler.heartbeat import SILENT_AFTER
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.records import StationRecord, VerificationRecord
-from abbe.service.workflows.trend_table import FigureTrend, trends
-from abbe.service.workflows.verified_by import LOOKED, VerifiedBy, of_push_taken_back, verified_by
+from abbe.service.verification.trend_table import FigureTrend, trends
+from abbe.service.verification.verified_by import LOOKED, VerifiedBy, of_push_taken_back, verified_by
 
 CHECKS = 400
 """So many checks of each machine are looked at for its trend, which uses no more (`abbe.models.trend.MOST_CHECKS`)."""

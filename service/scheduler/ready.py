@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from abbe.drivers.api import ControllerStatus
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
-from abbe.service.devices.alone import alone
+from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import AbbeError
 from abbe.service.scheduler.slots import Needs, Schedule

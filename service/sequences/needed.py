@@ -15,7 +15,7 @@ from abbe.drivers.errors import DriverError, ReplyTimeout, WrongDevice
 from abbe.drivers.fixture.driver import ConsoleFixture
 from abbe.service.devices.session import Session, raise_all
 from abbe.service.errors import AbbeError, ConfigError
-from abbe.service.sequences.rewind import BY_HAND
+from abbe.service.sequences.resume_plan import BY_HAND
 from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, ReadBar, ReadLaser, RecordPath, ZeroLaser
 
 CNC, BALLBAR, LASER, FIXTURE = "cnc", "ballbar", "laser", "fixture"

@@ -12,7 +12,7 @@ from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.guard import motion_guard
 from abbe.service.sequences.interlocks import HOLD, MOVING, PATH, check_interlocks
-from abbe.service.sequences.onward import Onward, SameStretch, Way
+from abbe.service.sequences.path_resume import Onward, SameStretch, Way
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
 

@@ -17,10 +17,10 @@ from abbe.service.sequences.control import Control
 from abbe.service.sequences.guard import motion_guard
 from abbe.service.sequences.interlocks import AT_WORK, PAUSED, PROGRAM, REMOTE, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
-from abbe.service.sequences.onward import Onward, Way
+from abbe.service.sequences.path_resume import Onward, Way
 from abbe.service.sequences.paths import follow_path, record_path
 from abbe.service.sequences.preconditions import Expected
-from abbe.service.sequences.rewind import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
+from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
 from abbe.service.sequences.standstill import read_bar
 from abbe.service.sequences.steps import (
     ChangeBar,

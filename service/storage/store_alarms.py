@@ -32,7 +32,7 @@ class AlarmStore(StoreBase):
         seq : int
             Number of the line: one more than the last that was read, so that whoever decided on old knowledge is refused.
         kind : str
-            What happened (`abbe.service.workflows.alarm_states`).
+            What happened (`abbe.service.verification.alarm_states`).
         doc : dict
             What is known of it.
         messages : sequence of (topic, document)

@@ -38,7 +38,7 @@ def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) 
     if own is not None:
         return own
     # A control that is nowhere noted: at a new address, or pushed into by an older version. The name's journal is its, unless a machine of
-    # another name has gone on with that. An open push in it is held against the control (`abbe.service.workflows.whose_push`).
+    # another name has gone on with that. An open push in it is held against the control (`abbe.service.tables.whose_push`).
     named = next((chain for chain, (name, _) in last.items() if name == machine), None)
     if named is not None:
         return named

@@ -15,6 +15,7 @@ from starlette.types import ASGIApp
 
 from abbe.service.plant.facts import FactsSource
 from abbe.service.plant.gather import Gatherer
+from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.roles import Permission
 from abbe.service.web import problems
@@ -22,11 +23,12 @@ from abbe.service.web.access import PUBLIC, needs
 from abbe.service.web.api.install import add_api
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.api.table_orders import add_table_orders
+from abbe.service.web.auth_middleware import Guard
+from abbe.service.web.authentication import Door
 from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_unavailable import add_silence
 from abbe.service.web.document import complete
-from abbe.service.web.door import Door
 from abbe.service.web.frame import Framed
-from abbe.service.web.guard import Guard
 from abbe.service.web.headers import SecurityHeaders
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
@@ -41,8 +43,6 @@ from abbe.service.web.pages.rehearsal import Rehearsals
 from abbe.service.web.pages.routes import add_pages
 from abbe.service.web.pages.table import add_table_screen
 from abbe.service.web.schemas import Health, Problem, Status, Verification, Verifications
-from abbe.service.web.silence import add_silence
-from abbe.service.workflows.report_parts import Rules
 
 PAGE_ROWS = 60
 

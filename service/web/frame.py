@@ -13,11 +13,11 @@ from starlette.requests import HTTPConnection
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from abbe.service.report.numbers import Unit
+from abbe.service.rendering.numbers import Unit
 from abbe.service.users.roles import Permission
 from abbe.service.web import language, units
-from abbe.service.web.door import csrf_token
-from abbe.service.web.guard import Visit
+from abbe.service.web.auth_middleware import Visit
+from abbe.service.web.authentication import csrf_token
 from abbe.service.web.language import DEFAULT, NAMES
 from abbe.service.web.origin import is_tls
 

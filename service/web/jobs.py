@@ -10,15 +10,15 @@ from typing import Annotated
 from fastapi import FastAPI, Header, HTTPException, Path, Request
 from fastapi.responses import JSONResponse, Response
 
+from abbe.service.campaigns.builtin_recipes import named, parted
 from abbe.service.channel.messages import Answer, How, JobSeen
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import needs
+from abbe.service.web.auth_middleware import Visit
 from abbe.service.web.core_line import CoreLine
-from abbe.service.web.guard import Visit
 from abbe.service.web.problems import problem
 from abbe.service.web.schemas import Problem
 from abbe.service.web.schemas_jobs import JobList, JobState, NewJob
-from abbe.service.workflows.shipped import named, parted
 
 STATUS = {"unknown": 404, "busy": 409, "forbidden": 403, "conflict": 409}
 NUMBER = Path(pattern="^[0-9a-f]{12}$", description="Number of the job")

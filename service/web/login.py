@@ -15,8 +15,8 @@ from starlette.requests import ClientDisconnect
 from abbe.service.users.lockout import Came
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import PUBLIC, needs
-from abbe.service.web.door import Door, csrf_token
-from abbe.service.web.guard import Visit
+from abbe.service.web.auth_middleware import Visit
+from abbe.service.web.authentication import Door, csrf_token
 from abbe.service.web.listening import is_local
 from abbe.service.web.origin import is_tls
 from abbe.service.web.problems import problem

@@ -16,9 +16,9 @@ from abbe.service.channel.messages import Moment
 from abbe.service.errors import CoreSilent
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.roles import Permission
+from abbe.service.verification.verified_by import verified_by
 from abbe.service.web.access import needs
 from abbe.service.web.core_line import CoreLine
-from abbe.service.workflows.verified_by import verified_by
 
 VERDICTS = ("pass", "fail", "cannot tell")
 

@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 
-from abbe.service.web import walls
+from abbe.service.web import import_guard
 
 
 def main() -> int:
@@ -16,7 +16,7 @@ def main() -> int:
     channel, listening = (socket.socket(fileno=int(word)) for word in sys.argv[1:3])
     # Ctrl-C at the terminal goes to both; the core decides when the page ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    walls.build()
+    import_guard.build()
     from abbe.service.logs import configure_logs
     from abbe.service.web.serving import serve_pages
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from abbe.service.campaigns.builtin_recipes import USUAL_HZ
 from abbe.service.web.schemas import Device, Job
-from abbe.service.workflows.shipped import USUAL_HZ
 
 LONGEST_RECIPE = 180
 """The channel takes words of 200 characters, and the rate stands behind the name."""

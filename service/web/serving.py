@@ -14,18 +14,18 @@ from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError, ChannelBroken
 from abbe.service.plant.gather import Gatherer
+from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.slots import Needs, Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
+from abbe.service.web.authentication import Door, Front
 from abbe.service.web.core_line import CoreLine
-from abbe.service.web.door import Door, Front
 from abbe.service.web.logtail import keep_log
 from abbe.service.web.pages.rehearsal import Rehearsals
 from abbe.service.web.server import Server, make_server
 from abbe.service.web.view import View
-from abbe.service.workflows.report_parts import Rules
 
 log = structlog.get_logger("abbe.web")
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from abbe.service.report.numbers import Unit, with_uncertainty
+from abbe.service.rendering.numbers import Unit, with_uncertainty
 from abbe.service.web.words import number
 
 METRIC, INCH = "mm", "inch"

@@ -11,11 +11,11 @@ from zoneinfo import ZoneInfo
 from abbe.service.clock import Clock
 from abbe.service.scheduler.slots import Schedule, cron_in_words
 from abbe.service.scheduler.store import ServiceStore
+from abbe.service.verification.alarm_states import folded, is_open
+from abbe.service.verification.alarms import alarm_doc
+from abbe.service.verification.verified_by import VerifiedBy, strange_table, verified_by
 from abbe.service.web import words
 from abbe.service.web.schemas import Alarm, Device, Due, Job, Mqtt, Status, Verification, Verified
-from abbe.service.workflows.alarm_states import folded, is_open
-from abbe.service.workflows.alarms import alarm_doc
-from abbe.service.workflows.verified_by import VerifiedBy, strange_table, verified_by
 
 
 class Standing(Protocol):

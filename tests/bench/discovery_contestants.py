@@ -18,10 +18,10 @@ from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidates import SEEN, UNNAMED
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import discover
-from abbe.models.discovery.scene import scene_of
 from abbe.models.discovery.selection import Contest
+from abbe.models.discovery.whitened_problem import scene_of
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.service.workflows.discovery_answer import answer_doc
+from abbe.service.discovery.discovery_answer import answer_doc
 
 MOST_GROUPS = 10
 """Forward selection stops here at the latest: twice as many as `discover` may name. Plain BIC would go on and only add wrong names."""

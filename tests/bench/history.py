@@ -17,7 +17,7 @@ from sqlalchemy import func, select
 from abbe.service.scheduler.fleet import fleet
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.tables import chunks, runs
-from abbe.service.workflows.trend_table import as_doc, trends
+from abbe.service.verification.trend_table import as_doc, trends
 from tests.bench.history_case import MONTH, START, History, build
 from tests.system.serve_bench import abbe
 

@@ -10,9 +10,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from abbe.service.identification.executors import Dask, Executor, Here, Processes
+from abbe.service.identification.reanalysis import Task, solve_all, tasks_of
 from abbe.service.storage.store import Store
-from abbe.service.workflows.executors import Dask, Executor, Here, Processes
-from abbe.service.workflows.reanalysis import Task, solve_all, tasks_of
 from tests.many_campaigns import dask_cluster, fill
 
 CAMPAIGNS = 16

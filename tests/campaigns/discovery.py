@@ -18,10 +18,10 @@ import numpy as np
 
 from abbe.models.discovery.discover import discover
 from abbe.models.effects.catalogue import CATALOGUE
+from abbe.service.discovery.discovery_doc import finding_doc
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
 from abbe.service.site import machine_from_doc
-from abbe.service.workflows.discovery_doc import finding_doc
 
 
 def answered(folder: Path, out: Path) -> tuple[str, float]:

@@ -20,10 +20,10 @@ import numpy as np
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.discover import discover
 from abbe.models.effects.catalogue import CATALOGUE
+from abbe.service.campaign_data.campaign_checks import check_files, refuse
 from abbe.service.errors import AbbeError
 from abbe.service.runs.cases import case_of
 from abbe.service.site import machine_from_doc
-from abbe.service.workflows.campaign_checks import check_files, refuse
 from abbe.simulators.hidden.draws import KINDS
 from abbe.simulators.hidden.suite import campaign, make_suite, run_file, sealed
 from tests.campaigns.discovery_judge import label

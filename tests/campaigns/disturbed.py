@@ -29,8 +29,12 @@ import numpy as np
 
 from abbe.drivers.errors import DriverError
 from abbe.models.machine import Machine
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.resume import resume
+from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import AbbeError, Interlock
+from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Suspending, Watching
@@ -38,10 +42,6 @@ from abbe.service.sequences.recipe_file import parse_recipe
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.recover import recover
-from abbe.service.workflows.resume import resume
-from abbe.service.workflows.solve import Solved, solve_runs
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
 from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.faults.on_sphere import looked_at

@@ -8,7 +8,7 @@ import sys
 from dataclasses import replace
 
 from abbe.service.clock import SystemClock
-from abbe.service.devices.alone import alone
+from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.scheduler.ready import Ready, look_at
 from abbe.service.scheduler.slots import Needs, Schedule

@@ -14,17 +14,17 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from abbe.service.devices.alone import alone
+from abbe.service.campaigns.campaign_run import Confirm
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.resume import resume
+from abbe.service.compensation.recover import recover
+from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.sequences.recipes import Circle, Diagonal, Helix, Linear
 from abbe.service.sequences.setups import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_run import Confirm
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.recover import recover
-from abbe.service.workflows.resume import resume
 from tests.faults.sequencer_world import MACHINE
 
 

@@ -13,6 +13,9 @@ import pytest
 
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.errors import DriverError, LinkDown, Rebooted, WrongDevice
+from abbe.service.campaigns.bar_link import MOST_BREAKS, BarBreaks
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.resume import resume
 from abbe.service.capture.recovery import ledger_of
 from abbe.service.errors import RunInterrupted, Stopped
 from abbe.service.runs.codec import decode_bar
@@ -22,9 +25,6 @@ from abbe.service.sequences.journal import HAND, INCIDENT, NoJournal
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import CampaignPlan, RecordPath
 from abbe.service.storage.store import Store
-from abbe.service.workflows.bar_link import MOST_BREAKS, BarBreaks
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.resume import resume
 from abbe.simulators.ballbar.wire import WITH_SETTINGS_BCD
 from tests.faults.sequencer_world import AtStep, Bench, bench, number, small
 from tests.faults.serial_rig import stage

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.errors import DriverError, Refused, ReplyTimeout, SettingsChanged, WrongDevice
+from abbe.service.campaigns.measure import measure
+from abbe.service.compensation.correct import correct, push
 from abbe.service.errors import ConfigError
 from abbe.service.events import ignore_progress
 from abbe.service.sequences.needed import needed_by
 from abbe.service.sequences.recipes import HelixPoints
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
-from abbe.service.workflows.correct import correct, push
-from abbe.service.workflows.measure import measure
 from abbe.simulators.ballbar import device
 from abbe.simulators.ballbar.wire import WITH_SETTINGS_BCD
 from tests.faults import modbus_rig

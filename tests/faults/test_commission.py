@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.service.compensation.commission import check_commissioned, commission, commissioned
+from abbe.service.compensation.recover import recover
 from abbe.service.errors import Interlock, StillActive, TableRefused
 from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.states import TERMINAL, State
 from abbe.service.sequences.interlocks import Suspending, Watching
 from abbe.service.storage.store import Store
-from abbe.service.workflows.commission import check_commissioned, commission, commissioned
-from abbe.service.workflows.recover import recover
 from abbe.simulators.cnc import bank
 from tests.faults.sequencer_world import bench
 

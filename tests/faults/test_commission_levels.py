@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
+from abbe.service.compensation.commission_levels import RESTART, commission_levels
+from abbe.service.compensation.proved_levels import check_level, standing
+from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
 from abbe.service.errors import StillActive, TableRefused, UnsafeToMove
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import facts
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.commission_levels import RESTART, commission_levels
-from abbe.service.workflows.proved_levels import check_level, standing
-from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.tables.base_table import read_base
 from abbe.simulators.cnc import bank
 from abbe.simulators.cnc.compensation import BankState, Compensation, CompResult
 from tests.faults.sequencer_world import bench

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.errors import Aborted, DoorOpen, Stopped
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan, FollowPath, ReadBar, RecordPath, TestPlan
 from abbe.service.storage.store import Store
-from abbe.service.workflows.measure import Manner, measure
 from abbe.simulators.cnc.log import Command
 from tests.faults.sequencer_world import AtStep, Bench, bench, kinds, small, step_numbers
 
@@ -217,7 +217,7 @@ async def test_a_point_in_hand_is_finished_before_a_stop(place):
 
 
 async def test_a_path_that_was_interrupted_never_enters_the_solution(place):
-    from abbe.service.workflows.campaign_folder import from_store
+    from abbe.service.campaign_data.campaign_folder import from_store
 
     b, store = place
     plan = replace(small("Helix"), label="helix")

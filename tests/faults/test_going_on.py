@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.campaigns.campaign_run import Resumed, nobody
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.resume import resume
 from abbe.service.errors import DoorOpen, EstopPressed, Interlock, Stopped, TemperatureOutside, UnsafeToMove, WorldChanged
 from abbe.service.events import Progress
 from abbe.service.sequences.control import State
 from abbe.service.sequences.interlocks import Suspending, Watching
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadLaser, RecordPath
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_run import Resumed, nobody
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.resume import resume
 from tests.faults.sequencer_world import AtStep, Bench, bench, small
 
 SPEED = 100.0

@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from abbe.drivers.errors import LinkDown
+from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.cli.app import app
 from abbe.service.clock import SystemClock
 from abbe.service.sequences.control import State
@@ -24,7 +25,6 @@ from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted
 from abbe.service.sequences.journal import ENDED, INCIDENT, StoreJournal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
-from abbe.service.workflows.measure import Manner, measure
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
 from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.faults.sequencer_world import AtStep, Bench, bench, small

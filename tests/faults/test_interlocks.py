@@ -34,7 +34,7 @@ from abbe.service.errors import (
     SpindleTurns,
     StatusUnknown,
 )
-from abbe.service.sequences.rewind import BY_HAND
+from abbe.service.sequences.resume_plan import BY_HAND
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import FollowPath, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan, Unmount, ZeroLaser
 from abbe.simulators.faults.modbus_proxy import ModbusProxy

@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 
 from abbe.drivers.errors import Rebooted
+from abbe.service.campaign_data.run_times import times
+from abbe.service.campaigns.campaign_run import nobody
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.resume import resume
 from abbe.service.errors import Interlock
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import export_folder, import_folder
@@ -20,10 +24,6 @@ from abbe.service.sequences.recipes import Helix
 from abbe.service.sequences.steps import CampaignPlan, RecordPath
 from abbe.service.storage.records import RunRecord
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_run import nobody
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.resume import resume
-from abbe.service.workflows.run_times import times
 from tests.faults.sequencer_world import MACHINE, AtStep, Bench, bench, number
 
 SPEED = 40.0

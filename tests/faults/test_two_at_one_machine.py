@@ -9,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.devices.alone import alone
+from abbe.service.campaigns.campaign_run import gone_on, items, mounted_anew
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.resume import resume
+from abbe.service.devices.machine_lock import alone
 from abbe.service.errors import (
     ProgramRuns,
     SpindleTurns,
@@ -17,12 +20,9 @@ from abbe.service.errors import (
     UnsafeToMove,
 )
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.rewind import end_of, way_back
+from abbe.service.sequences.resume_plan import end_of, way_back
 from abbe.service.sequences.steps import CampaignPlan, ChangeBar, FollowPath, MountBar, RecordPath, TakeBarOut
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_run import gone_on, items, mounted_anew
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.resume import resume
 from abbe.simulators.cnc.device import Hold
 from tests.faults.sequencer_world import AtStep, InTest, bench, number, on_one_cup, small
 from tests.faults.test_going_on import broken_off, going_on, statuses, step_of, yes

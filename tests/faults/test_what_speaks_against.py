@@ -16,6 +16,10 @@ import pytest
 
 from abbe.drivers.api import LaserReading
 from abbe.drivers.errors import DeviceFault
+from abbe.service.campaigns import campaign_run
+from abbe.service.campaigns.campaign_run import nobody
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.resume import begun_source
 from abbe.service.errors import (
     ConfigError,
     DoorOpen,
@@ -30,10 +34,6 @@ from abbe.service.sequences.interlocks import Suspending, Watching
 from abbe.service.sequences.journal import StoreJournal
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, RecordPath
 from abbe.service.storage.store import Store
-from abbe.service.workflows import campaign_run
-from abbe.service.workflows.campaign_run import nobody
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.resume import begun_source
 from tests.faults.sequencer_world import AtStep, Bench, InTest, bench, number, small
 from tests.faults.test_going_on import SUSPENDING, broken_off, going_on, statuses, step_of
 
@@ -299,7 +299,7 @@ async def test_a_test_that_is_suspended_again_and_again_ends(place, monkeypatch)
 
 async def test_an_e_stop_is_told_although_the_journal_cannot_be_ended(place, monkeypatch):
     b, store = place
-    monkeypatch.setattr("abbe.service.workflows.measure.LAST_LINE_S", 0.0)
+    monkeypatch.setattr("abbe.service.campaigns.measure.LAST_LINE_S", 0.0)
     add = store.add_checkpoint
 
     def refuses(campaign: int, kind: str, doc: dict) -> int:

@@ -13,11 +13,11 @@ from abbe.models.geometry.bases import smooth_terms
 from abbe.models.machine import Machine
 from abbe.models.volumetric import volume_grid
 from abbe.service.cli import run
+from abbe.service.compensation.comp_export import export, identified
 from abbe.service.formats.choice import Judge, best_of, choices
 from abbe.service.formats.controls import CONTROLS
 from abbe.service.formats.identified import Identified
 from abbe.service.formats.model import AxisTable, Compensation, correction_at
-from abbe.service.workflows.comp_export import export, identified
 
 STROKE = np.array([[0.0, 500.0], [-200.0, 200.0], [-300.0, 0.0]])
 MACHINE = Machine("w-X-b-Y-Z-t", STROKE, np.zeros((3, 3)), np.array([0.0, 0.0, -150.0]))

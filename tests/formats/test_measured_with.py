@@ -15,7 +15,7 @@ from abbe.service.push.entries import GENESIS, follow
 from abbe.service.push.states import State
 from abbe.service.storage.records import PushEntryRecord
 from abbe.service.storage.store import Store
-from abbe.service.workflows.measured_with import distinct
+from abbe.service.tables.measured_with import distinct
 from tests.formats.test_choice import _document, _known
 
 ACTING = encode(TableImage(1, 5, 100, (0.0, 0.0, 0.0), (100.0, 100.0, 100.0), (2, 2, 2), tuple(range(18))))

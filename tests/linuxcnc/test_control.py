@@ -18,13 +18,13 @@ from abbe.drivers.cnc.tables import TableImage, crc32, encode
 from abbe.drivers.errors import DeviceFault, Refused
 from abbe.drivers.registry import open_controller
 from abbe.models.compensation.tables import NineTables
+from abbe.service.compensation.commission_levels import commission_levels
+from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.push.operations import Verdict
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.commission_levels import commission_levels
-from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.tables.base_table import read_base
 from tests.linuxcnc.instance import Instance
 from tests.mbpoll import poll_table
 from tests.physics.truth import MACHINE

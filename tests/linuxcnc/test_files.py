@@ -9,9 +9,9 @@ import pytest
 from abbe.drivers.cnc.second_decoder import read_axis_tables
 from abbe.drivers.cnc.tables import TableImage, crc32, encode
 from abbe.drivers.errors import Refused
+from abbe.service.compensation.commission_levels import commission_levels
+from abbe.service.compensation.recover import accept
 from abbe.service.storage.store import Store
-from abbe.service.workflows.commission_levels import commission_levels
-from abbe.service.workflows.recover import accept
 from tests.linuxcnc.test_control import FEED, OWNER, controller, nine, push, site_of, until, wanted
 
 POINTS = 121

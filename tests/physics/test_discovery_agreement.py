@@ -18,8 +18,8 @@ from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.prediction import Solved, predictions, solve
-from abbe.models.discovery.scene import Scene, scene_of
-from abbe.service.workflows.never_fitted import ALARM
+from abbe.models.discovery.whitened_problem import Scene, scene_of
+from abbe.service.discovery.never_fitted import ALARM
 from abbe.simulators.hidden.cases import make_case
 from abbe.simulators.hidden.suite import write_case
 from tests.bench.discovery_case import read_case

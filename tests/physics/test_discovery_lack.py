@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.experiment_candidates import offers
 from abbe.models.discovery.lack import floors, repeat_steps
-from abbe.models.discovery.next_offers import offers
-from abbe.models.discovery.scene import scene_of
+from abbe.models.discovery.whitened_problem import scene_of
+from abbe.service.discovery.discovery_words import verdict_of
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
 from abbe.service.site import machine_from_doc
-from abbe.service.workflows.discovery_words import verdict_of
 from tests.unit.service.axis_bench import axis_case, found_in, searched, with_repeats
 
 BIFROST = (

@@ -15,13 +15,13 @@ from abbe.models.discovery.candidates import rows_for
 from abbe.models.discovery.case import Case, CaseRun, Role
 from abbe.models.discovery.discover import discover, fairly
 from abbe.models.discovery.noise import Colour, unscaled
-from abbe.models.discovery.scene import scene_of
+from abbe.models.discovery.projection import Space
 from abbe.models.discovery.selection import Contest, joined, weighed
-from abbe.models.discovery.space import Space
+from abbe.models.discovery.whitened_problem import scene_of
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path, driven, standing
 from abbe.models.machine import Machine
-from abbe.service.workflows.discovery_answer import answer_doc
+from abbe.service.discovery.discovery_answer import answer_doc
 
 R, N = 100.0, 109
 MACHINE = Machine("w-X-b-Y-Z-t", np.array([[0.0, 400.0]] * 3))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.where import SIGNIFICANT, locate
-from abbe.models.discovery.where_signal import where_of_signal
+from abbe.models.discovery.localization import SIGNIFICANT, locate
+from abbe.models.discovery.signal_localization import where_of_signal
 from tests.physics.discovery_paths import campaign, noise
 
 PATHS = campaign()

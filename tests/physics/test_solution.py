@@ -10,10 +10,10 @@ from abbe.models.solvers.observations import RunData
 from abbe.service.cli.solve import _print
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import InstrumentsDisagree
+from abbe.service.identification.solve import Solved, solve_runs
+from abbe.service.identification.solve_report import account, solution_doc
+from abbe.service.report.solve_pages import parameter_rows
 from abbe.service.site import Site, machine_doc
-from abbe.service.workflows.solve import Solved, solve_runs
-from abbe.service.workflows.solve_pages import parameter_rows
-from abbe.service.workflows.solve_report import account, solution_doc
 from tests.physics.truth import MACHINE, Truth
 
 SITE = Site("sim", MACHINE, machine_doc("sim", MACHINE), DeviceUrls())

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from abbe.drivers.cnc.tables import encode
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.nine_tables import table_image
 from tests.push.pushing_child import tables
 
 FIRST, OTHER = 40, 60

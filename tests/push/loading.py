@@ -13,7 +13,7 @@ NAMES = (
     "states", "entries", "operations", "levels", "limits", "approval", "learn", "staging", "back", "order", "machine", "conduct", "meaning",
 )  # fmt: skip
 """In the order of their imports."""
-OUTSIDE = {"second_decoder": "drivers/cnc/second_decoder.py", "codec": "service/workflows/tables.py"}
+OUTSIDE = {"second_decoder": "drivers/cnc/second_decoder.py", "codec": "service/tables/nine_tables.py"}
 _counter = itertools.count()
 
 Edits = tuple[tuple[str, str, str], ...]
@@ -23,7 +23,7 @@ Edits = tuple[tuple[str, str, str], ...]
 def real() -> SimpleNamespace:
     """The modules as they are."""
     found = {name: import_module(f"abbe.service.push.{name}") for name in NAMES}
-    return SimpleNamespace(**found, codec=import_module("abbe.service.workflows.tables"))
+    return SimpleNamespace(**found, codec=import_module("abbe.service.tables.nine_tables"))
 
 
 def edited(edits: Edits) -> SimpleNamespace:

@@ -27,12 +27,12 @@ from abbe.service.push import operations as o
 from abbe.service.push.adapter import ControllerPort, People
 from abbe.service.push.approval import approval_digest
 from abbe.service.push.book import StoreBook, read_entries
-from abbe.service.push.conduct import push, recover
 from abbe.service.push.entries import check_chain, facts
-from abbe.service.push.meaning import meaning_of_tables
+from abbe.service.push.execute import push, recover
 from abbe.service.push.order import Order
+from abbe.service.push.semantic_digest import meaning_of_tables
 from abbe.service.storage.store import Store
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.nine_tables import table_image
 
 MACHINE = "sim"
 

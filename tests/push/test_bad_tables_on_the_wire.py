@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.tables import NineTables
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import read_entries
 from abbe.service.push.limits import PushLimits
@@ -17,8 +18,7 @@ from abbe.service.push.operations import Verdict
 from abbe.service.push.states import State
 from abbe.service.push.validate import reasons_against
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.service.tables.base_table import read_base
 from tests.faults.sequencer_world import bench
 from tests.push.bad_tables import CLASSES, EACH, good
 

@@ -32,16 +32,16 @@ class Deafening(World):
 def test_the_way_back_ends_pending_and_goes_on_when_it_listens(question: str, owner: str) -> None:
     case = Case("goes back", verify=False, machine_sign=-1 if question == "PROBE" else 1)
     world = Deafening(question, real(), case, {})
-    ended = world.live(world.p.conduct.push(world, world, world.order()))
+    ended = world.live(world.p.execute.push(world, world, world.order()))
     assert (str(ended.state), ended.settled) == ("ROLLBACK_PENDING", False)
     assert world.ctl.in_force == world.candidate
     if owner == "nobody":
         world.ctl.owner = 0
     world.ops = itertools.count()
-    again = world.live(world.p.conduct.recover(world, world))  # still deaf: it ends again
+    again = world.live(world.p.execute.recover(world, world))  # still deaf: it ends again
     assert str(again.state) == "ROLLBACK_PENDING"
     world.ctl.deaf, world.ops = False, itertools.count()
-    assert str(world.live(world.p.conduct.recover(world, world)).state) == "ROLLED_BACK"
+    assert str(world.live(world.p.execute.recover(world, world)).state) == "ROLLED_BACK"
     assert world.ctl.in_force == world.base
 
 
@@ -53,6 +53,6 @@ def test_a_table_that_was_exchanged_and_put_back_while_it_was_verified_is_not_ke
             return answer
 
     world = Exchanged(real(), Case("kept"), {})
-    world.live(world.p.conduct.push(world, world, world.order()))
+    world.live(world.p.execute.push(world, world, world.order()))
     assert str(world.journal[-1].state) == "ROLLED_BACK"
     assert world.ctl.in_force == world.base

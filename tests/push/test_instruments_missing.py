@@ -17,17 +17,17 @@ import pytest
 
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import SystemClock
+from abbe.service.compensation import pushing
+from abbe.service.compensation.push_approved import Order, push_approved
 from abbe.service.config import load_machine
 from abbe.service.events import ignore_progress
+from abbe.service.jobs.check import run_check
+from abbe.service.jobs.guided_campaign import led_campaign
+from abbe.service.jobs.investigate import Bench
 from abbe.service.sequences.campaigns import identification
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site, site_of
 from abbe.service.storage.owner import this_process
-from abbe.service.workflows import pushing
-from abbe.service.workflows.check import run_check
-from abbe.service.workflows.investigate import Bench
-from abbe.service.workflows.led_campaign import led_campaign
-from abbe.service.workflows.push_approved import Order, push_approved
 from tests.push.test_whose_table import Left, left_in_probation
 from tests.scenarios.conftest import ABBE
 

@@ -42,20 +42,20 @@ def test_whatever_comes_between(fault: str, later: int) -> None:
 def test_a_start_before_it_was_forgotten_takes_it_back_as_far_as_the_control_lets_it() -> None:
     at = activation(World(real(), CASE, {}))
     world = World(real(), CASE, {at + 1: "crash_before"})
-    world.live(world.p.conduct.push(world, world, world.order()))
+    world.live(world.p.execute.push(world, world, world.order()))
     world.ctl.reboot("keep")
     assert world.ctl.in_force == world.candidate
     world.plan = {}
-    ended = world.live(world.p.conduct.recover(world, world))
+    ended = world.live(world.p.execute.recover(world, world))
     assert str(ended.state) == "ROLLBACK_PENDING"  # the old one is laid aside now
     world.ctl.reboot("keep")
-    ended = world.live(world.p.conduct.recover(world, world))
+    ended = world.live(world.p.execute.recover(world, world))
     assert (str(ended.state), world.ctl.in_force) == ("ROLLED_BACK", world.base)
 
 
 def test_what_does_not_forget_is_a_persons_matter() -> None:
     world = World(real(), Case("laid aside for good", stages=True, forgets=False), {})
-    world.live(world.p.conduct.push(world, world, world.order()))
+    world.live(world.p.execute.push(world, world, world.order()))
     assert str(world.journal[-1].state) == "OPERATOR"
     assert "does not forget" in world.journal[-1].doc["why"]
 
@@ -64,7 +64,7 @@ def test_what_somebody_else_has_laid_aside_is_left_alone() -> None:
     world = World(real(), Case("theirs"), {})
     world.ctl.banks[1] = world.candidate
     world.ctl.states[1], world.ctl.crc[1] = STAGED, 7
-    world.live(world.p.conduct.push(world, world, world.order()))
+    world.live(world.p.execute.push(world, world, world.order()))
     assert str(world.journal[-1].state) == "ABORTED"
     assert not [event for event in world.events if event[0] == "write"]
 

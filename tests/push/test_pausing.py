@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
 from abbe.service.errors import Stopped
 from abbe.service.push.book import read_entries
 from abbe.service.push.operations import Verdict
 from abbe.service.push.states import State as Push
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.tables.base_table import read_base
 from tests.faults.sequencer_world import Bench, bench
 from tests.push.test_bad_tables_on_the_wire import counted, tables
 

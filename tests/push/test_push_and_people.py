@@ -13,15 +13,15 @@ from typing import Any
 import pytest
 
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.pushing import AGAIN_S, Pushing, Questions, Wanted
+from abbe.service.compensation.recover import recover
 from abbe.service.errors import PushNotBegun, StillActive, TableMismatch
 from abbe.service.push.adapter import BEAT_S, ControllerPort, nobody
 from abbe.service.push.book import read_entries
 from abbe.service.push.operations import Done, Kind, Op, Verdict
 from abbe.service.push.states import State
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.pushing import AGAIN_S, Pushing, Questions, Wanted
-from abbe.service.workflows.recover import recover
+from abbe.service.tables.base_table import read_base
 from abbe.simulators.cnc.compensation import CompResult
 from tests.faults.sequencer_world import Bench, bench
 from tests.push.test_bad_tables_on_the_wire import kept, never, tables

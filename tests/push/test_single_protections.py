@@ -133,16 +133,16 @@ def test_while_the_e_stop_is_pressed_the_way_back_sends_nothing() -> None:
             return super()._verified()
 
     world = Pressed(real(), BACK, {})
-    ended = world.live(world.p.conduct.push(world, world, world.order()))
+    ended = world.live(world.p.execute.push(world, world, world.order()))
     assert (str(ended.state), ended.settled) == ("ROLLBACK_PENDING", False)
     assert world.journal[-1].doc["pending"] == "not safe now: the e-stop is pressed"
     entries = len(world.journal)
     for _ in range(3):  # the service asks every half minute, and each time it is another process that has no lease
-        world.live(world.p.conduct.recover(world, world))
+        world.live(world.p.execute.recover(world, world))
     assert not GOING_BACK & set(issued(world, "LEASE", "RELEASE", "WRITE", "SEAL", "ACTIVATE"))
     assert len(world.journal) == entries
     world.ctl.estop = False
-    assert str(world.live(world.p.conduct.recover(world, world)).state) == "ROLLED_BACK"
+    assert str(world.live(world.p.execute.recover(world, world)).state) == "ROLLED_BACK"
 
 
 @pytest.mark.parametrize("persons", [True, False])
@@ -151,7 +151,7 @@ def test_restoring_the_old_table_is_begun_again_over_our_own_words_and_never_ove
     lost = place(BACK, "PROBATION", "PROBE")
     died = place(BACK, "RESTAGING", "READ_CHUNK", {lost: "reboot_inactive"})
     world = World(real(), BACK, {lost: "reboot_inactive", died: "crash_before"})
-    world.live(world.p.conduct.push(world, world, world.order()))
+    world.live(world.p.execute.push(world, world, world.order()))
     assert states(world)[-1] == "RESTAGING"
     world.plan, bank = {}, 1 - world.ctl.active
     if persons:
@@ -161,6 +161,6 @@ def test_restoring_the_old_table_is_begun_again_over_our_own_words_and_never_ove
         world.ctl.states[bank], world.ctl.crc[bank] = c.SEALED, c.zlib.crc32(world.ctl.content(bank))
         world.ctl.gen += 1
     before = world.ctl.content(bank)
-    ended = world.live(world.p.conduct.recover(world, world))
+    ended = world.live(world.p.execute.recover(world, world))
     assert str(ended.state) == ("OPERATOR" if persons else "ROLLED_BACK")
     assert world.ctl.banks[bank].startswith(before if persons else world.base)

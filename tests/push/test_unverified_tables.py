@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from abbe.models.compensation.tables import NineTables
+from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.compensation.recover import accept, recover
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
-from abbe.service.workflows.recover import accept, recover
+from abbe.service.tables.base_table import read_base
 from tests.faults.sequencer_world import Bench, bench
 from tests.push.test_bad_tables_on_the_wire import kept, never, tables
 

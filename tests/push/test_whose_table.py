@@ -14,24 +14,24 @@ import pytest
 from abbe.drivers.cnc.tables import crc32
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.urls import DeviceUrls, address_of, control_of
 from abbe.service.errors import TableMismatch, UnsafeToMove
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import WORD, check_chain
 from abbe.service.push.operations import Verdict
 from abbe.service.push.states import State
+from abbe.service.report.report_table import table_said
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.in_force import look_at_table
-from abbe.service.workflows.measured_with import KIND_AT
-from abbe.service.workflows.push_word import open_pushes
-from abbe.service.workflows.pushing import Pushing, Questions, Wanted
-from abbe.service.workflows.recover import accept, recover
-from abbe.service.workflows.report_table import table_said
-from abbe.service.workflows.table_story import story
-from abbe.service.workflows.unverified import known_tables
-from abbe.service.workflows.verified_by import verified_by
+from abbe.service.tables.base_table import read_base
+from abbe.service.tables.in_force import look_at_table
+from abbe.service.tables.measured_with import KIND_AT
+from abbe.service.tables.push_outcome import open_pushes
+from abbe.service.tables.table_history import story
+from abbe.service.tables.unverified import known_tables
+from abbe.service.verification.verified_by import verified_by
 from tests.faults.sequencer_world import Bench, bench
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed
 from tests.push.test_bad_tables_on_the_wire import tables

@@ -220,7 +220,7 @@ class World:
 
     def _read_again(self, op: Any) -> Any:
         data = self._take(op.bank, 0, op.count, "read_again")
-        return self.p.operations.Done(meanings(self.p.meaning)(data))
+        return self.p.operations.Done(meanings(self.p.semantic_digest)(data))
 
     def _read_chunk(self, op: Any) -> Any:
         return self.p.operations.Done(self._take(op.bank, op.first, op.count, ""))
@@ -332,7 +332,7 @@ class World:
 
     def order(self) -> Any:
         case = self.case
-        meaning = self.p.meaning.meaning_of_tables(tables(55))
+        meaning = self.p.semantic_digest.meaning_of_tables(tables(55))
         return self.p.order.Order(
             "M", self.candidate, c.zlib.crc32(self.candidate), meaning, "limits", OWNER, case.level, case.attended, CHUNK_WORDS
         )
@@ -351,14 +351,14 @@ class World:
 
     def run(self, most: int = 6) -> list[str]:
         """Push; after every death recover; then the faults stop, people make the machine ready, and it has to come to an end."""
-        ended = self.live(self.p.conduct.push(self, self, self.order()))
+        ended = self.live(self.p.execute.push(self, self, self.order()))
         lives = 0
         while (ended is None or not ended.settled) and lives < most:
             lives += 1
             last_fault = max(self.plan, default=-1)
             if self.n > last_fault or lives >= 3:
                 self.quiet()
-            ended = self.live(self.p.conduct.recover(self, self))
+            ended = self.live(self.p.execute.recover(self, self))
         return self.judge(ended)
 
     def kinds_of_run(self) -> list[str]:
@@ -380,7 +380,7 @@ class World:
         self.n += max(LATE.values())
         self.deliver_late()
         before, writes = len(self.journal), self.n_changes()
-        again = self.live(self.p.conduct.recover(self, self)) if self.journal else ended
+        again = self.live(self.p.execute.recover(self, self)) if self.journal else ended
         idempotent = len(self.journal) == before and self.n_changes() == writes
         return violations(self, ended, again, idempotent=idempotent)
 

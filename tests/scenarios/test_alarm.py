@@ -17,16 +17,20 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
 from abbe.service.cli.serve import duties_on
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.proposal_checks import approve
+from abbe.service.compensation.proposal_doc import load
+from abbe.service.compensation.proposal_states import standing
 from abbe.service.config import load_machine
 from abbe.service.config_timetable import AlarmSection
 from abbe.service.devices.session import open_session
 from abbe.service.errors import StoreError
 from abbe.service.events import ProgressSink
+from abbe.service.jobs.check import CheckResult, run_check
 from abbe.service.push.limits import PushLimits
-from abbe.service.scheduler.desk import AlarmDesk, Telling
+from abbe.service.scheduler.alarm_manager import AlarmManager, Telling
 from abbe.service.scheduler.job import CheckJob
-from abbe.service.scheduler.keep import StoreLedger, StoreShelf
 from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.campaigns import identification
@@ -34,14 +38,10 @@ from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
+from abbe.service.verification.alarm_states import Alarm, Kind
+from abbe.service.verification.alarms import acknowledge, alarms_of
 from abbe.service.web.board import Board
 from abbe.service.web.view import View
-from abbe.service.workflows.alarm_states import Alarm, Kind
-from abbe.service.workflows.alarms import acknowledge, alarms_of
-from abbe.service.workflows.check import CheckResult, run_check
-from abbe.service.workflows.proposal_checks import approve
-from abbe.service.workflows.proposal_doc import load
-from abbe.service.workflows.proposal_states import standing
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
 from tests.scenarios.conftest import Sims
 
@@ -79,7 +79,7 @@ class Shop:
         tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
         duties = duties_on(AlarmSection(push="approved"), self.site, CampaignPlan("full", tests), RATE_HZ)(self.store)
         telling = Telling(TOPICS[1], lambda: None, AuditBook(self.store, self.url), [board])
-        desk = AlarmDesk(self.store, clock, "sim", [OFTEN], duties, telling)
+        desk = AlarmManager(self.store, clock, "sim", [OFTEN], duties, telling)
         shelf = StoreShelf(self.store, clock, ("sim", self.store.add_machine("sim", self.site.doc)), TOPICS, lambda: None)
 
         async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:

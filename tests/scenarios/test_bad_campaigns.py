@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from abbe.service.campaign_data.copied_runs import copies
 from abbe.service.errors import AbbeError, CampaignRefused
-from abbe.service.workflows.copied_runs import copies
-from abbe.service.workflows.solve import check_campaign
+from abbe.service.identification.solve import check_campaign
 from tests.campaigns import population
 from tests.campaigns.population import CAMPAIGNS
 from tests.scenarios.campaign_files import machine_of, measured

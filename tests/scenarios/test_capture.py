@@ -10,6 +10,7 @@ import pytest
 
 from abbe.drivers.ballbar import driver
 from abbe.drivers.errors import Backpressure
+from abbe.service.campaigns.measure import measure
 from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.recovery import ledger_of
 from abbe.service.cli import run
@@ -19,7 +20,6 @@ from abbe.service.sequences.recipes import Helix
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
-from abbe.service.workflows.measure import measure
 from tests.scenarios.world import axes_at_rest, bar_chunks, interrupt, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.tables import NineTables
+from abbe.service.campaigns.measure import measure
+from abbe.service.compensation import proposals as workflow
+from abbe.service.compensation import pushing
+from abbe.service.compensation.correct import correct
+from abbe.service.compensation.proposals import load_runs
+from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.errors import MeasurementFault, StillActive, TableMismatch, TableRefused
 from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.limits import PushLimits
-from abbe.service.push.meaning import meaning_of_tables
+from abbe.service.push.semantic_digest import meaning_of_tables
 from abbe.service.sequences.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store
-from abbe.service.workflows import proposals as workflow
-from abbe.service.workflows import pushing
-from abbe.service.workflows.correct import correct
-from abbe.service.workflows.measure import measure
-from abbe.service.workflows.proposals import load_runs
-from abbe.service.workflows.recover import recover
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.nine_tables import table_image
 from tests.pretended import as_if_commissioned
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(600)]

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
+from abbe.service.demo import demo_serve
+from abbe.service.demo.demo_serve import DRIFT_UM_PER_M, ROOM_UM, USER, served_lines
 from abbe.service.errors import StoreError
 from abbe.service.storage.store import Store
-from abbe.service.workflows import demo_serve
-from abbe.service.workflows.demo_serve import DRIFT_UM_PER_M, ROOM_UM, USER, served_lines
 from tests.system.serve_bench import Process, require
 from tests.system.test_serve_page import QUIET
 
@@ -127,8 +127,8 @@ def left_behind(folder: Path) -> list[str]:
 
 def test_the_machine_file_of_the_demonstration_is_one(tmp_path: Path) -> None:
     from abbe.service.config import load_machine
+    from abbe.service.demo.demo import demo_site, write_machine_file
     from abbe.service.site import machine_from_doc
-    from abbe.service.workflows.demo import demo_site, write_machine_file
 
     doc = {
         "chain": "w-X-Y-b-Z-t", "tool_mm": [0.0, 0.0, -120.0], "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]},

@@ -13,12 +13,12 @@ import signal
 import pytest
 
 from abbe.service.cli import run as cli
+from abbe.service.report.report import stored_report
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.coverage import covered_share, not_judged
 from abbe.service.storage.store import Store
 from abbe.service.web.pages.runs import run_screen
-from abbe.service.workflows.report import stored_report
-from abbe.service.workflows.report_parts import Rules
 from tests.scenarios.world import bar_chunks, interrupt, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]

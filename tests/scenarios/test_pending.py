@@ -10,11 +10,11 @@ from dataclasses import replace
 import pytest
 
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.deferred_rollback import finish_when_safe
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import StatusUnknown, StillActive
 from abbe.service.push.book import read_entries
 from abbe.service.storage.store import Store
-from abbe.service.workflows.pending import finish_when_safe
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
 from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.scenarios.test_push import active

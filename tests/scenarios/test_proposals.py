@@ -14,8 +14,15 @@ from typing import Any
 
 import pytest
 
+from abbe.service.campaigns.measure import measure
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.correct import Correction, push
+from abbe.service.compensation.proposal_checks import approve, hold
+from abbe.service.compensation.proposal_doc import digest_of_doc, load
+from abbe.service.compensation.proposal_states import standing, standing_of
+from abbe.service.compensation.proposals import load_runs, login
+from abbe.service.compensation.push_approved import Approved, Order, next_approved, push_approved
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import StoreError, TableRefused
@@ -28,13 +35,6 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.records import ApprovalRecord
 from abbe.service.storage.store import Store
-from abbe.service.workflows.correct import Correction, push
-from abbe.service.workflows.measure import measure
-from abbe.service.workflows.proposal_checks import approve, hold
-from abbe.service.workflows.proposal_doc import digest_of_doc, load
-from abbe.service.workflows.proposal_states import standing, standing_of
-from abbe.service.workflows.proposals import load_runs, login
-from abbe.service.workflows.push_approved import Approved, Order, next_approved, push_approved
 from tests.pretended import as_if_commissioned
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import registers

@@ -15,6 +15,10 @@ import pytest
 from abbe.drivers.cnc.tables import crc32, encode
 from abbe.drivers.errors import LinkDown
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
+from abbe.service.campaigns.measure import measure
+from abbe.service.compensation import pushing
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
 from abbe.service.events import ignore_progress
@@ -27,12 +31,8 @@ from abbe.service.sequences.recipes import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store
-from abbe.service.workflows import pushing
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.measure import measure
-from abbe.service.workflows.pushing import Pushing, Questions, Wanted
-from abbe.service.workflows.recover import accept, recover
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import table_image
 from tests.pretended import as_if_commissioned
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]

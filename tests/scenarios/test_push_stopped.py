@@ -4,13 +4,13 @@ import asyncio
 
 import pytest
 
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.recover import recover
 from abbe.service.errors import StoreError
 from abbe.service.push.book import StoreBook
 from abbe.service.push.operations import Verdict
 from abbe.service.push.states import State
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.pushing import Pushing, Questions, Wanted
-from abbe.service.workflows.recover import recover
+from abbe.service.tables.base_table import read_base
 from tests.scenarios.test_push import active, bench, last, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]

@@ -22,19 +22,19 @@ import pytest
 
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.service.cli import run
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
+from abbe.service.jobs.check import CheckResult
 from abbe.service.push.operations import Verdict
-from abbe.service.report.numbers import with_uncertainty
+from abbe.service.rendering.numbers import with_uncertainty
 from abbe.service.runs.columns import load_run
 from abbe.service.scheduler import record
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.check import CheckResult
-from abbe.service.workflows.pushing import Pushing, Questions, Wanted
-from abbe.service.workflows.verify import figure_rows, figures
+from abbe.service.tables.base_table import read_base
+from abbe.service.verification.verify import figure_rows, figures
 from tests.scenarios.conftest import simulated
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]

@@ -16,15 +16,15 @@ import pytest
 
 from abbe.drivers.cnc.tables import crc32, encode
 from abbe.service.cli import run
+from abbe.service.compensation import rollback as workflow
+from abbe.service.compensation.recover import recover
+from abbe.service.compensation.rollback import rollback
 from abbe.service.errors import PushNotBegun, StoreError, TableMismatch, TableRefused
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import check_chain
 from abbe.service.push.states import State
-from abbe.service.workflows import rollback as workflow
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.recover import recover
-from abbe.service.workflows.rollback import rollback
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import table_image
 from tests.scenarios.test_push import active, bench, last, linear_tables, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]

@@ -9,13 +9,13 @@ import pytest
 
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.service import cli
+from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.identification.solve import solve_runs
+from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.runs.exchange import import_folder
 from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_folder import from_folder
-from abbe.service.workflows.solve import solve_runs
-from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.campaigns.population import draw_case
 from tests.scenarios.campaign_files import measured, write_folder
 

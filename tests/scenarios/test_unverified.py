@@ -11,7 +11,7 @@ import pytest
 from abbe.service.cli import run
 from abbe.service.push.book import read_entries
 from abbe.service.storage.store import Store
-from abbe.service.workflows.in_force import look_at_table
+from abbe.service.tables.in_force import look_at_table
 from tests.scenarios.test_push import bench, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]

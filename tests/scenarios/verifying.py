@@ -16,6 +16,9 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.tables import NineTables
+from abbe.service.campaigns.measure import measure
+from abbe.service.compensation.correct import load_runs
+from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
 from abbe.service.devices.session import Session, open_session
 from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
@@ -25,11 +28,8 @@ from abbe.service.sequences.recipes import Diagonal, Helix
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.correct import load_runs
-from abbe.service.workflows.measure import measure
-from abbe.service.workflows.pushing import Pushed, Pushing, Questions, Wanted
-from abbe.service.workflows.verify import Figures, decide, figures
+from abbe.service.tables.base_table import read_base
+from abbe.service.verification.verify import Figures, decide, figures
 from tests.scenarios.conftest import simulated
 from tests.scenarios.test_push import linear_tables, site_of
 

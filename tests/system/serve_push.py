@@ -13,27 +13,27 @@ from typing import Any
 
 import numpy as np
 
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.compensation.push_approved import Approved, Order
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.recover import recover
 from abbe.service.core.setup import Setup
-from abbe.service.devices.alone import alone
+from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.events import Progress
+from abbe.service.jobs.at_start import recover_at_start
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.topics import Topics
 from abbe.service.push.operations import Verdict
-from abbe.service.scheduler import desk
+from abbe.service.scheduler import alarm_manager
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.recipes import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.serve import serve
 from abbe.service.site import Site, machine_doc, machine_from_doc
-from abbe.service.workflows.at_start import recover_at_start
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.measure import Manner, measure
-from abbe.service.workflows.push_approved import Approved, Order
-from abbe.service.workflows.push_word import Outcome
-from abbe.service.workflows.pushing import Pushing, Questions, Wanted
-from abbe.service.workflows.recover import recover
+from abbe.service.tables.base_table import read_base
+from abbe.service.tables.push_outcome import Outcome
 from tests.scenarios.test_push import linear_tables
 
 PROPOSAL = Approved(4, 9, 0)
@@ -69,7 +69,7 @@ async def probing(session: Session, store: ServiceStore, site: Site, order: Orde
 
 
 def duties_on(site: Site, last: str) -> Any:
-    def duties(store: ServiceStore) -> desk.Duties:
+    def duties(store: ServiceStore) -> alarm_manager.Duties:
         async def push(order: Order) -> Outcome:
             with alone(site.urls.cnc):
                 async with open_session(site.urls) as session:
@@ -90,7 +90,7 @@ def duties_on(site: Site, last: str) -> Any:
         async def investigate(*_: object) -> None:
             raise AssertionError
 
-        return desk.Duties(0.0, "identification", investigate, push)
+        return alarm_manager.Duties(0.0, "identification", investigate, push)
 
     return duties
 
@@ -102,7 +102,7 @@ def main() -> int:
     machine = machine_from_doc(ready["machine"])
     urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
     site = Site("sim", machine, machine_doc("sim", machine), urls)
-    desk.next_approved = lambda store, name, entries, now_s: None if any(e.kind == "pushing" for e in entries) else PROPOSAL  # type: ignore[assignment]
+    alarm_manager.next_approved = lambda store, name, entries, now_s: None if any(e.kind == "pushing" for e in entries) else PROPOSAL  # type: ignore[assignment]
     yearly = Schedule("yearly", "0 0 1 1 *", "UTC", "quick-check")
     return serve(
         Setup(

@@ -22,10 +22,10 @@ from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.modbus_policy import Op
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 from abbe.models.compensation.tables import NineTables, grid_positions
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import read_base
-from abbe.service.workflows.pushing import Pushing, Questions, Wanted
+from abbe.service.tables.base_table import read_base
 from abbe.simulators.cnc.device import Controller
 from abbe.simulators.cnc.wire import CncRegisters
 from abbe.simulators.faults.modbus_frames import crc16

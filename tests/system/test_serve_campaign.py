@@ -19,13 +19,13 @@ import pytest
 from playwright.sync_api import Page as Screen
 
 from abbe.service.audit.book import AuditBook
+from abbe.service.campaigns.resume import begun_source
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.proposal_doc import load
+from abbe.service.compensation.proposal_states import standing
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
-from abbe.service.workflows.proposal_doc import load
-from abbe.service.workflows.proposal_states import standing
-from abbe.service.workflows.resume import begun_source
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import wait_for
 from tests.system.serve_bench import Process, abbe, free_port

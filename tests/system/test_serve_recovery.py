@@ -17,7 +17,7 @@ import pytest
 from abbe.drivers.cnc.tables import crc32, encode
 from abbe.drivers.registry import open_controller
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.nine_tables import table_image
 from tests.push.pushing_child import tables
 from tests.scenarios.world import wait_for
 from tests.system.serve_bench import Machine, abbe, free_port

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.service.workflows.thinned import MOST_READINGS
+from abbe.service.campaign_data.decimation import MOST_READINGS
 from abbe.simulators.hidden import plans
 from tests.bench import discovery_report as report
 from tests.bench.discovery_case import CASES, kinds_of, measured_bar_readings, read_case, write_long

@@ -11,10 +11,10 @@ import pytest
 
 from abbe.models.discovery.answer import NamedEffect
 from abbe.models.discovery.finding import _confounded, _of_scatter
+from abbe.models.discovery.localization import Where
 from abbe.models.discovery.residue import residues
 from abbe.models.discovery.variance import VarianceFinding
-from abbe.models.discovery.where import Where
-from abbe.service.workflows.discovery_answer import _effect
+from abbe.service.discovery.discovery_answer import _effect
 
 SCATTER = frozenset({"vibration:Z", "stick_slip:X", "beam_outliers"})
 

@@ -15,10 +15,10 @@ import pytest
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base
 from abbe.service.audit.chain import Event
+from abbe.service.backup.restore import BESIDE
 from abbe.service.capture.settings import CaptureSettings, segment_folder
 from abbe.service.storage.migrate import known_revisions
 from abbe.service.storage.store import Store
-from abbe.service.workflows.restore import BESIDE
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = ("service", "drivers", "models", "simulators")

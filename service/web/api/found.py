@@ -8,10 +8,14 @@ from typing import Annotated
 from fastapi import FastAPI, Query
 from pydantic import BeforeValidator
 
+from abbe.service.discovery.changed_words import proved
+from abbe.service.discovery.discovery_states import taken_back
 from abbe.service.errors import Unusable
 from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.users.roles import Permission
+from abbe.service.verification.trend_table import as_doc, trends
+from abbe.service.verification.verified_by import verified_by
 from abbe.service.web.access import needs
 from abbe.service.web.api.shapes import Trends
 from abbe.service.web.api.shapes_tables import (
@@ -25,10 +29,6 @@ from abbe.service.web.api.shapes_tables import (
     Solutions,
 )
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, read_as, storable
-from abbe.service.workflows.changed_words import proved
-from abbe.service.workflows.discovery_states import taken_back
-from abbe.service.workflows.trend_table import as_doc, trends
-from abbe.service.workflows.verified_by import verified_by
 
 CHECKS = 20_000
 """So many of the latest checks make a trend: more than ten years of four a day."""

@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 from fastapi import FastAPI
 
+from abbe.service.campaigns.builtin_recipes import RECIPES
 from abbe.service.errors import Unusable
 from abbe.service.scheduler.slots import Schedule, cron_in_words, next_slot
 from abbe.service.users.roles import Permission
@@ -14,7 +15,6 @@ from abbe.service.web.api import shapes as s
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, finite, read_as
 from abbe.service.web.catalogue import entries
 from abbe.service.web.schemas import Verification
-from abbe.service.workflows.shipped import RECIPES
 
 LATEST = 10
 BLANK: Doc = {

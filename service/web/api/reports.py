@@ -10,11 +10,11 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
 from abbe.service.errors import NotStored
-from abbe.service.report.document import Document
+from abbe.service.rendering.document import Document
+from abbe.service.report.report import FORMS, default_name, numbered_report, stored_report
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import needs
 from abbe.service.web.api.sources import Number, Sources, as_stored, storable
-from abbe.service.workflows.report import FORMS, default_name, numbered_report, stored_report
 
 AT_A_TIME = 2
 

@@ -17,12 +17,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from abbe.service.clock import Clock
 from abbe.service.errors import NotStored, StoreError, Unusable
+from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.store_pages import LARGEST
 from abbe.service.web.logtail import LogTail
 from abbe.service.web.schemas import Device
-from abbe.service.workflows.report_parts import Rules
 
 log = structlog.get_logger("abbe.api")
 M = TypeVar("M", bound=BaseModel)

@@ -11,8 +11,8 @@ from abbe.service.web.access import needs
 from abbe.service.web.api.once import REPLAYED, Key
 from abbe.service.web.api.shapes_tables import PushBody, RollbackBody
 from abbe.service.web.api.sources import Number
+from abbe.service.web.auth_middleware import Visit
 from abbe.service.web.core_line import CoreLine
-from abbe.service.web.guard import Visit
 from abbe.service.web.jobs import ACCEPTED, REFUSALS, answered
 from abbe.service.web.schemas_jobs import JobState
 

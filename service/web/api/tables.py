@@ -8,6 +8,11 @@ from typing import Annotated
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import Response
 
+from abbe.service.compensation.proposal_checks import approve as work_approve
+from abbe.service.compensation.proposal_checks import reject as work_reject
+from abbe.service.compensation.proposal_diff import ACTIVE, compare, diff_json
+from abbe.service.compensation.proposal_doc import Proposed, load
+from abbe.service.compensation.proposal_states import Standing, check_waiting, standing, standing_of
 from abbe.service.errors import Unusable
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import Entry
@@ -18,12 +23,7 @@ from abbe.service.web.access import needs
 from abbe.service.web.api import shapes_tables as s
 from abbe.service.web.api.once import Key, once
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, as_stored
-from abbe.service.web.guard import Visit
-from abbe.service.workflows.proposal_checks import approve as work_approve
-from abbe.service.workflows.proposal_checks import reject as work_reject
-from abbe.service.workflows.proposal_diff import ACTIVE, compare, diff_json
-from abbe.service.workflows.proposal_doc import Proposed, load
-from abbe.service.workflows.proposal_states import Standing, check_waiting, standing, standing_of
+from abbe.service.web.auth_middleware import Visit
 
 LONGEST_BODY = 4096
 

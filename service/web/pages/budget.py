@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from abbe.service.report.model import Contribution
-from abbe.service.report.numbers import COVERAGE, NOT_AVAILABLE, finite, fixed, placed, plain
-from abbe.service.report.plots.bars import contribution_bars
+from abbe.service.rendering.model import Contribution
+from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, finite, fixed, placed, plain
+from abbe.service.rendering.plots.bars import contribution_bars
 from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current

@@ -8,7 +8,7 @@ _DARK = re.compile(r"@media screen and \(prefers-color-scheme:dark\)\{:root\{([^
 
 
 def themed(rules: str) -> str:
-    """The rules of `abbe.service.report.palette.style_rules`, for figures of a page whose ``html`` says which scheme was chosen."""
+    """The rules of `abbe.service.rendering.palette.style_rules`, for figures of a page whose ``html`` says which scheme was chosen."""
     found = _DARK.search(rules)
     if found is None:
         raise ValueError("the palette has no dark colours in the form that is expected here")

@@ -8,18 +8,29 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from abbe.service.errors import AbbeError
-from abbe.service.report.model import PolarTrace
-from abbe.service.report.numbers import COVERAGE, finite, plain
-from abbe.service.report.plots.overlay import difference_plot, overlay_plot
-from abbe.service.report.plots.polar import polar_plot
+from abbe.service.rendering.model import PolarTrace
+from abbe.service.rendering.numbers import COVERAGE, finite, plain
+from abbe.service.rendering.plots.overlay import difference_plot, overlay_plot
+from abbe.service.rendering.plots.polar import polar_plot
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
 from abbe.service.storage.records import RunRecord
 from abbe.service.storage.store import Store
+from abbe.service.verification.compare_runs import (
+    MOST,
+    Curve,
+    Difference,
+    FigureRow,
+    Loaded,
+    against,
+    curve,
+    difference,
+    figure_rows,
+    remarks,
+)
 from abbe.service.web.frame import current
 from abbe.service.web.pages.desk import found
 from abbe.service.web.pages.runs import run_document
-from abbe.service.workflows.compare_runs import MOST, Curve, Difference, FigureRow, Loaded, against, curve, difference, figure_rows, remarks
-from abbe.service.workflows.report_parts import Rules
 
 LETTERS = "ABCD"
 LISTED = 40

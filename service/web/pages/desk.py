@@ -13,12 +13,12 @@ from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
 from abbe.service.errors import NotStored
+from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from abbe.service.web import words
 from abbe.service.web.api.sources import storable
-from abbe.service.web.door import Door
+from abbe.service.web.authentication import Door
 from abbe.service.web.schemas import Status, Verification
-from abbe.service.workflows.report_parts import Rules
 
 T = TypeVar("T")
 

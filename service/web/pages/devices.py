@@ -6,12 +6,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 
+from abbe.service.compensation.proved_levels import KIND
 from abbe.service.secrets import mask_secrets
 from abbe.service.sequences.incident_account import Trouble, troubles
 from abbe.service.storage.records import CampaignRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.schemas import Device
-from abbe.service.workflows.proved_levels import KIND
 
 CAMPAIGNS = 10
 """So many of the latest campaigns are looked through for incidents."""

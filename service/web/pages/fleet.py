@@ -14,7 +14,7 @@ from datetime import datetime
 from abbe.service.scheduler.fleet import Figure, Stand, stands
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.base import utc_text
-from abbe.service.workflows.alarm_states import folded, is_open
+from abbe.service.verification.alarm_states import folded, is_open
 
 SORTS = ("worst", "machine", "due")
 COLUMNS = (

@@ -12,7 +12,7 @@ from abbe.service.channel.messages import JobSeen
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.access import needs
-from abbe.service.web.door import Door
+from abbe.service.web.authentication import Door
 from abbe.service.web.frame import current
 from abbe.service.web.pages.desk import Desk, Source
 

@@ -11,14 +11,14 @@ from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
+from abbe.service.campaigns.builtin_recipes import USUAL_HZ
 from abbe.service.channel.messages import RulesTold
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import needs
-from abbe.service.web.door import Door
+from abbe.service.web.authentication import Door
 from abbe.service.web.frame import current
 from abbe.service.web.pages.desk import Desk, Source
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
-from abbe.service.workflows.shipped import USUAL_HZ
 
 Recipe = Annotated[str, Query(max_length=200)]
 Rate = Annotated[int, Query(ge=1, le=1000)]

@@ -16,9 +16,9 @@ from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.access import needs
 from abbe.service.web.api.sources import Sources
-from abbe.service.web.door import Door
+from abbe.service.web.auth_middleware import Visit
+from abbe.service.web.authentication import Door
 from abbe.service.web.frame import THEMES, current
-from abbe.service.web.guard import Visit
 from abbe.service.web.pages.desk import Desk, Source, can_be_stored
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes

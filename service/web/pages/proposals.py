@@ -9,18 +9,18 @@ from datetime import UTC, datetime
 from markupsafe import Markup
 
 from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.proposal_checks import approve
+from abbe.service.compensation.proposal_diff import HEADINGS, compare, largest, rows
+from abbe.service.compensation.proposal_doc import Proposed, load
+from abbe.service.compensation.proposal_states import Standing, check_waiting, standing, standing_of
 from abbe.service.errors import StoreError
 from abbe.service.push.book import read_entries
-from abbe.service.report.plots.table_change import DiffCurve, change_plot
+from abbe.service.rendering.plots.table_change import DiffCurve, change_plot
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import ApprovalRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 from abbe.service.web.units import INCH
-from abbe.service.workflows.proposal_checks import approve
-from abbe.service.workflows.proposal_diff import HEADINGS, compare, largest, rows
-from abbe.service.workflows.proposal_doc import Proposed, load
-from abbe.service.workflows.proposal_states import Standing, check_waiting, standing, standing_of
 
 MOST = 50
 SIGNS = {"kept": "ok", "approved": "ok", "pushed": "ok", "refused": "bad", "rolled back": "bad", "changed": "bad", "rejected": "bad"}

@@ -3,7 +3,7 @@
 The contribution of one motion is the rms length of the deviation that it makes alone, over an even grid of the volume, the best-fit rigid
 motion removed (that is where the workpiece lies, not an error of the machine): c = sqrt(theta^T G theta), G the mean square of its terms.
 Its uncertainty follows from the covariance of theta (GUM 5.1.2); near zero, where the direction is itself not known, the worst direction
-counts, as in `abbe.service.workflows.deviations`. The squares of the contributions do not add up to the square of the whole: motions can
+counts, as in `abbe.service.verification.deviations`. The squares of the contributions do not add up to the square of the whole: motions can
 make up for each other.
 """
 
@@ -19,9 +19,9 @@ from abbe.models.arrays import F1, F2
 from abbe.models.machine import Machine
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.models.volumetric import volume_grid
-from abbe.service.report.model import Contribution
-from abbe.service.report.numbers import with_uncertainty
-from abbe.service.workflows.stored_prediction import stored_prediction
+from abbe.service.identification.stored_prediction import stored_prediction
+from abbe.service.rendering.model import Contribution
+from abbe.service.rendering.numbers import with_uncertainty
 
 NODES = 6
 HIDDEN = "not observable"

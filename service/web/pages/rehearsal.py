@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from abbe.models.machine import AXES, Machine
+from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, RATES_HZ, RECIPES, named, parted, recipe_plan
 from abbe.service.channel.messages import MachineTold, RulesTold
 from abbe.service.errors import AbbeError
-from abbe.service.report.numbers import MM, Unit
+from abbe.service.rendering.numbers import MM, Unit
+from abbe.service.report.dry_run_page import picture
 from abbe.service.sequences.campaigns import identification
 from abbe.service.sequences.check import DryRun, dry_run_campaign
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MountLaser, TestPlan
 from abbe.service.site import machine_from_doc
-from abbe.service.workflows.dry_page import picture
-from abbe.service.workflows.shipped import IDENTIFICATION, RATES_HZ, RECIPES, named, parted, recipe_plan
 
 CAMPAIGN = IDENTIFICATION
 """The full campaign: whoever starts it is led through its set-ups."""

@@ -10,17 +10,17 @@ from markupsafe import Markup
 
 from abbe.models.machine import Machine
 from abbe.service.errors import AbbeError
-from abbe.service.report.document import Document, Sign
-from abbe.service.report.numbers import plain
-from abbe.service.report.plots.bars import contribution_bars
+from abbe.service.rendering.document import Document, Sign
+from abbe.service.rendering.numbers import plain
+from abbe.service.rendering.plots.bars import contribution_bars
+from abbe.service.report.report_discovery import discovery_report
+from abbe.service.report.report_measured import SOLUTION_SIGNS
+from abbe.service.report.report_parts import Rules
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.records import DiscoveryRecord, SolutionRecord, StepRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 from abbe.service.web.pages.ranking import Ranked, ranking
-from abbe.service.workflows.report_discovery import discovery_report
-from abbe.service.workflows.report_measured import SOLUTION_SIGNS
-from abbe.service.workflows.report_parts import Rules
 
 MOST = 50
 MOST_SOLUTIONS = 20

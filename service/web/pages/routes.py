@@ -13,12 +13,13 @@ from jinja2 import Environment
 from pydantic import AfterValidator
 
 from abbe.service.errors import NotStored, StoreError, TableRefused
-from abbe.service.report.document_data import shown
-from abbe.service.report.palette import style_rules
+from abbe.service.rendering.document_data import shown
+from abbe.service.rendering.palette import style_rules
+from abbe.service.report.report_parts import Rules
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import needs
-from abbe.service.web.door import Door
-from abbe.service.web.guard import Visit
+from abbe.service.web.auth_middleware import Visit
+from abbe.service.web.authentication import Door
 from abbe.service.web.pages import times
 from abbe.service.web.pages.colours import themed
 from abbe.service.web.pages.desk import Desk, Source, can_be_stored, found
@@ -28,7 +29,6 @@ from abbe.service.web.pages.results import discovery_lines, discovery_screen, re
 from abbe.service.web.pages.runs import STATES, TESTS, Wanted, newest_run, run_list, run_screen
 from abbe.service.web.pages.table import ends
 from abbe.service.web.problems import problem
-from abbe.service.workflows.report_parts import Rules
 
 LONGEST_FORM = 1024
 HOURS = (1.0, 8.0, 24.0, 72.0)

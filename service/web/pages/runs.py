@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.devices.urls import DeviceUrls
 from abbe.service.errors import AbbeError
-from abbe.service.report.document import Document
+from abbe.service.rendering.document import Document
+from abbe.service.report.report_measured import Measured, run_report
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.cases import set_once
 from abbe.service.runs.columns import load_run
 from abbe.service.site import Site, machine_from_doc
 from abbe.service.storage.records import INCOMPLETE, RUNNING, RunRecord
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_folder import Campaign
-from abbe.service.workflows.report_measured import Measured, run_report
-from abbe.service.workflows.report_parts import Rules
 
 TESTS = ("ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear")
 STATES = ("complete", "running", "incomplete", "stopped", "aborted", "failed", "interrupted", "disk_full")

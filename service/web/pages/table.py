@@ -9,13 +9,13 @@ from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
 from abbe.service.errors import JournalChanged
+from abbe.service.tables.table_history import story
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import needs
 from abbe.service.web.api.sources import Sources
-from abbe.service.web.door import Door
+from abbe.service.web.authentication import Door
 from abbe.service.web.frame import current
 from abbe.service.web.pages.desk import Desk, Source
-from abbe.service.workflows.table_story import story
 
 MOST = 50
 SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}

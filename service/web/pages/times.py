@@ -9,13 +9,13 @@ from markupsafe import Markup
 
 from abbe.service.storage.records import SlotRecord, VerificationRecord
 from abbe.service.storage.store import Store
+from abbe.service.verification.trend_table import FigureTrend, in_words
+from abbe.service.verification.trend_table import trends as figure_trends
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.page import trends
 from abbe.service.web.pages.desk import zone_of
 from abbe.service.web.schemas import Due, Status, Verification, Verified
-from abbe.service.workflows.trend_table import FigureTrend, in_words
-from abbe.service.workflows.trend_table import trends as figure_trends
 
 CHECKS = 300
 SLOTS = 30

@@ -12,12 +12,12 @@ from markupsafe import Markup
 
 from abbe.models.uncertainty.what_if import expected_rms
 from abbe.service.errors import AbbeError
-from abbe.service.report.numbers import placed, tidy
-from abbe.service.report.plots.slices import PLANES, Slice, Words, colour_top, magnification, slice_plot, steps
+from abbe.service.identification.solution_field import NodeMap, StoredField, node_map, stored_field
+from abbe.service.rendering.numbers import placed, tidy
+from abbe.service.rendering.plots.slices import PLANES, Slice, Words, colour_top, magnification, slice_plot, steps
 from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
-from abbe.service.workflows.solution_field import NodeMap, StoredField, node_map, stored_field
 
 NODES = (3, 4, 5, 6)
 """More would make the table of all nodes heavier than a screen may be; the interface gives finer grids."""

@@ -10,13 +10,13 @@ from markupsafe import Markup
 
 from abbe.models.uncertainty.what_if import Outcome, check_figures, what_if
 from abbe.service.errors import AbbeError
-from abbe.service.report.numbers import COVERAGE, with_uncertainty
-from abbe.service.report.plots.paired import Pair, paired_bars
+from abbe.service.identification.solution_field import StoredField, stored_field
+from abbe.service.rendering.numbers import COVERAGE, with_uncertainty
+from abbe.service.rendering.plots.paired import Pair, paired_bars
 from abbe.service.sequences.campaigns import hemisphere
 from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
-from abbe.service.workflows.solution_field import StoredField, stored_field
 
 MEAN = "mean."
 """Before the name of a scale or squareness that is averaged over the volume."""

@@ -9,7 +9,7 @@ import pytest
 
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidates import Bank, bank_of, gain_of, rows_for, starts_of
-from abbe.models.discovery.scene import Scene, scene_of, taken_out
+from abbe.models.discovery.whitened_problem import Scene, scene_of, taken_out
 from abbe.models.effects.catalogue import CATALOGUE
 from tests.physics.test_discovery_search import campaign
 

@@ -51,7 +51,7 @@ def test_f(dof: float, below: float) -> None:
 def test_no_command_and_no_service_imports_scipy_stats() -> None:
     """Half of a start's processor time went there."""
     code = (
-        "import sys, abbe.service.serve, abbe.service.workflows.correct, abbe.service.workflows.discover\n"
+        "import sys, abbe.service.serve, abbe.service.compensation.correct, abbe.service.discovery.discover\n"
         "sys.exit('scipy.stats' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[3]).returncode == 0

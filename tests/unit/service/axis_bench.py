@@ -8,12 +8,12 @@ import numpy as np
 
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.case import Case
+from abbe.service.discovery.discovery_doc import finding_doc
+from abbe.service.discovery.discovery_engine import search
+from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.runs.cases import case_of
 from abbe.service.site import machine_from_doc
-from abbe.service.workflows.discovery_doc import finding_doc
-from abbe.service.workflows.discovery_engine import search
-from abbe.service.workflows.effect_catalogue import catalogue
 
 Doc = dict[str, Any]
 MACHINE: Doc = {
@@ -95,7 +95,7 @@ def searched(runs: list[Doc]) -> tuple[Discovery, Doc]:
 
 def found_in(case: Case) -> tuple[Discovery, Doc]:
     """The same of a case."""
-    from abbe.service.workflows.axis_test import SLOW_DRIFT
+    from abbe.service.effects.axis_test import SLOW_DRIFT
 
     found = search(case, catalogue(), ignore_progress)
     return found, finding_doc(found, case, (*catalogue(), SLOW_DRIFT), {r.path.label: np.zeros(r.path.n) for r in case.runs})

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.devices import alone as module
-from abbe.service.devices.alone import alone, lock_folder
+from abbe.service.devices import machine_lock as module
+from abbe.service.devices.machine_lock import alone, lock_folder
 from abbe.service.errors import MachineInUse, UnsafeToMove
 
 URL = "modbus+tcp://127.0.0.1:1"
 NOBODY = 65534
 HOLDER = """
 import os, sys
-from abbe.service.devices.alone import alone
+from abbe.service.devices.machine_lock import alone
 uid, gid, url = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 if uid:  # after the imports: what this account may read of the installation is not what is tried here
     os.setgroups([gid] if gid else [])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from abbe.service.workflows.discovery_states import closed
-from abbe.service.workflows.discovery_words import verdict_of
+from abbe.service.discovery.discovery_states import closed
+from abbe.service.discovery.discovery_words import verdict_of
 from tests.unit.service.axis_bench import cycles, searched
 
 

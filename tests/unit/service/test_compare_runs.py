@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from abbe.service.report.document import Figure
+from abbe.service.rendering.document import Figure
 from abbe.service.runs.observations import run_data
-from abbe.service.workflows.compare_runs import Loaded, against, curve, difference, figure_rows, remarks
+from abbe.service.verification.compare_runs import Loaded, against, curve, difference, figure_rows, remarks
 
 RADIUS = 100.0
 

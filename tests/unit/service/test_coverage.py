@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import MeasurementFault
+from abbe.service.report.report_measured import Measured, campaign_report
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.coverage import COMPLETE, LEAST, covered_share, not_judged, with_state
 from abbe.service.storage.owner import this_process
 from abbe.service.storage.records import RunRecord
-from abbe.service.workflows.campaign_folder import Campaign
-from abbe.service.workflows.compare_runs import against
-from abbe.service.workflows.iso_report import evaluate
-from abbe.service.workflows.report_measured import Measured, campaign_report
-from abbe.service.workflows.report_parts import Rules
-from abbe.service.workflows.verify import figures
+from abbe.service.verification.compare_runs import against
+from abbe.service.verification.iso_report import evaluate
+from abbe.service.verification.verify import figures
 from tests.scenarios.campaign_files import measured
 from tests.unit.service.test_helix_axis import compared, helix_about
 

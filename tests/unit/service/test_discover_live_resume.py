@@ -23,6 +23,9 @@ import pytest
 
 from abbe.models.discovery.answer import Discovery, NextTest
 from abbe.service import cli
+from abbe.service.campaign_data import campaign_checks
+from abbe.service.discovery import experiment_recipes
+from abbe.service.discovery.discover_live import rounds
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns
@@ -30,8 +33,6 @@ from abbe.service.sequences.interlocks import DRIVES, MOVING, REFERENCED, REMOTE
 from abbe.service.storage.owner import Owner
 from abbe.service.storage.records import NewVersion
 from abbe.service.storage.store import Store
-from abbe.service.workflows import campaign_checks, next_recipes
-from abbe.service.workflows.discover_live import rounds
 from tests.unit.service.discovery_bench import MACHINE, Search, circle, write_case
 
 READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
@@ -91,7 +92,7 @@ def once(compute: Callable[..., Any]) -> Callable[..., Any]:
 def _computed_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(campaign_checks, "suspects", once(campaign_checks.suspects))
-        patch.setattr(next_recipes, "dry_run_campaign", once(next_recipes.dry_run_campaign))
+        patch.setattr(experiment_recipes, "dry_run_campaign", once(experiment_recipes.dry_run_campaign))
         yield
 
 
@@ -108,12 +109,12 @@ class Bench:
         self.left: int | None = None
         self._folder, self._patch = folder, monkeypatch
         self._file()
-        monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", self.search)
+        monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", self.search)
         monkeypatch.setattr("abbe.service.cli.measure.ready_session", self._session)
-        monkeypatch.setattr("abbe.service.workflows.measure.measure_test", self._measure_test)
-        for name in ("discover_live", "measure"):
-            monkeypatch.setattr(f"abbe.service.workflows.{name}.check_devices", self._answer)
-        monkeypatch.setattr("abbe.service.workflows.provenance.revision", lambda: "r")  # asks git for a second, each time
+        monkeypatch.setattr("abbe.service.campaigns.measure.measure_test", self._measure_test)
+        for name in ("discovery.discover_live", "campaigns.measure"):
+            monkeypatch.setattr(f"abbe.service.{name}.check_devices", self._answer)
+        monkeypatch.setattr("abbe.service.campaign_data.provenance.revision", lambda: "r")  # asks git for a second, each time
         monkeypatch.setattr(Owner, "is_gone", lambda _self: True)
         for name in WRITES:
             monkeypatch.setattr(Store, name, self._counted(getattr(Store, name)))
@@ -258,7 +259,7 @@ def test_ended_within_a_search_only_that_one_is_done_again(bench: Bench, number:
             raise KeyboardInterrupt
         return found
 
-    monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", doomed)
+    monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", doomed)
     assert bench.live() == 130
     assert bench.live() == 0
     assert bench.stored() == WHOLE
@@ -291,7 +292,7 @@ def test_a_fault_of_one_run_keeps_the_others(bench: Bench, monkeypatch: pytest.M
         raise MeasurementFault("the bar fell out")
 
     with monkeypatch.context() as patch:
-        patch.setattr("abbe.service.workflows.measure.measure_test", fails)
+        patch.setattr("abbe.service.campaigns.measure.measure_test", fails)
         assert bench.live() == 2
     assert "error SEQ-003: the bar fell out" in capsys.readouterr().err
     assert bench.live() == 0

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.campaign_data.campaign_folder import Campaign, ensure_stored, from_folder
+from abbe.service.discovery.discover_live import Added, added
+from abbe.service.discovery.experiment_recipes import next_plan
 from abbe.service.runs.cases import case_of
 from abbe.service.sequences.recipes import Helix
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, RecordPath, TestPlan, Unmount
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.owner import Owner
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_folder import Campaign, ensure_stored, from_folder
-from abbe.service.workflows.discover_live import Added, added
-from abbe.service.workflows.next_recipes import next_plan
 from tests.unit.service.discovery_bench import MACHINE, Doc, write_case
 
 LIKE = Helix("a", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=4).plan(machine_from_doc(MACHINE))

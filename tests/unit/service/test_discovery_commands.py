@@ -12,14 +12,14 @@ import pytest
 
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service import cli
+from abbe.service.campaign_data.campaign_folder import from_folder, from_store
+from abbe.service.discovery.discover import prepare
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.effects.model_book import current, no_table_lines
+from abbe.service.identification.effect_removal import taken_out
+from abbe.service.identification.table_removal import NO_TABLE
 from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_folder import from_folder, from_store
-from abbe.service.workflows.discover import prepare
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.model_book import current, no_table_lines
-from abbe.service.workflows.table_out import NO_TABLE
-from abbe.service.workflows.taken_out import taken_out
 from tests.unit.service.discovery_bench import WIDTH_MM, Search, write_case
 
 DB = "sqlite:///book.sqlite3"
@@ -41,7 +41,7 @@ def abbe(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
 @pytest.fixture
 def finds(monkeypatch: pytest.MonkeyPatch) -> Callable[[Search], Search]:
     def use(search: Search) -> Search:
-        monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", search)
+        monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
         return search
 
     return use

@@ -16,20 +16,20 @@ from typing import Any
 import pytest
 
 from abbe.models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
+from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.discovery.discover import Job, Journal, discover, prepare
+from abbe.service.discovery.discovery_doc import finite
+from abbe.service.discovery.discovery_states import closed, entering, judge, not_entered, taken_back
+from abbe.service.discovery.discovery_store import StoredJournal, journal_of
+from abbe.service.discovery.discovery_words import lines_of, next_of, rival_lines, verdict_of
+from abbe.service.discovery.simulate import gap_doc, simulate
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.effects.model_book import current
 from abbe.service.errors import CampaignRefused, NotObservable, StoreError
 from abbe.service.events import ignore_progress
+from abbe.service.report.discovery_pages import discovery_page, gap_rows
 from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_folder import from_folder
-from abbe.service.workflows.discover import Job, Journal, discover, prepare
-from abbe.service.workflows.discovery_doc import finite
-from abbe.service.workflows.discovery_pages import discovery_page, gap_rows
-from abbe.service.workflows.discovery_states import closed, entering, judge, not_entered, taken_back
-from abbe.service.workflows.discovery_store import StoredJournal, journal_of
-from abbe.service.workflows.discovery_words import lines_of, next_of, rival_lines, verdict_of
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.model_book import current
-from abbe.service.workflows.simulate import gap_doc, simulate
 from tests.unit.service.discovery_bench import Search, write_case
 
 ALL = ["FITTED", "SUSPICIOUS", "PROPOSED", "TESTING", "EXPLAINED"]
@@ -354,8 +354,8 @@ import os, signal, sys
 from pathlib import Path
 from abbe.service.events import ignore_progress
 from abbe.service.storage.store import Store
-from abbe.service.workflows.discover import discover
-from abbe.service.workflows.discovery_store import journal_of
+from abbe.service.discovery.discover import discover
+from abbe.service.discovery.discovery_store import journal_of
 from tests.unit.service.discovery_bench import Search
 from tests.unit.service.test_discovery_workflow import job_of
 

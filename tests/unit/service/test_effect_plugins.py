@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.service.workflows.effect_catalogue import Plugins, installed
+from abbe.service.effects.effect_catalogue import Plugins, installed
 
 GOOD = """
 import numpy as np

@@ -10,13 +10,13 @@ import pytest
 
 from abbe.drivers.cnc.tables import crc32
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.rollback import known_images, table_after
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import Entry
 from abbe.service.push.states import S
 from abbe.service.storage.store import Store
-from abbe.service.workflows.push_history import ended_as, last_kept, pushes_of
-from abbe.service.workflows.rollback import known_images, table_after
+from abbe.service.tables.push_history import ended_as, last_kept, pushes_of
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 
 OLD, NEW, THIRD = b"the table of May", b"the table of June", b"a third table"

@@ -15,8 +15,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from abbe.service.runs import points as points_file
-from abbe.service.workflows import deviations as workflow
-from abbe.service.workflows.deviations import standard_uncertainty_mm
+from abbe.service.verification import deviations as workflow
+from abbe.service.verification.deviations import standard_uncertainty_mm
 from tests.unit.service.errors_bench import ERRORS, OBJECT, OWN, POINTS, TOML, TOOL, Bench
 
 pytestmark = pytest.mark.usefixtures("clean_environment")

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from abbe.models.paths.helix import even_helix_points, helix_points
+from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.capture.live import angles_along
 from abbe.service.errors import MeasurementFault
-from abbe.service.report.document import Document
-from abbe.service.report.model import PolarTrace
+from abbe.service.rendering.document import Document
+from abbe.service.rendering.model import PolarTrace
+from abbe.service.report import report_measured
+from abbe.service.report.report_measured import Measured, run_report
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.helix_axis import helix_axis
 from abbe.service.runs.observations import run_data
-from abbe.service.workflows import report_measured
-from abbe.service.workflows.campaign_folder import Campaign
-from abbe.service.workflows.compare_runs import Loaded, against, curve
-from abbe.service.workflows.report_measured import Measured, run_report
-from abbe.service.workflows.report_parts import Rules
+from abbe.service.verification.compare_runs import Loaded, against, curve
 from tests.scenarios.campaign_files import measured
 
 CENTRE = np.array([300.0, 250.0, 200.0])

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from abbe.service.workflows.demo_hidden import HiddenDemo
-from abbe.service.workflows.demo_hidden_words import hidden_json, judged, truth_lines
-from abbe.service.workflows.known_effects import _usual
-from abbe.service.workflows.new_measurement import NewGap, NewMeasurement
-from abbe.service.workflows.thinned import picked
+from abbe.service.campaign_data.decimation import picked
+from abbe.service.demo.demo_hidden import HiddenDemo
+from abbe.service.demo.demo_hidden_words import hidden_json, judged, truth_lines
+from abbe.service.discovery.new_measurement import NewGap, NewMeasurement
+from abbe.service.effects.known_effects import _usual
 
 PLAY = {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 6.0}, "wild": 7}
 SURGE = {"name": "counterbalance_surge", "key": "", "parameters": {"strength": 4.0}, "wild": 0}

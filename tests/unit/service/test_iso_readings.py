@@ -10,8 +10,8 @@ from abbe.models.verification import diagonal_figure
 from abbe.service.runs.observations import run_data
 from abbe.service.sequences.recipes import Linear
 from abbe.service.sequences.steps import MoveTo, ReadLaser
-from abbe.service.workflows.iso_readings import circle_tests, diagonal_tests, linear_tests
-from abbe.service.workflows.iso_report import evaluate
+from abbe.service.verification.iso_readings import circle_tests, diagonal_tests, linear_tests
+from abbe.service.verification.iso_report import evaluate
 
 MACHINE = {"name": "m", "chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 

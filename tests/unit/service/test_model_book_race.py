@@ -15,15 +15,15 @@ import pytest
 from sqlalchemy import event
 
 from abbe.service import cli
+from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.discovery.discover import Job, discover, prepare
+from abbe.service.discovery.discovery_store import StoredJournal, journal_of
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.effects.model_book import current, revert
 from abbe.service.errors import ModelMovedOn
 from abbe.service.events import ignore_progress
 from abbe.service.storage.records import Doc, NewVersion
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_folder import from_folder
-from abbe.service.workflows.discover import Job, discover, prepare
-from abbe.service.workflows.discovery_store import StoredJournal, journal_of
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.model_book import current, revert
 from tests.unit.service.discovery_bench import Search, write_case
 
 NAME = "VMC-1"
@@ -208,7 +208,7 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, url: str, monkeypatch: 
             other.add_model(version(None))
         return Search()(*words)
 
-    monkeypatch.setattr("abbe.service.workflows.discovery_engine.search", search)
+    monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
     assert cli.run(["discover", str(folder), "--db", url]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert len(lines) == 1

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.service.workflows.model_book import grown
-from abbe.service.workflows.model_sums import total
-from abbe.service.workflows.packed import packed_covariance
+from abbe.service.campaign_data.packed_arrays import packed_covariance
+from abbe.service.effects.model_book import grown
+from abbe.service.effects.model_sums import total
 
 SOURCE = {"campaign": "c1", "discovery": "d1", "machine_digest": "m", "runs": [], "versions": {}}
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from abbe.service import cli
+from abbe.service.campaigns.plausibility import Doubts, doubts
 from abbe.service.cli.serve import setup_of
 from abbe.service.config import load_machine
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipe_file import recipe_text
 from abbe.service.sequences.recipes import Helix
-from abbe.service.workflows.plausible import Doubts, doubts
 
 pytestmark = pytest.mark.usefixtures("clean_environment")
 

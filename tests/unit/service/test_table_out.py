@@ -15,17 +15,17 @@ from abbe.drivers.cnc.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.models.solvers.in_force import InForce
 from abbe.service import cli
+from abbe.service.campaign_data.campaign_folder import from_folder, from_store
+from abbe.service.compensation.proposals import check_same_table
+from abbe.service.discovery.discover import prepare
+from abbe.service.discovery.simulate import simulate
+from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
+from abbe.service.identification.table_removal import NO_TABLE, STAYS, TABLE_OUT, Taken, as_left, less, table_line, table_then
 from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.storage.store import Store
-from abbe.service.workflows.base_table import Base
-from abbe.service.workflows.campaign_folder import from_folder, from_store
-from abbe.service.workflows.discover import prepare
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.proposals import check_same_table
-from abbe.service.workflows.simulate import simulate
-from abbe.service.workflows.table_out import NO_TABLE, STAYS, TABLE_OUT, Taken, as_left, less, table_line, table_then
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.base_table import Base
+from abbe.service.tables.nine_tables import table_image
 from tests.unit.service.discovery_bench import WIDTH_MM, write_case
 
 DB = "sqlite:///book.sqlite3"

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.service.campaign_data import decimation as module
+from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.campaign_data.decimation import picked, thinned, thinning
+from abbe.service.discovery.discover import Journal, discover, prepare
+from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
-from abbe.service.report.discovery_page import render_discovery
+from abbe.service.rendering.discovery_page import render_discovery
+from abbe.service.report.discovery_pages import discovery_page, page_facts
 from abbe.service.runs.discovery_file import DiscoveryFile
-from abbe.service.workflows import thinned as module
-from abbe.service.workflows.campaign_folder import from_folder
-from abbe.service.workflows.discover import Journal, discover, prepare
-from abbe.service.workflows.discovery_pages import discovery_page, page_facts
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.thinned import picked, thinned, thinning
 from tests.unit.service.discovery_bench import Search, circle, write_case
 
 

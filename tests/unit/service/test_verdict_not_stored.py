@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from abbe.models.verification import Figure
+from abbe.service.compensation import correct
+from abbe.service.compensation.pushing import Pushed
 from abbe.service.errors import StoreError
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
-from abbe.service.workflows import correct
-from abbe.service.workflows.pushing import Pushed
-from abbe.service.workflows.verify import DIAGONALS, Decision, Figures
+from abbe.service.verification.verify import DIAGONALS, Decision, Figures
 
 NONE = np.zeros(0)
 AFTER = Figures({name: Figure(0.004, 0.001, NONE, NONE) for name in DIAGONALS}, Figure(0.002, 0.001, NONE, NONE))

@@ -24,19 +24,19 @@ from abbe.service.plant.mtconnect import Agent
 from abbe.service.plant.opcua.picture import picture_of
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import S
-from abbe.service.report.document import Document
+from abbe.service.rendering.document import Document
+from abbe.service.report.report import numbered_report
+from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler import record
 from abbe.service.scheduler.fleet import Stand, stands
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
+from abbe.service.verification.verified_by import STRANGE, VerifiedBy, verified_by
 from abbe.service.web.board import Board
 from abbe.service.web.page import environment, render
 from abbe.service.web.pages.times import trend_screen
 from abbe.service.web.schemas import Status
 from abbe.service.web.view import View
-from abbe.service.workflows.report import numbered_report
-from abbe.service.workflows.report_parts import Rules
-from abbe.service.workflows.verified_by import STRANGE, VerifiedBy, verified_by
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.system.serve_check import Result
 

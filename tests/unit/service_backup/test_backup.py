@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.backup.backup_files import read_backup
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.capture.settings import CaptureSettings
 from abbe.service.cli import run
@@ -22,7 +23,6 @@ from abbe.service.errors import BackupRefused, StoreError
 from abbe.service.runs.codec import decode_bar
 from abbe.service.storage.copying import copy_online, prove_copy, rows_of
 from abbe.service.storage.store import Store
-from abbe.service.workflows.backup_files import read_backup
 from tests.unit.service_backup.conftest import SAMPLES, Shop, new_machine_file
 from tests.unit.service_capture.capture_bench import assert_true
 

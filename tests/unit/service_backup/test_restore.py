@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.backup.backup_files import listed
 from abbe.service.cli import run
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
-from abbe.service.workflows.backup_files import listed
 from tests.scenarios.campaign_files import measured, write_folder
 from tests.unit.service_backup.conftest import Shop, new_machine_file
 

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import pytest
 
+from abbe.service.campaigns import listen_campaign
 from abbe.service.capture import ingest as ingest_module
 from abbe.service.capture import recorder as recorder_module
 from abbe.service.capture.settings import CaptureSettings, segment_path
+from abbe.service.compensation import recover as recover_module
 from abbe.service.errors import CaptureFault, StoreError
 from abbe.service.storage.store import Store
-from abbe.service.workflows import listen_campaign
-from abbe.service.workflows import recover as recover_module
 from tests.unit.service_capture.capture_bench import batch
 from tests.unit.service_capture.test_recovery import crashed
 

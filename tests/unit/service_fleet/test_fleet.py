@@ -19,8 +19,8 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import Event
 from abbe.service.cli import run
 from abbe.service.scheduler.fleet import HEADINGS, Stand, fleet, row, stands, state_of
+from abbe.service.scheduler.heartbeat import SILENT_AFTER, Station
 from abbe.service.scheduler.slots import Schedule
-from abbe.service.scheduler.station import SILENT_AFTER, Station
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.owner import Owner, this_process
 from abbe.service.storage.records import StationRecord

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, event
 from abbe.service.scheduler.fleet import fleet
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.records import VerificationRecord
-from abbe.service.workflows.trend_table import trends
+from abbe.service.verification.trend_table import trends
 from tests.bench.history_case import START, History, build
 
 HISTORY = History(machines=3, days=4, checks_a_day=2, runs=120)

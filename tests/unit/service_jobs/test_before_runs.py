@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from abbe.service.compensation.proposals import check_before_runs
 from abbe.service.errors import TableRefused
 from abbe.service.push.limits import PushLimits
-from abbe.service.workflows.proposals import check_before_runs
 
 DOC = {"name": "mill"}
 SITE: Any = SimpleNamespace(doc=DOC, limits=PushLimits(), temperature_c=(18.0, 24.0))

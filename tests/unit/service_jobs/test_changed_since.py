@@ -17,17 +17,17 @@ import pytest
 from abbe.drivers.cnc.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.models.discovery import changed
+from abbe.service.campaign_data.campaign_folder import from_store, keep
+from abbe.service.discovery.changed_since import since_of
+from abbe.service.discovery.changed_words import changed_lines, changed_words
+from abbe.service.discovery.discover import Journal, discover, prepare
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.identification.solve import solve_runs
+from abbe.service.identification.solve_report import solution_doc
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.records import NewVersion
 from abbe.service.storage.store import Store
-from abbe.service.workflows.campaign_folder import from_store, keep
-from abbe.service.workflows.changed_since import since_of
-from abbe.service.workflows.changed_words import changed_lines, changed_words
-from abbe.service.workflows.discover import Journal, discover, prepare
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.solve import solve_runs
-from abbe.service.workflows.solve_report import solution_doc
-from abbe.service.workflows.tables import table_image
+from abbe.service.tables.nine_tables import table_image
 from tests.scenarios.campaign_files import measured, write_folder
 from tests.unit.service.discovery_bench import Search
 
@@ -98,7 +98,7 @@ def _same_readings_compared_once() -> Iterator[None]:
         return found[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("abbe.service.workflows.changed_since.changed_since", changed_since)
+        patch.setattr("abbe.service.discovery.changed_since.changed_since", changed_since)
         yield
 
 
@@ -235,7 +235,7 @@ def test_what_heat_did_in_these_runs_is_taken_out_first(store: Store, tmp_path: 
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
     taken: list[str] = []
     monkeypatch.setattr(
-        "abbe.service.workflows.changed_since.less_effects", lambda c, entries, whose: taken.extend(e["label"] for e in entries) or c
+        "abbe.service.discovery.changed_since.less_effects", lambda c, entries, whose: taken.extend(e["label"] for e in entries) or c
     )
     compared(store, "july", [entry("spindle_growth", "Z", "thermal", 1.0), entry("backlash", "X", "drive", 1.0)])
     assert taken == ["spindle_growth:Z"]
@@ -262,7 +262,7 @@ def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path
 
 def test_what_cannot_be_compared_is_a_line_and_costs_no_finding(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
-    monkeypatch.setattr("abbe.service.workflows.changed_since.changed_since", lambda *_: np.linalg.cholesky(-np.eye(2)))
+    monkeypatch.setattr("abbe.service.discovery.changed_since.changed_since", lambda *_: np.linalg.cholesky(-np.eye(2)))
     found = compared(store, "july")
     assert found is not None
     assert changed_lines(found) == [changed_words(found)]

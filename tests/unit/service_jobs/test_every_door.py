@@ -9,26 +9,26 @@ import pytest
 
 import abbe.service
 from abbe.drivers.errors import LinkDown
+from abbe.service.compensation import recovered_session
 from abbe.service.devices import session
 from abbe.service.devices.urls import DeviceUrls
 from abbe.service.errors import TableMismatch
 from abbe.service.site import Site
-from abbe.service.workflows import recovered
 from tests.faults.sequencer_world import MACHINE
 
 ROOT = Path(abbe.service.__file__).parent
 ONLY_LOOKS = {
     ("scheduler/ready.py", "look_at"): "reads the status",
-    ("workflows/in_force.py", "look_at_table"): "reads which table is in force",
+    ("tables/in_force.py", "look_at_table"): "reads which table is in force",
     ("cli/table.py", "accept_table"): "a person vouches",
-    ("workflows/bring_back.py", "bring_back"): "goes through `rollback`, which recovers",
-    ("workflows/demo.py", "run_demo"): "a control of its own, begun with this database",
-    ("workflows/demo_serve.py", "run_served_demo"): "the same",
-    ("workflows/demo_hidden.py", "run_hidden_demo"): "the same",
+    ("compensation/ordered_rollback.py", "bring_back"): "goes through `rollback`, which recovers",
+    ("demo/demo.py", "run_demo"): "a control of its own, begun with this database",
+    ("demo/demo_serve.py", "run_served_demo"): "the same",
+    ("demo/demo_hidden.py", "run_hidden_demo"): "the same",
 }
 
 
-HELPER = ("workflows/recovered.py", "recovered_session")
+HELPER = ("compensation/recovered_session.py", "recovered_session")
 
 
 def doors() -> dict[tuple[str, str], set[str]]:
@@ -84,10 +84,10 @@ async def opened(monkeypatch: pytest.MonkeyPatch, done: list[str], error: Except
             raise error
         return "taken back"
 
-    monkeypatch.setattr(recovered, "recover", recovers)
+    monkeypatch.setattr(recovered_session, "recover", recovers)
     urls = DeviceUrls("cnc", "ballbar", "laser", "fixture")
     site = Site("m", MACHINE, {}, urls)
-    async with recovered.recovered_session(None, site, accept_by="ann", told=done.append):  # type: ignore[arg-type]
+    async with recovered_session.recovered_session(None, site, accept_by="ann", told=done.append):  # type: ignore[arg-type]
         done.append("in use")
 
 

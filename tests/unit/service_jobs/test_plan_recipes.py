@@ -13,6 +13,8 @@ from abbe.models.paths.lines import DIAGONALS
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
 from abbe.models.planning.plan import Step
+from abbe.service.campaigns.plan import plan_for, plan_page, recipe_of, words
+from abbe.service.campaigns.plan_instruments import read_instruments
 from abbe.service.cli.app import app
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import AbbeError, ConfigError
@@ -22,8 +24,6 @@ from abbe.service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix
 from abbe.service.sequences.setups import shared_setups
 from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
 from abbe.service.site import Site, machine_doc
-from abbe.service.workflows.plan import plan_for, plan_page, recipe_of, words
-from abbe.service.workflows.plan_instruments import read_instruments
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 ONE_BAR = Instruments(bar_lengths_mm=(150.0,))

@@ -9,9 +9,9 @@ import pytest
 
 from abbe.service.cli import run
 from abbe.service.errors import ConfigError
+from abbe.service.identification.executors import Dask, Executor, Here, Processes
+from abbe.service.identification.reanalysis import Answer, solve_all, tasks_of
 from abbe.service.storage.store import Store
-from abbe.service.workflows.executors import Dask, Executor, Here, Processes
-from abbe.service.workflows.reanalysis import Answer, solve_all, tasks_of
 from tests.conftest import Require
 from tests.many_campaigns import dask_cluster, fill
 

@@ -8,14 +8,14 @@ import pytest
 
 from abbe.drivers.api import BarBatch, BarSample
 from abbe.drivers.errors import LinkDown, ReplyTimeout
+from abbe.service.campaigns.measure import OpenCampaign, measure_test
+from abbe.service.campaigns.progress import Meter
 from abbe.service.devices.session import Session
 from abbe.service.errors import MeasurementFault
 from abbe.service.sequences.guard import UNDELIVERED, motion_guard, warnings_of
 from abbe.service.sequences.interlocks import DRIVES, PATH, REFERENCED, REMOTE
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import MountBar, MountLaser, RecordPath, TestPlan, Unmount
-from abbe.service.workflows.measure import OpenCampaign, measure_test
-from abbe.service.workflows.meter import Meter
 
 READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
 RUNS_ON = RecordPath(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 100.0, 100, 1)
@@ -102,7 +102,7 @@ def nothing_is_recorded(monkeypatch):
     async def recording(*_):
         yield FakeRecorder()
 
-    monkeypatch.setattr("abbe.service.workflows.measure.recording", recording)
+    monkeypatch.setattr("abbe.service.campaigns.measure.recording", recording)
 
 
 SITE = SimpleNamespace(doc={}, name="m", capture=None)

@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.solvers.observability_volume import Number
 from abbe.models.uncertainty.prediction import Prediction
-from abbe.service.workflows.solve_verdict import WORDS, verdict
+from abbe.service.identification.solve_verdict import WORDS, verdict
 
 
 def layout(value: float, word: str) -> Number:

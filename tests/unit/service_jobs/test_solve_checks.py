@@ -8,13 +8,13 @@ import pytest
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import step_diagonal
+from abbe.service.campaign_data.campaign_checks import check_files, refuse
+from abbe.service.campaign_data.campaign_issue import Finding
+from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, revision, run_digest, versions
+from abbe.service.campaign_data.run_geometry import geometry
+from abbe.service.campaign_data.run_times import times
 from abbe.service.errors import CampaignRefused
-from abbe.service.workflows.campaign_checks import check_files, refuse
-from abbe.service.workflows.finding import Finding
-from abbe.service.workflows.provenance import campaign_digest, machine_digest, revision, run_digest, versions
-from abbe.service.workflows.run_geometry import geometry
-from abbe.service.workflows.run_times import times
-from abbe.service.workflows.solve import _whole
+from abbe.service.identification.solve import _whole
 
 MACHINE = {"chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 

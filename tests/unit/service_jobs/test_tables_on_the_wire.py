@@ -9,8 +9,8 @@ from abbe.drivers.cnc.tables import encode
 from abbe.models.compensation.tables import NineTables, quantise
 from abbe.service.errors import TableRefused
 from abbe.service.push.limits import PushLimits
-from abbe.service.push.meaning import meaning_of_bytes, meaning_of_tables
-from abbe.service.workflows.tables import added, check_limits, table_image
+from abbe.service.push.semantic_digest import meaning_of_bytes, meaning_of_tables
+from abbe.service.tables.nine_tables import added, check_limits, table_image
 
 
 def tables(scale: float = 1.0) -> NineTables:

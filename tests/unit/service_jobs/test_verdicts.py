@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.verification import Figure
 from abbe.service.errors import TableRefused
-from abbe.service.workflows.verify import Figures, check_before, decide, judge, overall
+from abbe.service.verification.verify import Figures, check_before, decide, judge, overall
 
 NONE = np.zeros(0)
 

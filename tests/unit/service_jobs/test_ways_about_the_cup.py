@@ -15,7 +15,7 @@ from abbe.service.sequences.bar_tables import bar_table
 from abbe.service.sequences.check import dry_run
 from abbe.service.sequences.recipe_file import parse_recipe
 from abbe.service.sequences.recipes import Circle
-from abbe.service.sequences.rewind import end_of, remounted, rest_of
+from abbe.service.sequences.resume_plan import end_of, remounted, rest_of
 from abbe.service.sequences.setups import shared_setups
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, RecordPath, TakeBarOut
 

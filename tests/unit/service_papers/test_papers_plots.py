@@ -6,12 +6,12 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from abbe.service.report.plots.comparison import Comparison, comparison_plot
-from abbe.service.report.plots.contours import contour_plot, level_lines
-from abbe.service.report.plots.deformed import deformed_grid
-from abbe.service.report.plots.facets import Surface, lobing_plot, surface_plot
-from abbe.service.report.plots.isometric import VIEW, Paper, Window, depth
-from abbe.service.report.plots.signed import SignedScale
+from abbe.service.rendering.plots.comparison import Comparison, comparison_plot
+from abbe.service.rendering.plots.contours import contour_plot, level_lines
+from abbe.service.rendering.plots.deformed import deformed_grid
+from abbe.service.rendering.plots.facets import Surface, lobing_plot, surface_plot
+from abbe.service.rendering.plots.isometric import VIEW, Paper, Window, depth
+from abbe.service.rendering.plots.signed import SignedScale
 
 
 def test_level_line_of_a_cone_is_one_closed_circle():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from abbe.service.report import (
+from abbe.service.rendering import (
     ArrowField,
     Contribution,
     DemoReport,

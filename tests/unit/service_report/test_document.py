@@ -9,13 +9,13 @@ import numpy as np
 import pypdf
 import pytest
 
-from abbe.service.report.document import DECISION_RULE, Document, Figure, Instrument, Picture, TextTable
-from abbe.service.report.document_data import document_csv, document_json
-from abbe.service.report.document_page import document_html, document_pdf, standalone
-from abbe.service.report.model import PolarTrace
-from abbe.service.report.plots.polar import polar_plot
-from abbe.service.report.plots.positioning import PositioningCurves, positioning_plot
-from abbe.service.workflows.report_parts import Rules, judged, verdict_of
+from abbe.service.rendering.document import DECISION_RULE, Document, Figure, Instrument, Picture, TextTable
+from abbe.service.rendering.document_data import document_csv, document_json
+from abbe.service.rendering.document_page import document_html, document_pdf, standalone
+from abbe.service.rendering.model import PolarTrace
+from abbe.service.rendering.plots.polar import polar_plot
+from abbe.service.rendering.plots.positioning import PositioningCurves, positioning_plot
+from abbe.service.report.report_parts import Rules, judged, verdict_of
 
 HOSTILE = '#import "@preview/x:1.0.0" *bold* $x$ </td><script>alert(1)</script> \\ "quoted" {{ 7*7 }} [a] <b> @ref // = Title'
 

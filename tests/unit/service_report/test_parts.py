@@ -11,13 +11,13 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from abbe.service.report import palette
-from abbe.service.report.axes import data_range, nice_step, tick_text, ticks
-from abbe.service.report.model import ArrowField, Contribution, ParameterRow, ResidualSeries, TableCurve
-from abbe.service.report.numbers import plain, tidy, with_uncertainty
-from abbe.service.report.plots import contribution_bars, residual_plot, table_plot, uncertainty_bars, volume_arrows, volume_pair
-from abbe.service.report.plots.volume import MAX_ARROWS, common_scale
-from abbe.service.report.svg import Svg
+from abbe.service.rendering import palette
+from abbe.service.rendering.axes import data_range, nice_step, tick_text, ticks
+from abbe.service.rendering.model import ArrowField, Contribution, ParameterRow, ResidualSeries, TableCurve
+from abbe.service.rendering.numbers import plain, tidy, with_uncertainty
+from abbe.service.rendering.plots import contribution_bars, residual_plot, table_plot, uncertainty_bars, volume_arrows, volume_pair
+from abbe.service.rendering.plots.volume import MAX_ARROWS, common_scale
+from abbe.service.rendering.svg import Svg
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from abbe.service.report import (
+from abbe.service.rendering import (
     ArrowField,
     Contribution,
     DemoReport,
@@ -20,7 +20,7 @@ from abbe.service.report import (
     SummaryRow,
     TableCurve,
 )
-from abbe.service.report.html import render_report
+from abbe.service.rendering.html import render_report
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 HOSTILE = "</title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\x00\x07\ud800"

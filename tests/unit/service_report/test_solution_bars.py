@@ -2,8 +2,8 @@
 
 import re
 
-from abbe.service.report.model import Contribution
-from abbe.service.report.plots.bars import LABELS, WIDTH, contribution_bars
+from abbe.service.rendering.model import Contribution
+from abbe.service.rendering.plots.bars import LABELS, WIDTH, contribution_bars
 
 ROWS = [Contribution("EYY", 45.8512, 10.3), Contribution("EXX", 1.234, 4.0), Contribution("backlash X", 0.004, 0.18)]
 

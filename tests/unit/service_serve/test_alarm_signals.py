@@ -14,22 +14,22 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
+from abbe.service.compensation.push_approved import Outcome
 from abbe.service.errors import StoreError
+from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
 from abbe.service.scheduler import record
-from abbe.service.scheduler.desk import AlarmDesk, Duties, Telling
+from abbe.service.scheduler.alarm_manager import AlarmManager, Duties, Telling
 from abbe.service.scheduler.job import CheckJob
-from abbe.service.scheduler.keep import StoreShelf
+from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import PushEntryRecord, VerificationRecord
-from abbe.service.workflows.alarm_signals import Terms, found_in
-from abbe.service.workflows.alarm_states import NO_ALARM, Alarm, Kind
-from abbe.service.workflows.alarms import acknowledge, alarms_of, open_alarms, series_begins
-from abbe.service.workflows.investigate import Note
-from abbe.service.workflows.push_approved import Outcome
+from abbe.service.verification.alarm_signals import Terms, found_in
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Kind
+from abbe.service.verification.alarms import acknowledge, alarms_of, open_alarms, series_begins
 from tests.unit.service_serve.fakes import FakeClock, FakeWatcher, Result, utc
 
 START = utc(2026, 3, 1, 5)
@@ -125,7 +125,7 @@ class Bench:
             return Outcome("kept", "better")
 
         duties = Duties(14.0, "identification", look_into, push_one if push else None)
-        self.desk = AlarmDesk(store, self.clock, "mill-7", [DAILY], duties, telling)
+        self.desk = AlarmManager(store, self.clock, "mill-7", [DAILY], duties, telling)
         shelf = StoreShelf(store, self.clock, ("mill-7", self.machine_id), TOPICS, lambda: None)
         self.job = CheckJob("mill-7", self._check, shelf, [], self.clock, self.desk.checked)
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abbe.service.workflows.alarm_states import Alarm, Found, Kind, Signal, after_check, folded, is_open, next_step
+from abbe.service.verification.alarm_states import Alarm, Found, Kind, Signal, after_check, folded, is_open, next_step
 
 RECIPE = "quick-check"
 SIGNAL = Signal("helix_rms_um", "limit", 8.8, 0.2, 7.0, "helix rms 8.8 ± 0.2 µm (U, k = 2) is above its limit of 7 µm")

@@ -13,7 +13,7 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.channel.messages import MOST_JOBS, Answer, How, StartJob, SteerJob
 from abbe.service.core.jobs import JobBook
-from abbe.service.core.open_ends import AGAIN_S, LOOK_S, NAME, OpenEnds
+from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, OpenEnds
 from abbe.service.core.rights import may_measure
 from abbe.service.errors import MachineInUse, StillActive, StoreError
 from abbe.service.scheduler.loop import Scheduler

@@ -20,14 +20,14 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, DoneByHand, How, JobSeen, StartJob, SteerJob
 from abbe.service.core.campaigns import CampaignOrder, Campaigns
 from abbe.service.core.jobs import JobBook
-from abbe.service.core.moment import Moments
+from abbe.service.core.snapshot import Moments
 from abbe.service.errors import StoreError, TableMismatch
+from abbe.service.jobs.guided_campaign import Led
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.prompts import Prompts
 from abbe.service.web.board import Board
-from abbe.service.workflows.led_campaign import Led
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
 LED = Led("proposed", "proposal 4 waits for approval", 7, 4)

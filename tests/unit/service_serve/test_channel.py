@@ -23,7 +23,7 @@ from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.errors import ChannelBroken, CoreSilent
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.web import walls
+from abbe.service.web import import_guard
 from abbe.service.web.core_line import QUEUE, SILENT_S, CoreLine
 from tests.unit.service_serve.fakes import FakeClock, settle, utc
 
@@ -258,8 +258,8 @@ def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
     """In a fresh interpreter: everything that the process loads, and what it is refused afterwards."""
     program = (
         "import sys\nfrom abbe.service.web import walls, process\nwalls.build()\nimport abbe.service.web.serving, abbe.service.logs\n"
-        "bad = [name for name in sys.modules if walls.behind(name)]\nassert not bad, bad\n"
-        "for name in ('abbe.drivers.registry', 'pymodbus.client', 'serial', 'abbe.service.push.adapter', 'abbe.service.push.conduct'):\n"
+        "bad = [name for name in sys.modules if import_guard.behind(name)]\nassert not bad, bad\n"
+        "for name in ('abbe.drivers.registry', 'pymodbus.client', 'serial', 'abbe.service.push.adapter', 'abbe.service.push.execute'):\n"
         "    try:\n        __import__(name)\n    except ImportError as error:\n        assert 'does not import' in str(error), error\n"
         "    else:\n        raise AssertionError(name)\nprint('shut')\n"
     )
@@ -269,7 +269,7 @@ def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
 
 def test_the_wall_knows_parts_from_beginnings() -> None:
     assert [
-        walls.behind(name)
+        import_guard.behind(name)
         for name in ("abbe.drivers.registry", "abbe.drivers.api", "serial", "serialise", "abbe.service.web", "abbe.service.core.jobs")
     ] == [
         True,

@@ -16,27 +16,27 @@ import pytest
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import How, JobSeen, SteerJob
+from abbe.service.compensation import push_approved
+from abbe.service.compensation.push_approved import Approved, Order
 from abbe.service.core.jobs import JobBook
-from abbe.service.devices.alone import ENVIRONMENT
+from abbe.service.devices.machine_lock import ENVIRONMENT
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.events import ProgressSink
+from abbe.service.jobs.at_start import push_is_open
+from abbe.service.jobs.investigate import Bench as Investigation
+from abbe.service.jobs.investigate import Note, investigate
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import State as Push
-from abbe.service.scheduler.desk import AlarmDesk, Duties, Telling
+from abbe.service.scheduler.alarm_manager import AlarmManager, Duties, Telling
 from abbe.service.scheduler.loop import Scheduler, Terms
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.records import AlarmEntryRecord
-from abbe.service.workflows import push_approved
-from abbe.service.workflows.alarm_states import NO_ALARM, Alarm, Kind
-from abbe.service.workflows.alarms import alarms_of
-from abbe.service.workflows.at_start import push_is_open
-from abbe.service.workflows.investigate import Bench as Investigation
-from abbe.service.workflows.investigate import Note, investigate
-from abbe.service.workflows.push_approved import Approved, Order
-from abbe.service.workflows.push_word import Outcome, by_journal, open_push
+from abbe.service.tables.push_outcome import Outcome, by_journal, open_push
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Kind
+from abbe.service.verification.alarms import alarms_of
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, utc
 
 NOON = utc(2026, 6, 1, 12)
@@ -72,7 +72,7 @@ class Bench:
     def __post_init__(self) -> None:
         self.machine = self.store.add_machine("mill-7", {"name": "mill-7"})
         duties = Duties(0.0, "identification", self._investigate, self._push)
-        self.desk = AlarmDesk(
+        self.desk = AlarmManager(
             self.store, self.clock, "mill-7", [YEARLY], duties, Telling(None, lambda: None, AuditBook(self.store, self.url))
         )
         self.book = JobBook(self._check, ("quick-check",), self._may, self.clock, lambda: None)
@@ -256,7 +256,7 @@ async def test_work_that_ends_by_itself_is_not_touched_by_an_abort() -> None:
 
 HOLDER = """
 import sys
-from abbe.service.devices.alone import alone
+from abbe.service.devices.machine_lock import alone
 with alone(sys.argv[1]):
     print("has it", flush=True)
     sys.stdin.readline()
@@ -373,7 +373,7 @@ async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(be
     bench.push = push
     bench.clock.sleep = lambda s: asyncio.sleep(0)  # type: ignore[method-assign]
     with monkeypatch.context() as patch:
-        patch.setattr("abbe.service.scheduler.desk.by_journal", _unreadable)
+        patch.setattr("abbe.service.scheduler.alarm_manager.by_journal", _unreadable)
         with pytest.raises(StoreError):
             await bench.pushed()
     assert [line.kind for line in bench.lines()] == [Kind.PUSHING]

@@ -13,7 +13,7 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.errors import StoreError
 from abbe.service.scheduler import record
-from abbe.service.scheduler.keep import PAUSES_S, StoreLedger, StoreShelf
+from abbe.service.scheduler.retrying_store import PAUSES_S, StoreLedger, StoreShelf
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from tests.unit.service_serve.fakes import FakeClock, Result, utc

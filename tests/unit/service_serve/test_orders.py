@@ -18,6 +18,7 @@ import pytest
 from abbe.drivers.cnc.tables import crc32
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, JobSeen, RollBack, StartJob
+from abbe.service.compensation.ordered_rollback import BackOrder
 from abbe.service.core.jobs import JobBook
 from abbe.service.core.orders import Ground, Hands, Orders
 from abbe.service.core.rights import may
@@ -26,13 +27,12 @@ from abbe.service.push.states import S, State
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
+from abbe.service.tables.push_history import KIND
+from abbe.service.tables.push_outcome import Outcome
+from abbe.service.tables.table_history import story
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.users.roles import Permission, Role
-from abbe.service.workflows.bring_back import BackOrder
-from abbe.service.workflows.push_history import KIND
-from abbe.service.workflows.push_word import Outcome
-from abbe.service.workflows.table_story import story
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 

@@ -13,8 +13,8 @@ from abbe.drivers.errors import LinkDown
 from abbe.service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWatch
 from abbe.service.push.entries import Entry
 from abbe.service.push.states import State
-from abbe.service.workflows.in_force import InForce
-from abbe.service.workflows.push_history import wanted_by
+from abbe.service.tables.in_force import InForce
+from abbe.service.tables.push_history import wanted_by
 from tests.unit.service_serve.fakes import FakeClock, FakeShelf, settle, utc
 
 OURS = InForce(0, 0xA, 0xA)

@@ -17,8 +17,8 @@ from abbe.service.users.people import IDLE
 from abbe.service.users.roles import Permission
 from abbe.service.web.access import needs
 from abbe.service.web.app import as_in_host_header, create_app
-from abbe.service.web.door import Door, Front
-from abbe.service.web.guard import CSRF_HEADER
+from abbe.service.web.auth_middleware import CSRF_HEADER
+from abbe.service.web.authentication import Door, Front
 from tests.unit.service_users.conftest import PHRASE, World
 from tests.unit.service_users.test_access import BASE, OWN, Gate, app_of, gate, log_in
 

@@ -16,6 +16,12 @@ from fastapi import FastAPI
 from abbe.drivers.api import BarSample, CompStatus, TableFormat
 from abbe.drivers.cnc.tables import TableImage, crc32, encode
 from abbe.service.audit.book import AuditBook
+from abbe.service.campaign_data.campaign_folder import from_store
+from abbe.service.compensation.proposal_doc import digest_of_doc, doc_of, load
+from abbe.service.compensation.proposals import Gathered, make
+from abbe.service.discovery.discover import discover, prepare
+from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import State
@@ -23,24 +29,18 @@ from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_js
 from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
+from abbe.service.tables.base_table import Base
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.users.roles import ALLOWED, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
+from abbe.service.web.auth_middleware import CSRF_HEADER
+from abbe.service.web.authentication import COOKIE, Door, csrf_token
 from abbe.service.web.board import Board
-from abbe.service.web.door import COOKIE, Door, csrf_token
-from abbe.service.web.guard import CSRF_HEADER
 from abbe.service.web.listening import bind
 from abbe.service.web.server import make_server
 from abbe.service.web.view import View
-from abbe.service.workflows.base_table import Base
-from abbe.service.workflows.campaign_folder import from_store
-from abbe.service.workflows.discover import discover, prepare
-from abbe.service.workflows.discovery_store import journal_of
-from abbe.service.workflows.effect_catalogue import catalogue
-from abbe.service.workflows.proposal_doc import digest_of_doc, doc_of, load
-from abbe.service.workflows.proposals import Gathered, make
 from tests.unit.service.discovery_bench import MACHINE, Search, write_case
 
 PHRASE = "correct horse battery staple"

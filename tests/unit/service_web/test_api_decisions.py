@@ -9,11 +9,11 @@ from typing import Any
 import httpx
 import pytest
 
+from abbe.service.compensation.proposal_checks import reject, valid_approval
+from abbe.service.compensation.proposal_doc import load
+from abbe.service.compensation.proposal_states import check_waiting, standing
 from abbe.service.errors import TableRefused
 from abbe.service.storage.store_decisions import RejectionRecord
-from abbe.service.workflows.proposal_checks import reject, valid_approval
-from abbe.service.workflows.proposal_doc import load
-from abbe.service.workflows.proposal_states import check_waiting, standing
 from tests.unit.service_web.api_bench import Plant
 
 BASE = "http://127.0.0.1:8080"
@@ -128,7 +128,7 @@ async def test_a_rejection_is_final_and_says_why(client, plant, fresh):
 
 
 async def test_a_push_is_told_of_a_rejection(plant, fresh):
-    from abbe.service.workflows.proposal_checks import Held
+    from abbe.service.compensation.proposal_checks import Held
 
     rejection = reject(plant.store, fresh, "somebody", "no", "user:somebody")
     assert isinstance(rejection, RejectionRecord)

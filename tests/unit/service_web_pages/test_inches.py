@@ -16,8 +16,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from abbe.service.report.numbers import MM, Unit
+from abbe.service.identification.solution_field import stored_field
+from abbe.service.rendering.numbers import MM, Unit
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
+from abbe.service.verification.compare_runs import Curve, Difference, Loaded, curve, figure_rows
 from abbe.service.web import frame, language
 from abbe.service.web.frame import Frame
 from abbe.service.web.page import environment
@@ -28,9 +31,6 @@ from abbe.service.web.pages.runs import run_document
 from abbe.service.web.pages.whatif import forecast
 from abbe.service.web.schemas import Job
 from abbe.service.web.units import INCH, METRIC
-from abbe.service.workflows.compare_runs import Curve, Difference, Loaded, curve, figure_rows
-from abbe.service.workflows.report_parts import Rules
-from abbe.service.workflows.solution_field import stored_field
 from tests.pages_world import Served, as_user
 from tests.unit.service_web_pages.test_rehearsal import PLANS, TOLD
 from tests.unit.service_web_pages.test_result_screens import observed, runs_of

@@ -14,13 +14,13 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, JobSeen, PushNow
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.push_approved import Order
 from abbe.service.core.jobs import JobBook
 from abbe.service.core.orders import Ground, Hands, Orders
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
+from abbe.service.tables.push_outcome import Outcome
 from abbe.service.web.pages.proposals import approve_as
-from abbe.service.workflows.push_approved import Order
-from abbe.service.workflows.push_word import Outcome
 from tests.pages_world import Filled, Served
 from tests.pretended_push import TAKEN_BACK, as_if_pushed
 from tests.unit.service_serve.fakes import FakeLedger, FakeShelf

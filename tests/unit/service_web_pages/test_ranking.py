@@ -10,9 +10,9 @@ import pytest
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
 from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
 from abbe.service.web.pages.ranking import NODES, Ranked, ranking
-from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.pages_world import solved_campaign
 
 POINTS_ALONE = ("EYY", "ECZ", "EXX", "C0Y")

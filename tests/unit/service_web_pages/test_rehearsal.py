@@ -8,6 +8,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
+from abbe.service.campaigns.builtin_recipes import RATES_HZ, named, parted, recipe_plan
 from abbe.service.channel.messages import MachineTold, RulesTold
 from abbe.service.clock import SystemClock
 from abbe.service.errors import ConfigError
@@ -19,7 +20,6 @@ from abbe.service.web.page import HERE, environment
 from abbe.service.web.pages.new import expired
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 from abbe.service.web.schemas_jobs import LONGEST_RECIPE
-from abbe.service.workflows.shipped import RATES_HZ, named, parted, recipe_plan
 from tests.unit.service_serve.fakes import utc
 
 STROKES = {"X": (0.0, 600.0), "Y": (0.0, 500.0), "Z": (0.0, 450.0)}

@@ -12,13 +12,13 @@ from scipy.stats import chi2
 from abbe.models.functions.motions import motion_names
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.models.verification import U_REPEAT_MM
+from abbe.service.identification.stored_prediction import stored_prediction
+from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
 from abbe.service.site import machine_from_doc
+from abbe.service.verification.compare_runs import Difference, Loaded, curve, difference, remarks
 from abbe.service.web.api.field import Motion
 from abbe.service.web.pages.runs import run_document
-from abbe.service.workflows.compare_runs import Difference, Loaded, curve, difference, remarks
-from abbe.service.workflows.report_parts import Rules
-from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.pages_world import Served, as_user
 
 

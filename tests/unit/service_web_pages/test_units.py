@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from abbe.service.report.numbers import MM, placed
+from abbe.service.rendering.numbers import MM, placed
 from abbe.service.web.pages.budget import _interval
 from abbe.service.web.units import INCH, METRIC, converted, drawn_in, rounded, shown, unit_in
 

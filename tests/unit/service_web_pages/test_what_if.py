@@ -21,8 +21,8 @@ from abbe.models.uncertainty.what_if import Outcome, check_figures, diagonal_fig
 from abbe.models.verification import diagonal_figure
 from abbe.models.verification import helix_figure as measured_helix
 from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
-from abbe.service.workflows.stored_prediction import stored_prediction
 from tests.pages_world import solved_campaign
 
 

@@ -1,0 +1,229 @@
+"""Where the gap lives: tests of whitened residuals by run, axis, direction, feed, time, place, frequency and temperature.
+
+Every p-value is family-wise (Sidak over everything that was looked at). Energy is looked at reading by reading and in sums over blocks,
+which see what is smooth; noise counts with a little more variance than it is said to have (`ROOM`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Significance, Where
+from abbe.models.discovery.signal_localization import where_of_signal
+from abbe.models.effects.path import Path
+from abbe.models.machine import AXES
+from abbe.models.probability import chi2_above, normal_above
+
+BLOCKS = 12
+"""Readings of a run are summed in so many blocks, of one size."""
+LAGS = 10
+SIGNIFICANT = 0.01
+CELLS = 4
+"""Position cells along each axis."""
+LEAST = 20
+NEIGHBOURS, DIFFER = " (neighbours)", " up and down differ"
+"""What the table adds to the name of a run or an axis: how it was tested."""
+ROOM = 1.15
+"""Energy is judged with so much more variance than the noise is said to have: its size is known to some percent only."""
+
+
+@dataclass(frozen=True)
+class _Group:
+    kind: str
+    value: str
+    statistic: float
+    p: float
+    rows: np.ndarray[tuple[int], np.dtype[np.bool_]] | None = None
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Readings of all runs: residual, block sums with a variance of one each, and what they are grouped by."""
+
+    rest: F1
+    run: np.ndarray[tuple[int], np.dtype[np.intp]]
+    block: np.ndarray[tuple[int], np.dtype[np.intp]]
+
+
+def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Where:
+    """Where what is left of the readings is more than noise.
+
+    Parameters
+    ----------
+    paths : runs.
+    whitened : one array (n,) per run
+        Whitened residuals, unit variance for noise alone; exact zeros count as no reading.
+
+    Returns
+    -------
+    Where
+        ``table``: every test that was made, smallest p first. The other fields: what of it is significant (1 %, family-wise); empty where
+        nothing is.
+    """
+    rows = _rows(paths, whitened)
+    found = [
+        *_by_group(paths, rows),
+        *_whiteness(paths, whitened),
+        *_direction(paths, rows),
+        *_temperature(paths, rows),
+        *_lines(paths, rows),
+    ]
+    tried = max(len(found), 1)
+    table = sorted(
+        (replace(g, p=float(-np.expm1(tried * np.log1p(-min(g.p, 1.0 - 1e-12))))) for g in found), key=lambda g: (g.p, g.kind, g.value)
+    )
+    significant = [g for g in table if g.p < SIGNIFICANT]
+    table_out = tuple(Significance(g.kind, g.value, g.statistic, g.p) for g in table)
+    if not significant:
+        return Where(table=table_out)
+
+    def values(kind: str) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(g.value.removesuffix(NEIGHBOURS).removesuffix(DIFFER) for g in significant if g.kind == kind))
+
+    spread = where_of_signal(paths, _excess(rows, paths))
+    return Where(
+        tests=values("test") or values("instrument"), axes=values("axis"), directions=tuple(int(v) for v in values("direction")),
+        runs=values("run"), time_s=spread.time_s, position_mm=spread.position_mm, radius_mm=spread.radius_mm,
+        depends_on=tuple(dict.fromkeys(DEPENDS[g.kind] for g in significant if g.kind in DEPENDS)), table=table_out,
+    )  # fmt: skip
+
+
+DEPENDS = {
+    "direction": "direction",
+    "feed": "feed",
+    "time": "time",
+    "position": "position",
+    "temperature": "temperature",
+    "frequency": "time",
+}
+
+
+def _rows(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> _Rows:
+    run = np.repeat(np.arange(len(paths)), [p.n for p in paths])
+    block, first = np.zeros(len(run), dtype=np.intp), 0
+    for k, p in enumerate(paths):
+        count = max(min(BLOCKS, p.n // 4), 1)
+        block[run == k] = first + np.arange(p.n) * count // max(p.n, 1)
+        first += count
+    return _Rows(np.concatenate(whitened), run, block)
+
+
+def _excess(rows: _Rows, paths: tuple[Path, ...]) -> tuple[F1, ...]:
+    """Root of the energy above noise, smoothed over blocks, by run."""
+    count = np.bincount(rows.block)
+    total = np.bincount(rows.block, rows.rest) ** 2 / np.maximum(count, 1)
+    energy = np.bincount(rows.block, rows.rest**2) - count
+    above = np.maximum(np.maximum(total - 6.0, energy / np.sqrt(2.0 * np.maximum(count, 1)) - 3.0), 0.0)
+    return tuple(np.split(np.sqrt(above / np.maximum(count, 1))[rows.block], np.cumsum([p.n for p in paths])[:-1]))
+
+
+def _by_group(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
+    """Energy of readings and of block sums in groups of readings."""
+    q = np.concatenate([p.at.q_mm for p in paths])
+    look = np.concatenate([p.look**2 for p in paths])
+    for kind, names in (
+        ("run", [p.label for p in paths]), ("test", [p.test for p in paths]), ("instrument", [p.kind for p in paths]),
+    ):  # fmt: skip
+        named = np.array(names)[rows.run]
+        for name in dict.fromkeys(names):
+            yield _energy(kind, name, rows, (named == name).astype(np.float64))
+    feed = np.concatenate([np.round(p.feed_mm_min) for p in paths])
+    for f in np.unique(feed)[:12]:
+        yield _energy("feed", f"{f:g}", rows, (feed == f).astype(np.float64))
+    for a, axis in enumerate(AXES):
+        yield _energy("axis", axis, rows, look[:, a] ** 2)
+        edges = np.linspace(q[:, a].min(), q[:, a].max() + 1e-9, CELLS + 1)
+        for low, high in pairwise(edges):
+            yield _energy("position", f"{axis} {low:.0f} to {high:.0f} mm", rows, ((q[:, a] >= low) & (q[:, a] < high)).astype(np.float64))
+    t = np.concatenate([p.at.t_s for p in paths])
+    for setup in dict.fromkeys(p.setup for p in paths):
+        inside = np.isin(rows.run, [k for k, p in enumerate(paths) if p.setup == setup])
+        yield _energy("time", f"{t[inside].min():.0f} to {t[inside].max():.0f} s", rows, inside.astype(np.float64))
+
+
+def _energy(kind: str, value: str, rows: _Rows, weight: F1) -> _Group:
+    """Weighted energy of block sums and of single readings against that of noise; both count, the smaller p twice."""
+    read = rows.rest != 0.0
+    w = weight * read
+    count = np.bincount(rows.block, read)
+    mean = np.bincount(rows.block, w) / np.maximum(count, 1)
+    sums = np.bincount(rows.block, rows.rest) ** 2 / np.maximum(count, 1)
+    p_block = _weighted_p(mean[count > 3], sums[count > 3])
+    p_single = _weighted_p(w[read], rows.rest[read] ** 2)
+    statistic = float(w @ rows.rest**2 / max(w.sum(), 1e-12))
+    return _Group(kind, value, statistic, min(1.0, 2.0 * min(p_block, p_single)))
+
+
+def _weighted_p(weight: F1, square: F1) -> float:
+    """Chance of a weighted sum of chi-squares this large (Satterthwaite)."""
+    if weight.sum() <= 0:
+        return 1.0
+    scale, freedom = float(weight @ weight / weight.sum()), float(weight.sum() ** 2 / (weight @ weight))
+    return float(chi2_above(weight @ square / (scale * ROOM), freedom)) if freedom >= 2.0 else 1.0
+
+
+def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_Group]:
+    """Ljung-Box per run, of the first ten lags."""
+    for p, r in zip(paths, whitened, strict=True):
+        if p.n < 4 * LAGS:
+            continue
+        e = r - r.mean()
+        rho = np.array([e[k:] @ e[:-k] for k in range(1, LAGS + 1)]) / max(float(e @ e), 1e-300)
+        q = p.n * (p.n + 2.0) * float(np.sum(rho**2 / (p.n - np.arange(1, LAGS + 1))))
+        yield _Group("run", p.label + NEIGHBOURS, q / LAGS, float(chi2_above(q / ROOM**2, LAGS)))
+
+
+def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
+    """Whether an axis reads otherwise on the way up than on the way down; and energy of each direction of the path."""
+    way = np.concatenate([np.sign(p.direction) for p in paths])
+    for d in (1, -1):
+        yield _energy("direction", f"{d:d}", rows, (way == d).astype(np.float64))
+    sign = np.concatenate([p.at.sign * p.look for p in paths])
+    for a, axis in enumerate(AXES):
+        z = _score(sign[:, a], rows)
+        yield _Group("axis", axis + DIFFER, z, float(2.0 * normal_above(abs(z) / np.sqrt(ROOM))))
+
+
+def _temperature(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
+    """Whether the reading follows a sensor, along any axis."""
+    for sensor in sorted(set.intersection(*(set(p.at.temp_c) for p in paths)) if paths else ()):
+        value = np.concatenate([p.at.temp_c[sensor] for p in paths])
+        if np.ptp(value) < 0.05:
+            continue
+        moved = [np.concatenate([p.look[:, a] * (p.at.q_mm[:, a] - p.machine.centre_mm[a]) for p in paths]) for a in range(3)]
+        z = max((_score((value - value.mean()) * m, rows) for m in moved), key=abs)
+        yield _Group("temperature", sensor, z, min(1.0, float(6.0 * normal_above(abs(z) / np.sqrt(ROOM)))))
+
+
+def _score(column: F1, rows: _Rows) -> float:
+    """Product of a column with the residual in standard deviations, from the sums over blocks."""
+    parts = np.bincount(rows.block, column * rows.rest)
+    return float(parts.sum() / np.sqrt(max(float(np.sum((column * (rows.rest != 0)) ** 2)), 1e-300)))
+
+
+def _lines(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
+    """Strongest line on the clock between 1/100 Hz and 1/15 Hz, over all bar runs, along each axis."""
+    bars = [k for k, p in enumerate(paths) if p.kind == "bar"]
+    inside = np.isin(rows.run, bars)
+    if inside.sum() < LEAST:
+        return
+    t = np.concatenate([p.at.t_s for p in paths])[inside]
+    look = np.concatenate([p.look for p in paths])[inside]
+    rest = rows.rest[inside]
+    size = int(2 ** np.ceil(np.log2(2.5 * np.ptp(t) + 2.0)))
+    f = np.arange(size // 2 + 1) / size
+    band = (f > 0.01) & (f < 1.0 / 15.0)
+    cell = (t - t.min()).astype(np.intp)
+    for a, axis in enumerate(AXES):
+        power = np.abs(np.fft.rfft(np.bincount(cell, look[:, a] * rest, size))[band]) ** 2 / max(
+            0.5 * float(look[:, a] @ look[:, a]), 1e-12
+        )
+        k = int(np.argmax(power))
+        tried = max(float(np.ptp(t)) * (1.0 / 15.0 - 0.01), 1.0)
+        p = float(-np.expm1(tried * np.log1p(-np.exp(-min(0.5 * power[k] / ROOM, 700.0)) * (1 - 1e-12))))
+        yield _Group("frequency", f"{axis}, period {1.0 / f[band][k]:.1f} s", float(power[k]), p)

@@ -1,0 +1,1 @@
+"""Backup and restore of a database with its samples and its audit."""

@@ -1,0 +1,200 @@
+"""`abbe backup`: database, samples that it does not have yet and audit, as of one moment, while the service goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from abbe.service.audit.book import AuditBook, this_account
+from abbe.service.audit.chain import Event
+from abbe.service.backup.backup_files import (
+    CAPTURE,
+    DATABASE,
+    FORMAT,
+    HEADS,
+    KEY,
+    LIST,
+    MACHINE,
+    audit_faults,
+    counts,
+    listed,
+)
+from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
+from abbe.service.errors import BackupRefused
+from abbe.service.secrets import mask_secrets
+from abbe.service.storage.copying import copy_online, prove_copy, rows_of, sync_file
+from abbe.service.storage.engine import parse_url
+from abbe.service.storage.store import Store
+
+SERVER_HELP = "copy it with pg_dump --format=custom, bring it back with pg_restore (docs/how-to/backup.md)"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What is backed up.
+
+    Parameters
+    ----------
+    url : str
+        Database.
+    capture : CaptureSettings
+        Where samples are before the database has them.
+    machine_file : Path or None
+        Copied along.
+    """
+
+    url: str
+    capture: CaptureSettings
+    machine_file: Path | None = None
+
+
+def sqlite_file(url: str, what: str) -> Path:
+    """Path of the SQLite file of a URL.
+
+    Raises
+    ------
+    BackupRefused
+        It is on a server, or in memory.
+    """
+    parsed = parse_url(url)
+    if parsed.drivername != "sqlite":
+        raise BackupRefused(f"abbe {what} copies SQLite files, and {mask_secrets(url)} is on a PostgreSQL server", SERVER_HELP)
+    if parsed.database in {None, "", ":memory:"}:
+        raise BackupRefused(f"{url} is in memory only", "give the URL of a file, e.g. sqlite:///abbe.sqlite3")
+    return Path(str(parsed.database))
+
+
+def back_up(source: Source, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> dict[str, Any]:
+    """Make a backup: a new folder (0700, files 0600) that is there as a whole or not at all. Nothing is interrupted by it.
+
+    Everything that was on the disk when this was called is in it: samples first, for they leave their segment only when the database has
+    them; then the database as of one instant; the audit's heads last, as far as that database goes.
+
+    Parameters
+    ----------
+    source : Source
+        What.
+    target : Path
+        New folder.
+    utcnow : callable
+        Clock.
+    with_key : bool
+        Whether the audit's key goes along. Without it, whoever has the backup cannot make an audit up, and `restore` asks for it.
+
+    Returns
+    -------
+    dict
+        The backup's list (``backup.json``). ``audit.faults``: what is wrong with the audit that was copied.
+
+    Raises
+    ------
+    BackupRefused
+        The folder exists or cannot be made, or the database is on a server.
+    StoreError
+        The database cannot be copied, or the copy is damaged.
+    """
+    database = sqlite_file(source.url, "backup")
+    if not database.is_file():
+        raise BackupRefused(f"there is no database {database}", "give a machine file or --store URL")
+    part = _new_folder(target)
+    try:
+        doc = _fill(part, database, source, utcnow, with_key=with_key)
+        os.rename(part, target)
+        sync_file(target.parent)
+    except OSError as err:
+        raise BackupRefused(f"{target} could not be written: {err.strerror}", "look at disk space and rights; nothing was left") from err
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    with Store.open(source.url) as store:
+        told = {"made_utc": doc["made_utc"], "key": "with" if with_key else "without"}
+        AuditBook(store, source.url).write(Event(this_account(), "abbe backup", str(target), "done", told))
+    return doc
+
+
+def _new_folder(target: Path) -> Path:
+    if target.exists():
+        raise BackupRefused(f"{target} exists", "give the name of a new folder; a backup never overwrites")
+    part = target.parent / f".{target.name}.part-{secrets.token_hex(4)}"
+    try:
+        part.mkdir(mode=0o700)
+    except OSError as err:
+        raise BackupRefused(f"{target} cannot be made: {err.strerror}", "give a folder that exists and may be written") from None
+    return part
+
+
+def _fill(part: Path, database: Path, source: Source, utcnow: Callable[[], datetime], *, with_key: bool) -> dict[str, Any]:
+    made = utcnow().isoformat(timespec="seconds")
+    segments = _segments(part / CAPTURE, source)
+    copy_online(database, part / DATABASE)
+    revision = prove_copy(part / DATABASE)
+    audit = _audit(part, source, with_key=with_key)
+    if source.machine_file is not None:
+        _copied(source.machine_file, part / MACHINE)
+    doc = {
+        "format": FORMAT,
+        "made_utc": made,
+        "abbe": version("abbe"),
+        "source": mask_secrets(source.url),
+        "database_id": str(rows_of(part / DATABASE, "SELECT uid FROM identity")[0][0]) if revision >= "0004" else "",
+        "schema": revision,
+        "rows": counts(part / DATABASE),
+        "segments": segments,
+        "audit": audit,
+        "files": listed(part),
+    }
+    (part / LIST).touch(mode=0o600)
+    (part / LIST).write_text(json.dumps(doc, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    for path in [*part.rglob("*"), part]:
+        sync_file(path)
+    return doc
+
+
+def _segments(folder: Path, source: Source) -> int:
+    """Copy what the capture holds; a segment that goes away meanwhile is in the database, which is copied after it."""
+    own = segment_folder(source.url, source.capture)
+    found = [path for one in (own, *other_folders(source.url, source.capture, own)) for path in sorted(one.glob("run-*"))]
+    if found:
+        folder.mkdir(mode=0o700)
+    copied = 0
+    for path in found:
+        target = folder / path.name
+        if target.exists():  # of two folders: the present one's counts
+            continue
+        try:
+            _copied(path, target)
+        except FileNotFoundError:
+            target.unlink(missing_ok=True)
+            continue
+        copied += 1
+    return copied
+
+
+def _audit(part: Path, source: Source, *, with_key: bool) -> dict[str, Any]:
+    """Copy the audit's files: heads after the database, so that none is missing, and none beyond what the copied database holds."""
+    with Store.open(source.url) as store:
+        book = AuditBook(store, source.url)
+    if not book.key_file.exists():
+        return {"records": audit_faults(part / DATABASE, part / HEADS, None)[0], "key": False, "faults": []}
+    last = int(rows_of(part / DATABASE, "SELECT coalesce(max(id), 0) FROM audit")[0][0])
+    lines = book.head_file.read_text(encoding="ascii", errors="replace").splitlines(keepends=True) if book.head_file.exists() else []
+    kept = [line for line in lines if not (number := line.partition(" ")[0]).isdigit() or int(number) <= last]
+    (part / HEADS).touch(mode=0o600)
+    (part / HEADS).write_text("".join(kept), encoding="ascii", errors="replace")
+    records, found = audit_faults(part / DATABASE, part / HEADS, book.key_file)
+    if with_key:
+        _copied(book.key_file, part / KEY)
+    return {"records": records, "key": with_key, "faults": found}
+
+
+def _copied(source: Path, target: Path) -> None:
+    """Copy a file into one that only its owner may read."""
+    with source.open("rb") as origin, os.fdopen(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as copy:
+        shutil.copyfileobj(origin, copy)

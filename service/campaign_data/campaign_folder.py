@@ -1,0 +1,143 @@
+"""Where a campaign comes from: the store, or a folder with campaign.json that is read, checked and, if asked for, stored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from abbe.service.campaign_data.provenance import machine_digest, run_digest
+from abbe.service.devices.urls import DeviceUrls
+from abbe.service.errors import CampaignRefused
+from abbe.service.runs.cases import set_once
+from abbe.service.runs.columns import load_run
+from abbe.service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
+from abbe.service.site import Site, machine_from_doc
+from abbe.service.storage.store import Store
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign as a solver takes it. ``folder``: where it was read from; None for one of the store. ``doc``: its campaign object."""
+
+    name: str
+    site: Site
+    runs: list[dict[str, Any]]
+    folder: Path | None
+    doc: dict[str, Any] = field(default_factory=dict)
+
+    def without(self, labels: list[str]) -> Campaign:
+        """The campaign without some of its runs.
+
+        Raises
+        ------
+        CampaignRefused
+            There is no such run.
+        """
+        names = [r["run_id"] for r in self.runs]
+        missing = [n for n in labels if n not in names]
+        if missing:
+            raise CampaignRefused(f"campaign {self.name} has no run {missing[0]}", f"it has {', '.join(names)}")
+        return Campaign(self.name, self.site, [r for r in self.runs if r["run_id"] not in labels], self.folder, self.doc)
+
+
+def is_folder(campaign: str) -> bool:
+    """Whether an argument names a campaign folder and not a campaign of the store."""
+    return (Path(campaign) / CAMPAIGN_FILE).exists() or Path(campaign).is_dir()
+
+
+def from_folder(folder: Path) -> Campaign:
+    """Read and check a campaign folder.
+
+    Raises
+    ------
+    FileFormatError
+        For the first mistake in any file.
+    """
+    content = read_folder(folder)
+    return _campaign(content.campaign["campaign"], content.campaign, content.runs, folder)
+
+
+def from_store(store: Store, name: str) -> Campaign:
+    """Complete runs of a campaign in the store.
+
+    Raises
+    ------
+    StoreError
+        There is no such campaign.
+    """
+    record = store.campaign(name)
+    runs = [load_run(store, r.id) for r in store.runs(record.id) if r.visible_status == "complete"]
+    known = record.doc.get("imported") or record.doc
+    doc = known | {"campaign": record.name, "machine": store.machine(record.machine_id).doc}
+    return _campaign(record.name, doc, runs, None)
+
+
+def _campaign(name: str, doc: dict[str, Any], runs: list[dict[str, Any]], folder: Path | None) -> Campaign:
+    machine = doc["machine"]
+    site = Site(str(machine.get("name") or name), machine_from_doc(machine), machine, DeviceUrls())
+    return Campaign(name, site, set_once(runs), folder, doc)
+
+
+def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any]:
+    """Store a solution with its runs; a folder is imported first, unless its campaign is there already.
+
+    Returns
+    -------
+    dict
+        What the document learns by it: ``run_ids``, ``solution_id``, and ``same_as``: earlier solutions of the same readings and model.
+
+    Raises
+    ------
+    StoreError
+        It cannot be written.
+    CampaignRefused
+        Another campaign of this name is in the store.
+    """
+    ids = ensure_stored(store, campaign)
+    record = store.campaign(campaign.name)
+    used = [ids[label] for label in doc["inputs"]["runs"]]
+    same = [s.id for s in store.solutions(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
+    told = {"run_ids": used, "same_as": same}
+    return told | {"solution_id": store.add_solution(record.id, "joint", used, doc | told)}
+
+
+def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
+    """Have a campaign in the store: a folder is imported, unless it is there already. Returns the numbers of its runs by their labels.
+
+    Raises
+    ------
+    StoreError
+        It cannot be written.
+    CampaignRefused
+        Another campaign of this name is in the store.
+    """
+    if campaign.folder is not None and all(c.name != campaign.name for c in store.campaigns()):
+        import_folder(store, campaign.folder)
+    record = store.campaign(campaign.name)
+    ids = {r.label: r.id for r in store.runs(record.id) if r.visible_status == "complete"}
+    if campaign.folder is not None:
+        _check_same(store, campaign, store.machine(record.machine_id).doc, ids)
+    return ids
+
+
+def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: dict[str, int]) -> None:
+    """The stored campaign must be of the same machine and hold the same readings with the same set-ups: solutions refer to its runs."""
+    differs = None
+    there = {r["run_id"]: r for r in set_once([load_run(store, number) for number in ids.values()])}
+    if machine_digest(machine_from_doc(machine)) != machine_digest(campaign.site.machine):
+        differs = "the machine (chain, strokes, pivots or tool)"
+    for run in campaign.runs:
+        if differs is None and run["role"] == "identify":
+            stored = there.get(run["run_id"])
+            if stored is None:
+                differs = f"run {run['run_id']} is missing there"
+            elif stored["columns"] != run["columns"]:
+                differs = f"run {run['run_id']}"
+            elif run_digest(stored) != run_digest(run) or stored["role"] != run["role"]:
+                differs = f"test, role or set-up of run {run['run_id']}"
+    if differs is not None:
+        what = differs if differs.endswith("there") else f"{differs} differs"
+        raise CampaignRefused(
+            f"the store has another campaign {campaign.name!r}: {what}", "rename the folder's campaign, or use another --db"
+        )

@@ -1,0 +1,82 @@
+"""Are the times of a run seconds of the campaign's clock? Against its own feed, and against the other runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from abbe.service.campaign_data.campaign_issue import Finding
+
+Doc = dict[str, Any]
+FASTEST = 0.2
+"""No run takes less than this of path length over feed: the feed is what was programmed."""
+SLOWEST = {"ballbar": 10.0, "laser": 200.0}
+"""A ball-bar moves steadily; a laser run stands still at every point."""
+OVERLAP = 0.1
+"""Share of the shorter of two runs that may lie in the other: clocks are not set to the second."""
+UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
+
+
+def times(runs: Sequence[Doc]) -> list[Finding]:
+    """Flags of runs whose t_s does not fit their feed, and of runs that were measured while others were."""
+    out = [f for run in runs for f in (*_clocks(run), *_against_feed(run))]
+    known = {f.run for f in out}
+    return out + _overlaps([r for r in runs if r["run_id"] not in known])
+
+
+def _clocks(run: Doc) -> list[Finding]:
+    """What the clocks of a run that was measured here contradict each other in (abbe.service.runs.clocks)."""
+    trouble = (run.get("timing") or {}).get("trouble")
+    return [Finding(run["run_id"], str(trouble), "look at the sync cable and the links, then measure it again", False)] if trouble else []
+
+
+def _against_feed(run: Doc) -> list[Finding]:
+    columns = run["columns"]
+    if columns.get("feed_mm_min") is None:
+        return []
+    points = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
+    t, feed = (np.asarray(columns[k], dtype=np.float64) for k in ("t_s", "feed_mm_min"))
+    if len(points) < 2 or not all(np.isfinite(v).all() for v in (points, t, feed)) or feed.min() <= 0.0:
+        return []
+    wanted = float((np.linalg.norm(np.diff(points, axis=0), axis=1) * 60.0 / feed[1:]).sum())
+    if wanted <= 0.0:
+        return []
+    waited = np.sort(np.diff(t))[::-1][: len((run.get("timing") or {}).get("pieces", []))].sum()  # between the pieces of a path
+    ratio, slowest = float(t[-1] - t[0] - waited) / wanted, SLOWEST["laser" if run["test"].startswith("laser") else "ballbar"]
+    if FASTEST <= ratio <= slowest:
+        return []
+    unit = next((word for factor, word in UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is not what it says")
+    what = f"it took {ratio:.2g} times as long as its path at its feed_mm_min: {unit}"
+    return [
+        Finding(run["run_id"], what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: drift is judged by them", False)
+    ]
+
+
+def _overlaps(runs: Sequence[Doc]) -> list[Finding]:
+    """Runs that lie in time where others lie; the one with the most others is named first and set aside."""
+    spans = {r["run_id"]: (float(r["columns"]["t_s"][0]), float(r["columns"]["t_s"][-1])) for r in runs if len(r["columns"]["t_s"])}
+    spans = {k: v for k, v in spans.items() if np.isfinite(v).all()}
+    meets = {k: [m for m in spans if m != k and _share(spans[k], spans[m]) > OVERLAP] for k in spans}
+    out = []
+    while any(meets.values()):
+        worst = max(meets, key=lambda k: len(meets[k]))
+        others = meets.pop(worst)
+        meets = {k: [m for m in v if m != worst] for k, v in meets.items()}
+        what = f"its t_s lies within that of {_named(others)}: one machine cannot measure two runs at a time"
+        out.append(Finding(worst, what, "write t_s in s of one clock for the whole campaign: drift is judged by it", False))
+    if len(out) > 1 and 2 * len(out) >= len(spans):
+        what = f"its t_s and those of {len(out)} other runs overlap: every run seems to have a clock of its own"
+        return [Finding(next(iter(spans)), what, out[0].remedy, False)]
+    return out
+
+
+def _share(a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Common time as a share of the shorter of two spans."""
+    shorter = min(a[1] - a[0], b[1] - b[0])
+    return (min(a[1], b[1]) - max(a[0], b[0])) / shorter if shorter > 0.0 else 0.0
+
+
+def _named(others: list[str]) -> str:
+    return f"run {others[0]}" if len(others) == 1 else f"{len(others)} other runs ({others[0]}, ...)"

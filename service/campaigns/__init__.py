@@ -1,0 +1,1 @@
+"""Measuring: a recipe becomes runs in the store, complete or visibly not."""

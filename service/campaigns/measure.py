@@ -1,0 +1,350 @@
+"""Measure a campaign: every test becomes a run in the store, complete or visibly not."""
+
+from __future__ import annotations
+
+import asyncio
+import platform
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from typing import Any
+
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.campaigns.bar_link import BarBreaks, bar_ready
+from abbe.service.campaigns.campaign_run import Conduct, Confirm, Resumed, in_mounting, items, nobody, plan_hash, read_path
+from abbe.service.campaigns.progress import Meter
+from abbe.service.capture.live import LiveFeed
+from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.devices.clock_notes import notes_since
+from abbe.service.devices.session import Session
+from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
+from abbe.service.events import ProgressSink, ignore_progress
+from abbe.service.sequences.check import dry_run_campaign, step_seconds
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.guard import warnings_of
+from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
+from abbe.service.sequences.interlocks import COMPENSATION_ON
+from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
+from abbe.service.sequences.needed import check_devices
+from abbe.service.sequences.preconditions import Expected
+from abbe.service.sequences.resume_plan import Attempt
+from abbe.service.sequences.runner import Runner, Tick
+from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
+from abbe.service.site import Site
+from abbe.service.storage.owner import this_process
+from abbe.service.storage.records import DISK_FULL
+from abbe.service.storage.store import Store
+
+RUN_STATUS: dict[type[Exception], str] = {Stopped: "stopped", Aborted: "aborted", RunInterrupted: "aborted"}
+"""How a run is closed that a person has ended, or that is gone on with; everything else has failed."""
+
+
+LAST_LINE_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class How:
+    """By whom a test is run, which part of it, where its checkpoints go, and who looks on."""
+
+    runner: Runner
+    attempt: Attempt
+    journal: Journal
+    live: LiveFeed | None = None
+
+
+@dataclass
+class OpenCampaign:
+    """A campaign that is being measured: number in the store, clock zero and when each set-up was mounted (controller time, us)."""
+
+    id: int
+    ctrl0_us: int
+    mounted_us: dict[str, int] = field(default_factory=dict)
+
+
+async def start_campaign(session: Session, store: Store, site: Site, name: str, more: dict[str, Any] | None = None) -> tuple[int, int]:
+    """A new campaign in the store and its clock zero (controller time, us). ``more``: what else its document shall say."""
+    machine_id = await store.write(store.add_machine, site.name, site.doc)
+    status = await session.controller.status()
+    comp = await session.controller.comp_status()
+    doc = {
+        "ctrl0_us": status.ctrl_us,
+        "active_bank": comp.active_bank,
+        "table_crc": comp.bank_crc[comp.active_bank],
+        "boot_id": comp.boot_id,
+        "current_model": {"includes": ["rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"], "errors": None},
+        "instruments": {"ballbar": {"resolution_mm": 1e-6}, "laser": {"resolution_mm": 1e-7}},
+        "temperature_sensors": False,
+    } | (more or {})
+    return await store.write(store.add_campaign, machine_id, name, doc), status.ctrl_us
+
+
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """Who may interrupt a measurement, who can say whether a set-up was touched, what it was made of, and where it goes on.
+
+    ``source``: what the plan can be made from again, for `abbe measure --resume`. ``part``: what ``control`` controls is not over with this
+    measurement. ``live``: is shown what paths read.
+    """
+
+    control: Control | None = None
+    confirm: Confirm = nobody
+    source: dict[str, Any] = field(default_factory=dict)
+    resumed: Resumed | None = None
+    part: bool = False
+    live: LiveFeed | None = None
+
+
+async def measure(  # noqa: PLR0913 - what on what, and for whom
+    session: Session,
+    store: Store,
+    site: Site,
+    plan: CampaignPlan,
+    *,
+    progress: ProgressSink = ignore_progress,
+    clock: Clock | None = None,
+    campaign: tuple[int, int] | None = None,
+    manner: Manner | None = None,
+) -> list[int]:
+    """Run all tests of a plan; returns the numbers of their complete runs in the store.
+
+    Parameters
+    ----------
+    campaign : tuple of int, optional
+        A campaign that was begun, as `start_campaign` gives it; default: a new one of the plan's name.
+    manner : Manner, optional
+        Control from outside, and from where to go on; default: nobody interrupts, from the beginning.
+
+    Raises
+    ------
+    StrokeError, ConfigError, DevicesNotReady, DriverError
+        The plan does not fit the machine, or a device that it needs is missing, silent or not what it should be: before anything moves.
+    Interlock, MeasurementFault, DriverError
+        The run in hand is closed as failed, with the reason; earlier runs stay.
+    Stopped, Aborted
+        A person asked for it; the run in hand is closed as stopped or aborted.
+    """
+    clock, manner = clock or SystemClock(), manner or Manner()
+    control, resumed = manner.control or Control(), manner.resumed
+    dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
+    await check_devices(session, plan, air=site.watching.air_c is not None)
+    if resumed is not None:
+        campaign = resumed.campaign
+    campaign = campaign or await start_campaign(session, store, site, plan.name)
+    under_way = OpenCampaign(*campaign, dict(resumed.mounted_us) if resumed is not None else {})
+    journal = StoreJournal(store, under_way.id)
+    conduct = await _conduct(session, store, site, plan, journal, manner, control)
+    meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
+    control.now(State.RUNNING)
+    notes, told = IncidentNotes(journal, clock), asyncio.create_task(meter.tell())
+    once = _once(session, store, site, under_way, meter, manner.live)
+    try:
+        async with incidents_noted(session, notes):
+            run_ids = await _all_tests(plan, [d.duration_s for d in dry], conduct, meter, resumed, once)
+    except BaseException as error:
+        await _ended(journal, notes, "stopped" if isinstance(error, Stopped) else "failed", error)
+        raise
+    else:
+        await _ended(journal, notes, "complete", None)
+    finally:
+        control.now(State.RUNNING if manner.part else State.ENDED)
+        told.cancel()
+    return run_ids
+
+
+async def _ended(journal: StoreJournal, notes: IncidentNotes, how: str, error: BaseException | None) -> None:
+    """The journal's last line. A database that does not take it must not hide why the measurement has ended."""
+    journal.longest_s = min(journal.longest_s, LAST_LINE_S)
+    try:
+        left_out = {"incidents_not_written": notes.not_written} if notes.not_written else {}
+        await run_to_end(journal.add(ENDED, how=how, **left_out))
+    except StoreError as lost:
+        if error is None:
+            raise
+        error.add_note(f"and the journal's last line could not be written: {lost}")
+
+
+async def _conduct(
+    session: Session, store: Store, site: Site, plan: CampaignPlan, journal: StoreJournal, manner: Manner, control: Control
+) -> Conduct:
+    """The journal's first line, and what the campaign is carried through with."""
+    comp = await session.controller.comp_status()
+    expected = Expected(comp.boot_id, comp.bank_crc[comp.active_bank])
+    if manner.resumed is not None and manner.resumed.expected is not None:
+        expected = manner.resumed.expected  # the table may have been changed since it was looked at: while a question stood
+    begun = {"plan": plan_hash(plan), "source": manner.source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
+    begun["owner"] = asdict(this_process())
+    await journal.add(BEGUN, **begun)
+    conduct = Conduct(session, control, site.watching, journal, expected, manner.confirm)
+    conduct.read_path = lambda test, mounting: read_path(session, store, journal.campaign, test, mounting)
+    if manner.resumed is not None:
+        conduct.mountings = dict(manner.resumed.mountings)
+        conduct.used = set(manner.resumed.used)
+        conduct.labels = {run.label for run in await asyncio.to_thread(store.runs, journal.campaign)}
+    return conduct
+
+
+def planned_seconds(test: TestPlan) -> float:
+    """How long a test's steps take."""
+    seconds, here = 0.0, None
+    for step in test.steps:
+        if not (isinstance(step, MoveTo) and here == step.target_mm):
+            one, here = step_seconds(step, here)
+            seconds += one
+    return seconds
+
+
+Once = Callable[[TestPlan, Attempt, Runner], Awaitable[int]]
+
+
+async def _all_tests(
+    plan: CampaignPlan,
+    seconds: list[float],
+    conduct: Conduct,
+    meter: Meter,
+    resumed: Resumed | None,
+    once: Callable[[TestPlan, float], Once],
+) -> list[int]:
+    """Every test that has no complete run yet, in the plan's order."""
+    run_ids: list[int] = []
+    done, start = (resumed.done, resumed.start) if resumed is not None else ({}, {})
+    for item, duration_s in zip(items(plan), seconds, strict=True):
+        label, base_s = item.test.label, meter.done_s
+        if label in done:
+            run_ids.append(done[label])
+            meter.skip(duration_s)
+        else:
+            item = start.get(label) or in_mounting(item, conduct.mountings.get(item.setup, 1))
+            run_ids.append(await conduct.complete(item, once(item.test, base_s)))
+            meter.done_s = base_s + duration_s
+        meter.at(meter.done_s, label)
+    return run_ids
+
+
+def _once(
+    session: Session, store: Store, site: Site, under_way: OpenCampaign, meter: Meter, live: LiveFeed | None
+) -> Callable[[TestPlan, float], Once]:
+    """How one attempt at a test becomes one run."""
+
+    def of(test: TestPlan, base_s: float) -> Once:
+        breaks = BarBreaks(session, meter.control or Control(), site.watching.suspending)
+
+        async def once(left: TestPlan, attempt: Attempt, runner: Runner) -> int:
+            before_s = max(planned_seconds(test) - planned_seconds(left), 0.0)  # what an earlier attempt has done stays done
+
+            def tick(seconds: float, waited_s: float) -> None:
+                meter.at(base_s + before_s + seconds, test.label, waited_s)
+
+            how = How(runner, attempt, runner.journal, live)
+            try:
+                return await measure_test(session, store, site, under_way, left, tick, meter.clock, how)
+            except DriverError as error:
+                await breaks.wait(error, runner, runner.journal)
+                raise
+
+        return once
+
+    return of
+
+
+async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it goes, and how
+    session: Session,
+    store: Store,
+    site: Site,
+    campaign: OpenCampaign,
+    test: TestPlan,
+    tick: Tick,
+    clock: Clock,
+    how: How | None = None,
+) -> int:
+    """One test as one run; whatever ends it early is written into the run before it is raised again."""
+    runner, attempt, journal = (how.runner, how.attempt, how.journal) if how is not None else (Runner(session), Attempt(), NoJournal())
+    doc = await start_document(session, site, campaign, test, clock) | _standstills(test, attempt)
+    if attempt.onward is not None:
+        doc["path"] |= attempt.onward.doc()
+    run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, doc)
+    status, reason, end = "aborted", "stopped", dict[str, Any]()
+    recorder: CaptureRecorder | None = None
+    about = {"label": test.label, "test": test.test, "machine": site.name}
+    try:
+        async with recording(store, run_id, site.capture, clock, about) as recorder:
+            await journal.add(RUN, test=attempt.test, run=run_id, label=test.label, setup=attempt.setup, mounting=attempt.mounting)
+            with run_named(session, f"run {run_id} {test.label}"):
+                await bar_ready(session, test)
+                with shown(how.live if how is not None else None, test, recorder):
+                    end = dict(await runner.run(test, recorder, tick, replace(attempt, run_id=run_id)))
+        status, reason = "complete", ""
+    except DiskFull as error:
+        status, reason = DISK_FULL, f"{error.code}: {error}"
+        raise
+    except (AbbeError, DriverError) as error:
+        status, reason = RUN_STATUS.get(type(error), "failed"), f"{error.code}: {error}"
+        raise
+    except Exception as error:
+        status, reason = "failed", repr(error)  # a defect: what it was must not get lost behind "stopped"
+        raise
+    except BaseException as error:
+        reason = "; ".join(["stopped", *warnings_of(error)])
+        raise
+    finally:
+        mounted_us = end.get("mounted_us", runner.mounted_us)
+        if mounted_us is not None:
+            campaign.mounted_us[test.setup["setup_id"]] = end["mounted_us"] = mounted_us
+        end |= {"ended_utc": clock.utc().isoformat(), "clock_pairs": notes_since(session.controller, doc["clock"]["ctrl_us"])}
+        end |= {} if recorder is None else recorder.doc()
+        end |= {} if runner.way is None or status == "complete" else runner.way.doc()
+        await run_to_end(close_run(store, run_id, recorder, status, reason, end))
+    return run_id
+
+
+@contextmanager
+def shown(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) -> Iterator[None]:
+    """Whoever looks on sees what the test's path reads, beside the way to the disk."""
+    path = next((step for step in test.steps if isinstance(step, RecordPath)), None)
+    if live is None or path is None:
+        yield
+        return
+    live.begin(test.label, test.test, test.setup, (path.points_mm, path.feed_mm_min, path.rate_hz))
+    recorder.look = live.take
+    try:
+        yield
+    finally:
+        live.end()
+
+
+async def start_document(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:
+    """What is known before the first step. A test that mounts is taken to mount now; the end document knows better (`mounted_us`)."""
+    status = await session.controller.status()
+    comp = await session.controller.comp_status()
+    ctrl0_us, set_us = campaign.ctrl0_us, status.ctrl_us
+    if not test.mounts:
+        set_us = campaign.mounted_us.get(test.setup["setup_id"], set_us)
+    acting = bool(status.bits >> COMPENSATION_ON & 1)
+    doc: dict[str, Any] = {
+        "setup": test.setup | {"t_set_s": (set_us - ctrl0_us) * 1e-6},
+        "machine": site.doc,
+        "ctrl0_us": ctrl0_us,
+        "table": {
+            "bank": comp.active_bank,
+            "crc": comp.bank_crc[comp.active_bank],
+            "gen": comp.gen,
+            "boot_id": comp.boot_id,
+            "acting": acting,
+        },
+        "clock": {"utc": clock.utc().isoformat(), "host_s": clock.monotonic_s(), "ctrl_us": status.ctrl_us},
+        "versions": {"abbe": version("abbe"), "python": platform.python_version()},
+    }
+    for step in test.steps:
+        if isinstance(step, RecordPath):
+            doc["path"] = {"feed_mm_min": step.feed_mm_min, "direction": step.direction, "points_mm": [list(p) for p in step.points_mm]}
+            doc["path"] |= {} if step.measured is None else {"measured": list(step.measured)}
+            doc["rate_hz"] = step.rate_hz
+    return doc
+
+
+def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
+    """How many readings at standstill a whole run has: those of its steps, and those carried over, the last of which is read again."""
+    count = sum(isinstance(step, ReadLaser | ReadBar) for step in test.steps)
+    return {"standstills": count + max(0, len(attempt.rewind.carried) - 1)} if count else {}

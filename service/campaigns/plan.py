@@ -1,0 +1,224 @@
+"""Plan a campaign for a machine: the planner's choice as a recipe that the sequencer runs, checked by its dry run, and as a document."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.models.planning.goal import COVERAGE
+from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, feed_mm_min
+from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, Step, plan_campaign
+from abbe.service.campaigns.plan_instruments import at_this_machine
+from abbe.service.errors import ConfigError
+from abbe.service.events import Progress, ProgressSink, ignore_progress
+from abbe.service.rendering.plan_page import PlanPage, render_plan
+from abbe.service.rendering.plots.setups import SetupPath, setups_picture
+from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
+from abbe.service.sequences.recipe_file import recipe_text
+from abbe.service.sequences.recipes import Diagonal, Helix, Linear, Recipe
+from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site
+
+BOUND_NOTE = (
+    "U is the posterior (Bayesian Cramer-Rao) bound of these readings over the inner 80 % of the volume, rigid motion taken out, and the "
+    "temperature of the scales; left out are error motions above the plan's order and that noise and typical sizes are estimated: "
+    "`abbe solve` states both, so its U may be larger; on a machine better than the priors it is smaller"
+)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan with what the sequencer makes of it: recipes, campaign, dry run of every test, and the recipe file's text.
+
+    ``notes``: what a person has to know before it runs.
+    """
+
+    plan: Plan
+    recipes: tuple[Recipe, ...]
+    campaign: CampaignPlan
+    dry: tuple[DryRun, ...]
+    text: str
+    notes: tuple[str, ...]
+
+
+def plan_for(
+    site: Site,
+    *,
+    minutes: float,
+    goal_um: float | None = None,
+    tools: Instruments | None = None,
+    progress: ProgressSink = ignore_progress,
+) -> Planned:
+    """Plan a campaign for a machine.
+
+    Raises
+    ------
+    ConfigError
+        Nothing can be planned: minutes too few, strokes too small, numbers impossible.
+    StrokeError
+        The dry run refuses what was planned.
+    """
+
+    def tick(share: float) -> None:
+        progress(Progress("plan", share, 1.0, None, "looking for the measurements that tell most"))
+
+    vertical = AXES.index(str(site.doc.get("vertical_axis", "Z")))
+    goal_mm = None if goal_um is None else goal_um * 1e-3
+    tools, said = at_this_machine(tools or Instruments(), site)
+    try:
+        plan = plan_campaign(site.machine, minutes=minutes, goal_mm=goal_mm, tools=tools, vertical=vertical, progress=tick)
+    except ValueError as error:
+        raise ConfigError(
+            str(error), "give more --minutes, shorter bar_lengths_mm (--instruments), or check stroke_mm in the machine file"
+        ) from None
+    name = f"plan {plan.minutes:.0f} min"
+    recipes = shared_setups(tuple(recipe_of(s, tools) for s in plan.steps), name)
+    campaign = paced(CampaignPlan(name, tuple(r.plan(site.machine) for r in recipes)), site.max_feed_mm_min)
+    dry = dry_run_campaign(site.machine, campaign, site.max_feed_mm_min)
+    note = f"for {site.name}, {plan.minutes:.0f} minutes with set-ups; expected worst U {_um(COVERAGE * plan.u_worst_mm)} um"
+    return Planned(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*said, *plan.doubts))
+
+
+def recipe_of(step: Step, tools: Instruments) -> Recipe:
+    """The sequencer's recipe for a planned measurement with these instruments."""
+    test: Measurement = step.test
+    feed = feed_mm_min(tools, test)
+    if isinstance(test, HelixTest):
+        return Helix(
+            step.label,
+            step.setup_id,
+            "identify",
+            test.centre_mm,
+            test.radius_mm,
+            turns=test.turns,
+            axis=test.axis,
+            feed_mm_min=feed,
+            direction=1 if test.direction > 0 else -1,
+            opens=1 if test.opens > 0 else -1,
+            u_length_mm=tools.u_bar_length_mm,
+        )
+    if isinstance(test, DiagonalTest):
+        return Diagonal(step.label, step.setup_id, "identify", test.diagonal, test.steps, test.order, feed_mm_min=feed)
+    return Linear(step.label, step.setup_id, "identify", test.axis, n=test.n, at=test.at, feed_mm_min=feed)
+
+
+def words(test: Measurement) -> str:
+    """A measurement as an operator reads it."""
+    if isinstance(test, HelixTest):
+        at = ", ".join(f"{v:g}" for v in test.centre_mm)
+        opens = "" if (test.axis, test.opens) == (2, 1) else f", opening along {'+' if test.opens > 0 else '-'}{AXES[test.axis]}"
+        return f"ball-bar {test.radius_mm:g} mm about ({at}){opens}{'' if test.direction > 0 else ', equator to pole'}"
+    if isinstance(test, DiagonalTest):
+        return f"laser, body diagonal {test.diagonal}, {f'steps {test.order}' if test.order else 'straight'}"
+    others = [a for a in range(3) if a != test.axis]
+    at = ", ".join(f"{AXES[a]} at {100 * s:.0f} %" for a, s in zip(others, test.at, strict=True))
+    return f"laser along {AXES[test.axis]}, {at} of the stroke"
+
+
+def temperature_words(plan: Plan) -> str:
+    """What part of U no measurement takes away."""
+    inputs = plan.tools.inputs
+    return (
+        f"in every U: scales known to {inputs.u_scale_temperature_k:g} K ({inputs.scale_expansion_per_k * 1e6:g} µm/m/K), "
+        f"which alone make U = {_um(COVERAGE * plan.u_temperature_mm)} µm"
+    )
+
+
+def goal_words(plan: Plan) -> list[str]:
+    """What became of the goal, in sentences; none without a goal."""
+    goal = plan.goal
+    if goal is None:
+        return []
+    wanted, limit = _um(goal.wanted_mm), _um(goal.limit_mm)
+    bound = f"limit of these instruments: U = {limit} µm ({goal.limit_by})"
+    if goal.reached:
+        return [f"goal {wanted} µm is reached after {plan.minutes:.0f} minutes: worst U = {_um(COVERAGE * plan.u_worst_mm)} µm", bound]
+    here = f"goal {wanted} µm is not reached in {plan.minutes:.0f} minutes (worst U = {_um(COVERAGE * plan.u_worst_mm)} µm)"
+    if goal.minutes_needed is not None:
+        return [f"{here}; about {goal.minutes_needed:.0f} minutes would do", bound]
+    if goal.limit_mm >= goal.wanted_mm:
+        return [f"{here} and cannot be reached with these instruments", bound]
+    return [f"{here}, nor in a working day", bound]
+
+
+def step_rows(plan: Plan) -> list[tuple[str, ...]]:
+    """The table of a plan: set-up, label, measurement, minutes, minutes so far, worst and mean U (k = 2) after it, µm."""
+    before = tuple(_um(COVERAGE * u) for u in plan.u_before_mm)
+    rows: list[tuple[str, ...]] = [("", "", "from the priors alone", "", "0", *before)]
+    for s in plan.steps:
+        u = (_um(COVERAGE * s.u_worst_mm), _um(COVERAGE * s.u_mean_mm))
+        rows.append((s.setup_id.removeprefix("S"), s.label, words(s.test), f"{s.minutes:.1f}", f"{s.until_min:.1f}", *u))
+    return rows
+
+
+def plan_page(site: Site, planned: Planned) -> str:
+    """A page with the picture of the set-ups and what each measurement buys."""
+    plan = planned.plan
+    paths = [
+        SetupPath(int(s.setup_id.removeprefix("S")), _kind(s.test), words(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
+        for s, run in zip(plan.steps, plan.runs, strict=True)
+    ]
+    lead = (f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_words(plan), *planned.notes)
+    headings = ("No", "Label", "Measurement", "min", "until min", "worst U µm", "mean U µm")
+    picture = setups_picture(site.machine.stroke_mm, paths)
+    rows = tuple(step_rows(plan))
+    return render_plan(
+        PlanPage("Planned measurements", lead, headings, rows, f"{BOUND_NOTE}. {temperature_words(plan)}", plan.open_questions, picture)
+    )
+
+
+def _kind(test: Measurement) -> str:
+    return "bar" if isinstance(test, HelixTest) else "diagonal" if isinstance(test, DiagonalTest) else "line"
+
+
+def _mount_mm(test: Measurement, path_mm: F2) -> F1:
+    return np.array(test.centre_mm) if isinstance(test, HelixTest) else path_mm[0]
+
+
+def plan_doc(planned: Planned) -> dict[str, Any]:
+    """The plan for programs, micrometres and minutes."""
+    plan, goal = planned.plan, planned.plan.goal
+    steps = [
+        {
+            "label": s.label,
+            "setup": s.setup_id,
+            "what": words(s.test),
+            "minutes": s.minutes,
+            "until_min": s.until_min,
+            "machine_s": d.duration_s,
+            "u_worst_um": s.u_worst_mm * 1e3,
+            "u_mean_um": s.u_mean_mm * 1e3,
+        }
+        for s, d in zip(plan.steps, planned.dry, strict=True)
+    ]
+    return {
+        "minutes": plan.minutes,
+        "model": f"rigid21/legendre{PLAN_ORDER}",
+        "inner_share": INNER_SHARE,
+        "bound": BOUND_NOTE,
+        "u_scale_temperature_um": plan.u_temperature_mm * 1e3,
+        "notes": list(planned.notes),
+        "before": {"u_worst_um": plan.u_before_mm[0] * 1e3, "u_mean_um": plan.u_before_mm[1] * 1e3},
+        "steps": steps,
+        "u_worst_um": plan.u_worst_mm * 1e3,
+        "goal": None
+        if goal is None
+        else {
+            "wanted_U_um": goal.wanted_mm * 1e3,
+            "reached": goal.reached,
+            "minutes_needed": goal.minutes_needed,
+            "limit_U_um": goal.limit_mm * 1e3,
+            "limit_by": goal.limit_by,
+        },
+        "not_observable": list(plan.open_questions),
+    }
+
+
+def _um(mm: float) -> str:
+    return f"{mm * 1e3:.3g}"

@@ -1,0 +1,132 @@
+"""What of a machine file cannot work, and what is probably not meant: said before a machine is asked to move, not at night by a schedule.
+
+What no machine can be (a stroke of 1e9 mm, 68 degrees C) is refused where the file is read (`abbe.service.config_schema`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+from abbe.drivers.links.urls import FixtureConsoleUrl, parse_url
+from abbe.service.campaigns.builtin_recipes import campaign_plan, recipe_plan
+from abbe.service.config_schema import MachineFile
+from abbe.service.config_timetable import ScheduleEntry
+from abbe.service.errors import AbbeError, ConfigError
+from abbe.service.sequences.check import dry_run_campaign, paced
+from abbe.service.sequences.needed import BALLBAR, LASER, check_configured, needed_by
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, site_of
+
+SMALL_MM, LARGE_MM = 200.0, 20_000.0
+"""A machine whose longest axis is shorter, or that has a longer one, is possible and rare."""
+ROOM_C = (10.0, 35.0)
+"""A window of the air's temperature beyond this is possible and rare."""
+LONG_VALID_YEARS = 10
+INSTRUMENTS = {BALLBAR: "ball-bar", LASER: "laser"}
+
+
+@dataclass(frozen=True, slots=True)
+class Doubts:
+    """What cannot work, and what can but is rarely meant; one line each."""
+
+    errors: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def good(self) -> bool:
+        """Whether there is nothing to say."""
+        return not self.errors and not self.warnings
+
+
+def doubts(config: MachineFile, folder: Path, today: date) -> Doubts:
+    """Look at all of a machine file; nothing is connected.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the machine file: recipe files lie beside it.
+    today : date
+        For certificates.
+    """
+    site = site_of(config)
+    rare = [*_strokes(config), *_window(config), *certificates(site, today), *_far(site, today), *_none(site)]
+    return Doubts(tuple(unattended(config, site, folder)), tuple(rare))
+
+
+def check_unattended(config: MachineFile, folder: Path) -> None:
+    """Refuse a timetable that cannot be kept.
+
+    Raises
+    ------
+    ConfigError
+        All that is wrong, in one line.
+    """
+    found = unattended(config, site_of(config), folder)
+    if found:
+        raise ConfigError("; ".join(found), "correct the machine file; `abbe check-config` says all of this")
+
+
+def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
+    """Why scheduled checks, and what follows them by itself, could not run: recipe, strokes, feed, devices, who mounts."""
+    found = []
+    for entry in config.schedule:
+        found += _lines(entry, site, lambda entry=entry: recipe_plan(entry.recipe, site.machine))  # type: ignore[misc]
+        if entry.on_alarm == "propose":
+            found += _lines(entry, site, lambda: paced(campaign_plan(config.alarm.campaign, site.machine, folder), site.max_feed_mm_min))
+    return list(dict.fromkeys(found))
+
+
+def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> list[str]:
+    """Certificates of these instruments that have ended."""
+    return [
+        f"the certificate of the {INSTRUMENTS[role]} has ended on {day}: what is measured now goes into no table ([calibration] {role})"
+        for role, day in ended_certificates(site, today, roles).items()
+    ]
+
+
+def ended_certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> dict[str, date]:
+    """Last days of those certificates of these instruments that have ended."""
+    return {role: day for role, day in site.calibrated_until.items() if role in roles and day < today}
+
+
+def _lines(entry: ScheduleEntry, site: Site, plan: Callable[[], CampaignPlan]) -> list[str]:
+    try:
+        made = plan()
+        dry_run_campaign(site.machine, made, site.max_feed_mm_min)
+        check_configured(needed_by(made, air=site.watching.air_c is not None), site.urls.named())
+        if site.urls.fixture is not None and isinstance(parse_url(site.urls.fixture), FixtureConsoleUrl):
+            raise ConfigError("the fixture is the console, where nobody answers a schedule", "configure a remote fixture under [devices]")
+    except AbbeError as error:
+        return [f"schedule {entry.name!r}: {error}"]
+    return []
+
+
+def _strokes(config: MachineFile) -> list[str]:
+    lengths = {axis: high - low for axis, (low, high) in config.stroke_mm.model_dump().items()}
+    axis, longest = max(lengths.items(), key=lambda pair: pair[1])
+    if longest < SMALL_MM and not config.short_strokes:
+        return [f"the longest axis has {longest:g} mm: are the strokes inches? (stroke_mm; short_strokes = true if they are not)"]
+    return [f"stroke_mm.{axis} is {longest:g} mm long: is it meant?"] if longest > LARGE_MM else []
+
+
+def _window(config: MachineFile) -> list[str]:
+    low, high = config.limits.temperature_c
+    if low >= ROOM_C[0] and high <= ROOM_C[1]:
+        return []
+    return [f"limits.temperature_c is {low:g} to {high:g} degrees C: is it meant? a table holds at the temperature that it was measured at"]
+
+
+def _far(site: Site, today: date) -> list[str]:
+    far = {role: day for role, day in site.calibrated_until.items() if day.year - today.year > LONG_VALID_YEARS}
+    return [
+        f"the certificate of the {INSTRUMENTS[role]} ends in {day.year}: is the year right? ([calibration] {role})"
+        for role, day in far.items()
+    ]
+
+
+def _none(site: Site) -> list[str]:
+    without = [role for role in INSTRUMENTS if role in site.urls.named() and role not in site.calibrated_until]
+    return [f"the {INSTRUMENTS[role]} has no certificate: what it measures goes into no table ([calibration] {role})" for role in without]

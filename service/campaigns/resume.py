@@ -1,0 +1,227 @@
+"""Going on with a campaign that was broken off: by Ctrl-C, an interlock, a crash or a power cut. What was complete is used, nothing twice.
+
+Everything is looked at again and said; what changed so that nothing can be gone on with is refused in one line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from abbe.drivers.errors import DriverError
+from abbe.service.campaigns.campaign_run import (
+    Confirm,
+    Item,
+    Resumed,
+    gone_on,
+    halfway,
+    in_mounting,
+    items,
+    mounted_anew,
+    plan_hash,
+    read_path,
+)
+from abbe.service.devices.session import Session
+from abbe.service.errors import UnsafeToMove, WorldChanged
+from abbe.service.runs.codec import decode_json
+from abbe.service.runs.columns import LASER_CHANNEL
+from abbe.service.sequences.interlocks import BEAM_BITS, MOVING, check_interlocks, check_ours
+from abbe.service.sequences.journal import BEGUN, ENDED, HAND, RUN
+from abbe.service.sequences.preconditions import Expected, check_expected
+from abbe.service.sequences.resume_plan import anew, remounted
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site
+from abbe.service.storage.owner import Owner
+from abbe.service.storage.records import RUNNING, CampaignRecord, CheckpointRecord, Doc
+from abbe.service.storage.store import Store
+
+COMPLETE = "complete"
+ZEROED = 1 << 2
+MOUNTS = ("MountBar", "MountLaser")
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """A campaign's journal: the last beginning, what was done by hand, and which run is of which test."""
+
+    begun: Doc
+    ended: bool
+    hand: tuple[Doc, ...]
+    runs: dict[int, Doc]
+
+
+def read_journal(store: Store, campaign: CampaignRecord) -> Lines:
+    """The journal of a campaign.
+
+    Raises
+    ------
+    WorldChanged
+        It has none.
+    """
+    found: list[CheckpointRecord] = store.checkpoints(campaign.id)
+    begun = [one.doc for one in found if one.kind == BEGUN]
+    if not begun:
+        raise WorldChanged(
+            f"campaign {campaign.name!r} has no journal",
+            "it was imported, or measured by an older Abbe: measure it anew under another name",
+        )
+    hand = tuple(one.doc for one in found if one.kind == HAND)
+    last = max(k for k, one in enumerate(found) if one.kind == BEGUN)
+    ended = any(one.kind == ENDED for one in found[last:])
+    return Lines(begun[-1], ended, hand, {int(one.doc["run"]): one.doc for one in found if one.kind == RUN})
+
+
+def begun_source(store: Store, name: str) -> Doc:
+    """What the plan of a campaign was made of that was broken off.
+
+    Raises
+    ------
+    WorldChanged
+        Its journal does not say.
+    """
+    source: Doc = read_journal(store, store.campaign(name)).begun.get("source") or {}
+    if "recipe" not in source:
+        raise WorldChanged(f"the journal of campaign {name!r} does not name its recipe", "give it: --recipe FILE.toml (or --helix)")
+    return source
+
+
+async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan, name: str, confirm: Confirm) -> Resumed:
+    """Find out where a campaign goes on. A motion that is still under way is stopped; nothing else moves.
+
+    Parameters
+    ----------
+    plan : CampaignPlan
+        The same as when it was begun.
+    confirm : callable
+        Asked whether a set-up with complete runs was not touched; a no has it mounted anew.
+
+    Raises
+    ------
+    WorldChanged
+        Another plan, machine, table or run of the controller.
+    UnsafeToMove
+        Another process is measuring it, or an interlock holds.
+    """
+    campaign = store.campaign(name)
+    lines = read_journal(store, campaign)
+    _same_plan(store, campaign, lines, site, plan)
+    comp = await session.controller.comp_status()
+    expected = Expected(lines.begun["boot_id"], lines.begun["table_crc"])
+    check_expected(expected, comp.boot_id, comp.bank_crc[comp.active_bank])
+    said = [f"campaign {campaign.name!r}: same plan, same machine, same run of the controller, same table"]
+    status = await session.controller.status()
+    check_ours(status)
+    if status.bits >> MOVING & 1:
+        await session.controller.abort()
+        said.append("the machine was still moving: it was stopped")
+    check_interlocks(await session.controller.status())
+    found = _Finder(store, campaign.id, plan, lines, {run.id: run.visible_status for run in store.runs(campaign.id)})
+    start = await found.starts(session, confirm, said)
+    said.insert(1, f"{len(found.done)} of {len(plan.tests)} tests are complete")
+    ctrl0_us = int(campaign.doc["ctrl0_us"])
+    return Resumed(
+        (campaign.id, ctrl0_us), found.done, start, found.mountings, frozenset(found.used), found.mounted_us, tuple(said), expected
+    )
+
+
+def _same_plan(store: Store, campaign: CampaignRecord, lines: Lines, site: Site, plan: CampaignPlan) -> None:
+    owner = Owner(**lines.begun["owner"]) if "owner" in lines.begun else None
+    if owner is not None and not lines.ended and not owner.is_gone():
+        raise UnsafeToMove(f"campaign {campaign.name!r} is being measured (process {owner.pid} on {owner.host})", "wait until it has ended")
+    for run in store.runs(campaign.id):
+        if run.visible_status == RUNNING:
+            raise UnsafeToMove(
+                f"run {run.label} of campaign {campaign.name} is being measured (process {run.owner.pid})", "wait until it has ended"
+            )
+    if lines.begun["plan"] != plan_hash(plan):
+        raise WorldChanged(
+            f"campaign {campaign.name!r} was begun with another recipe (or feed limit, or version of Abbe)",
+            "go on with the recipe that it was begun with, or measure a new campaign",
+        )
+    if store.machine(campaign.machine_id).doc != site.doc:
+        raise WorldChanged(f"campaign {campaign.name!r} is of another machine, or its description was changed", "measure a new campaign")
+
+
+class _Finder:
+    """What of a plan is done, what is mounted, and where the rest begins."""
+
+    def __init__(self, store: Store, campaign: int, plan: CampaignPlan, lines: Lines, states: dict[int, str]) -> None:
+        self._store, self._campaign, self._lines, self._items = store, campaign, lines, items(plan)
+        complete = {n: one for n, one in lines.runs.items() if states.get(n) == COMPLETE}
+        self.done = {str(one["test"]): n for n, one in complete.items()}
+        self.used = {(str(one["setup"]), int(one["mounting"])) for one in complete.values()}
+        self.mountings: dict[str, int] = {}
+        self.mounted_us: dict[str, int] = {}
+        for one in lines.hand:
+            setup, number = str(one["setup"]), int(one["mounting"])
+            self.mountings[setup] = max(number, self.mountings.get(setup, 1))
+            if one["phase"] == "done" and one["what"] in MOUNTS:
+                self.mounted_us[setup if number == 1 else f"{setup}-{number}"] = int(one["ctrl_us"])
+
+    async def starts(self, session: Session, confirm: Confirm, said: list[str]) -> dict[str, Item]:
+        """The first test that is left of every set-up that was begun."""
+        start: dict[str, Item] = {}
+        for setup in self.mountings:
+            item = next((i for i in self._items if i.setup == setup and i.test.label not in self.done), None)
+            if item is not None:
+                start[item.test.label] = await self._start(session, item, confirm, said)
+        return start
+
+    async def _start(self, session: Session, item: Item, confirm: Confirm, said: list[str]) -> Item:
+        setup, number = item.setup, self.mountings[item.setup]
+        hand = [one for one in self._lines.hand if one["setup"] == setup and one["mounting"] == number]
+        why = ""
+        if hand[-1]["phase"] != "done":
+            why = "nobody knows how far whoever mounts had come"
+        elif hand[-1]["what"] == "Unmount":
+            why = "it was cleared away"
+        else:
+            item = await self._in_place(session, item, number, hand[-1])
+            if (setup, number) in self.used and not item.rewind.carried:
+                asked = f"Set-up {setup} was left mounted and has complete runs. Has nobody touched it since?"
+                why = "" if await confirm(asked) else "nobody vouches for it, and runs of it are complete"
+            elif item.onward is not None and not await confirm(halfway(item)):
+                item = gone_on(item, item.hand, ())
+        if why:
+            said.append(f"set-up {setup} is mounted anew for {item.test.label}: {why}")
+            self.mountings[setup] = number + 1
+            return mounted_anew(item, number + 1)
+        kept = len(item.rewind.carried)
+        how = f"goes on after point {kept}, which is read again" if kept else "begins again"
+        if item.onward is not None:
+            how = f"goes on at {item.onward.offset_mm:.0f} of {item.onward.whole_mm:.0f} mm of its path, a stretch of which is read again"
+        said.append(f"set-up {setup} is still mounted: {item.test.label} {how}")
+        return item
+
+    async def _in_place(self, session: Session, item: Item, number: int, last: Doc) -> Item:
+        """The test with what is mounted, from its last checkpoint."""
+        label = item.test.label
+        mounted_it = any(one["test"] == label and one["mounting"] == number and one["what"] in MOUNTS for one in self._lines.hand)
+        if number > 1 and mounted_it:
+            whole = remounted(item.test, item.first, number)
+            item = Item(item.test, item.first, whole, whole, number)
+        else:
+            item = (
+                in_mounting(item, number) if number > 1 else Item(item.test, item.first, anew(item.test, 1), item.test, before=item.before)
+            )
+        hand = int(last["step"]) if last["test"] == label else None
+        records = self._records(label, number) if await counting(session) else ()
+        return gone_on(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
+
+    def _records(self, label: str, number: int) -> tuple[dict[str, Any], ...]:
+        """Laser records of the last run of a test in this mounting."""
+        runs = [n for n, one in self._lines.runs.items() if one["test"] == label and one["mounting"] == number]
+        if not runs:
+            return ()
+        return tuple(record for chunk in self._store.chunks(max(runs), LASER_CHANNEL) for record in decode_json(chunk.payload))
+
+
+async def counting(session: Session) -> bool:
+    """Whether the laser still counts from the zero that it was given."""
+    if session.laser is None:
+        return False
+    try:
+        status = (await session.laser.peek()).status
+    except DriverError:
+        return False
+    return bool(status & ZEROED) and not status & BEAM_BITS

@@ -1,0 +1,1 @@
+"""From a solution to a table in force: proposed, approved, pushed, verified, or rolled back."""

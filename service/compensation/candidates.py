@@ -1,0 +1,144 @@
+"""What a proposal of tables is held against before it may go to a controller: its promise, its measurement, its machine, and now."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from datetime import UTC, date, datetime, time, timedelta
+from typing import Any
+
+import numpy as np
+
+from abbe.drivers.api import TableFormat
+from abbe.drivers.cnc.registers import MAP_VERSION
+from abbe.models.compensation.tables import NineTables, Predicted
+from abbe.models.machine import AXES
+from abbe.service.clock import Clock
+from abbe.service.push.book import read_entries
+from abbe.service.push.candidate import Candidate, Column, Evidence, Scene, Seal
+from abbe.service.push.entries import facts
+from abbe.service.push.states import State
+from abbe.service.push.validate import content_digest
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.tables.base_table import Base
+from abbe.service.tables.nine_tables import tables_from_image
+
+Runs = list[dict[str, Any]]
+SIGNER = "metrologist"
+MONTH = timedelta(days=30)
+
+
+@dataclass(frozen=True, slots=True)
+class Promise:
+    """Tables that were computed, and from what.
+
+    ``tables``: absolute, in the controller's unit; ``change``: what they add to those in force, as computed. ``drift_mm``: what the
+    solution leaves of the run that was measured last and not used; None where there is none. ``ended_s``, ``last_s``: end of
+    the oldest and of the newest run that identifies, UTC.
+    """
+
+    tables: NineTables
+    change: NineTables
+    predicted: Predicted
+    drift_mm: float | None
+    ended_s: float
+    last_s: float
+
+
+def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: TableFormat) -> Candidate:
+    """A proposal as it is signed, by whoever ordered it.
+
+    Parameters
+    ----------
+    runs : list of dict
+        The runs that were solved, ``abbe-run/1``.
+    """
+    columns = tuple(_column(promise, a, i) for a in range(3) for i in range(3))
+    blank = Candidate(site.name, MAP_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
+    digest = content_digest(blank)
+    return replace(blank, digest=digest, seal=Seal(SIGNER, digest))
+
+
+def _column(promise: Promise, a: int, i: int) -> Column:
+    values = promise.tables.correction_mm[a][:, i] + 0.0  # -0.0 is another number to whoever compares bytes
+    left = -promise.change.correction_mm[a][:, i] + 0.0
+    return Column(AXES[a], AXES[i], tuple(promise.tables.position_mm[a].tolist()), tuple(values.tolist()), tuple(_plain(left)))
+
+
+def _plain(values: Any) -> list[float]:
+    """Without numbers too small to be any."""
+    return [0.0 if abs(v) < 1e-15 else float(v) for v in values]
+
+
+def _evidence(site: Site, promise: Promise, runs: Runs) -> Evidence:
+    used = [r for r in runs if r["role"] == "identify"]
+    air = [float(t) for r in used for t in r["columns"].get("temp_air_C", [])]
+    if not air or not np.isfinite(air).all():
+        air = [float("nan")]
+    p = promise.predicted
+    until = tuple(until_s(site.calibrated_until[kind]) for kind in sorted(_instruments(used)) if kind in site.calibrated_until)
+    known = until if len(until) == len(_instruments(used)) else ()
+    drift = 0.0 if promise.drift_mm is None else promise.drift_mm
+    return Evidence(
+        len(used), promise.ended_s, (min(air), max(air)), drift, p.u_model_mm, p.before_mm, p.after_mm,
+        mark_of(boot for r in used for boot in [r.get("table", {}).get("boot_id")]), known,
+        promise.last_s,
+    )  # fmt: skip
+
+
+def _instruments(runs: Runs) -> set[str]:
+    return {"ballbar" if r["test"].startswith("ballbar") else "laser" for r in runs}
+
+
+def until_s(day: date) -> float:
+    """The end of the last day of a certificate, UTC."""
+    return datetime.combine(day, time.max, UTC).timestamp()
+
+
+def mark_of(boots: Iterable[int | None]) -> str:
+    """What must not change between measuring and pushing: the controller was not restarted. Names every boot that was seen."""
+    seen = sorted({-1 if boot is None else int(boot) for boot in boots})
+    return "boot " + ", ".join("not known" if boot < 0 else f"{boot:08X}" for boot in seen)
+
+
+async def scene_of(
+    site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
+) -> Scene:
+    """This machine, its controller and its table in force, now. ``attended``: a person who may approve is at the machine."""
+    last_s = await asyncio.to_thread(_last_push_s, store, site)
+    month_ago = {} if attended else _on_grid(await asyncio.to_thread(_month_ago, store, site, base, clock), grid)
+    travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}
+    return Scene(
+        site.name, mark_of([base.status.boot_id]), MAP_VERSION, form.lsb_nm, form.bank_registers, travel, {}, base.crc,
+        _on_grid(base.tables, grid), month_ago, clock.utc().timestamp(), attended=attended, last_push_s=last_s,
+    )  # fmt: skip
+
+
+def _month_ago(store: Store, site: Site, base: Base, clock: Clock) -> NineTables | None:
+    """The tables that were in force `MONTH` ago, as far as pushes tell; before the first push that of its base, else the present one."""
+    entries = read_entries(store, site.name, site.control)
+    then = clock.utc() - MONTH
+    kept = [e for e in entries if e.state is State.KEEP]
+    old = [e.push for e in kept if datetime.fromisoformat(e.utc) <= then]
+    number, key = (old[-1], "image") if old else (kept[0].push, "base_image") if kept else (0, "")
+    if not key:
+        return base.tables
+    return tables_from_image(bytes.fromhex(facts(tuple(e for e in entries if e.push == number))[key]))
+
+
+def _on_grid(tables: NineTables | None, grid: NineTables) -> dict[tuple[str, str], tuple[float, ...]]:
+    """Tables on the new one's grid."""
+    if tables is None:
+        return {(a, i): (0.0,) * grid.position_mm[k].size for k, a in enumerate(AXES) for i in AXES}
+    found = {}
+    for k, a in enumerate(AXES):
+        for n, i in enumerate(AXES):
+            found[(a, i)] = tuple(np.interp(grid.position_mm[k], tables.position_mm[k], tables.correction_mm[k][:, n]).tolist())
+    return found
+
+
+def _last_push_s(store: Store, site: Site) -> float:
+    kept = [e for e in store.push_entries(site.name, site.control) if e.state == "KEEP"]
+    return datetime.fromisoformat(kept[-1].utc).timestamp() if kept else float("-inf")

@@ -1,0 +1,230 @@
+"""Commissioning of a control's tables: a known step is written, measured with the ball-bar, and sign, axis and unit are inferred.
+
+A first step of half a micrometre shows a wrong unit while it is harmless (taken for millimetres it is half a millimetre, within the
+bar's stroke). Then 10 um for each axis, each taken back before the next. The bar hangs in all the time; every table goes through the same
+door as any other, and whatever goes wrong takes the old one back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from abbe.drivers.api import Controller
+from abbe.models.arrays import F2
+from abbe.models.compensation.sign_proof import Shift, SignProof, bar_shift, sign_proof, step_tables
+from abbe.models.compensation.tables import NineTables, grid_positions, quantise
+from abbe.models.machine import AXES
+from abbe.service.campaigns.bar_places import BarPlaces, Readings
+from abbe.service.compensation.proved_levels import identity
+from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.recover import recover
+from abbe.service.devices.session import Session
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.events import ProgressSink
+from abbe.service.push.operations import Verdict
+from abbe.service.sequences.interlocks import Suspending
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.tables.base_table import Base, read_base
+from abbe.service.tables.nine_tables import check_limits
+
+KIND = "sign-proof"
+STEP_MM, FIRST_MM = 0.010, 0.0005
+HARMLESS = 10.0
+"""The first step must not move the tool by more than so many times itself."""
+STROKE_MM, LARGEST_RATIO = 1.0, 1000.0
+"""Stroke of the bar either way, and how much too large a wrong unit may make a number."""
+PLACES = 24
+GRID = (25, 21, 19)
+U_READING_MM = 0.0003
+UPRIGHT = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Proved:
+    """What commissioning found, and its number in the store."""
+
+    proof: SignProof
+    solution_id: int
+
+
+@dataclass
+class _Bench:
+    """What a commissioning works with."""
+
+    session: Session
+    store: Store
+    site: Site
+    bar: BarPlaces
+
+    async def with_table(self, what: str, tables: NineTables, base: Base, lsb_nm: int) -> Readings:
+        """Read all places with other tables in force; the old ones are in force again afterwards, whatever happens."""
+        now = await read_base(self.session.controller)
+        if now.crc != base.crc:
+            raise TableMismatch("somebody changed the active table during commissioning", "begin again")
+        found: list[Readings] = []
+
+        async def read() -> Verdict:
+            found.append(await self.bar.read(what))
+            return Verdict(False, f"{KIND}: {what} was read")  # a test step is never kept
+
+        wanted = Wanted(tables, now, lsb_nm, None, {"kind": KIND, "what": what})
+        await Pushing(self.session.controller, self.store, self.site).bring(wanted, Questions(list, KIND, read, read))
+        if not found:
+            raise TableMismatch("the controller changed before the places were read", "look at the controller, then begin again")
+        return found[0]
+
+
+async def commission(session: Session, store: Store, site: Site, *, progress: ProgressSink) -> Proved:
+    """Find out what the control does with a correction. About ten minutes of machine time, one mounting of cup and bar.
+
+    An interlock always ends it, whatever the machine file lets a measurement wait for: a test table is in force meanwhile.
+
+    Raises
+    ------
+    TableRefused
+        The first small step moved the tool too far, or the control's unit is too coarse for it. The old table is in force.
+    StillActive, TableMismatch, Interlock, MeasurementFault, DriverError
+        As of any push and any measurement.
+    """
+    site = replace(site, watching=replace(site.watching, suspending=Suspending()))
+    await recover(session.controller, store, site)
+    base = await read_base(session.controller)
+    lsb_nm = (await session.controller.table_format()).lsb_nm
+    known = identity(await session.controller.identify())
+    number = sum(c.name.startswith(KIND) for c in await asyncio.to_thread(store.campaigns)) + 1
+    bench = _Bench(session, store, site, BarPlaces(session, store, site, progress, f"{KIND} {number}", PLACES))
+    steps = _steps(bench, base, lsb_nm)  # and their limits, before anything is mounted
+    async with bench.bar.cleared_away():
+        proof = await _prove(bench, base, steps)
+        campaign = await asyncio.to_thread(store.campaign, f"{bench.bar.name} before")
+        solution_id = await store.write(store.add_solution, campaign.id, KIND, bench.bar.run_ids, _doc(proof) | {"identity": known})
+    return Proved(proof, solution_id)
+
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """The tables to be written: a first small step of all axes, then one for each; and how large the steps are in the control's unit."""
+
+    lsb_nm: int
+    small_mm: float
+    small: NineTables
+    step_mm: float
+    each: tuple[NineTables, NineTables, NineTables]
+
+
+def _steps(bench: _Bench, base: Base, lsb_nm: int) -> _Steps:
+    lsb_mm = lsb_nm * 1e-6
+    small_mm, step_mm = (max(round(s / lsb_mm), 1) * lsb_mm for s in (FIRST_MM, STEP_MM))
+    if small_mm * LARGEST_RATIO > STROKE_MM:
+        raise TableRefused(
+            f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: its least step, taken for millimetres, is beyond the bar's stroke",
+            "prove sign and unit with an indicator and the axis clear of everything; nothing was written",
+        )
+    tables = _base_tables(bench.site, base)
+    x, y, z = (quantise(_stepped(bench, tables, (axis,), step_mm), lsb_mm) for axis in range(3))
+    small = quantise(_stepped(bench, tables, (0, 1, 2), small_mm), lsb_mm)
+    for one in (small, x, y, z):
+        check_limits(one, base.tables, bench.site.limits)
+    return _Steps(lsb_nm, small_mm, small, step_mm, (x, y, z))
+
+
+async def _prove(bench: _Bench, base: Base, steps: _Steps) -> SignProof:
+    """All passes and what follows from them; a wrong unit is stored before it is raised."""
+    before = await bench.bar.read("before")
+    first = await bench.with_table("first", steps.small, base, steps.lsb_nm)
+    moved_mm = float(np.abs(first.deviation_mm - before.deviation_mm).max())
+    if moved_mm > HARMLESS * max(steps.small_mm, FIRST_MM):
+        moved = f"a step of {steps.small_mm * 1e3:g} µm moved the tool by {moved_mm * 1e3:.1f} µm"
+        what = f"{moved}: the control takes the numbers for another unit"
+        campaign = await asyncio.to_thread(bench.store.campaign, f"{bench.bar.name} before")
+        doc = {"step_mm": steps.small_mm, "faults": [what], "proved": False}
+        await bench.store.write(bench.store.add_solution, campaign.id, KIND, bench.bar.run_ids, doc)
+        raise TableRefused(what, "the old table is in force; look up the unit of the control's table and its entry in the machine file")
+    read = [await bench.with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
+    after = await bench.bar.read("after")
+    return sign_proof(steps.step_mm, _shifts(bench.bar.directions(before), before, read, after))
+
+
+def _base_tables(site: Site, base: Base) -> NineTables:
+    """The tables in force; zeros where there is no correction."""
+    if base.tables is not None:
+        return base.tables
+    grids = grid_positions(site.machine, GRID)
+    zeros = tuple(np.zeros((g.size, 3)) for g in grids)
+    both = (zeros[0], zeros[1], zeros[2])
+    return NineTables(grids, both, both)
+
+
+def _stepped(bench: _Bench, tables: NineTables, axes: tuple[int, ...], step_mm: float) -> NineTables:
+    """The tables with a step for some axes, in force wherever the bar reads."""
+    for axis in axes:
+        centre, reach = bench.bar.centre_mm[axis], bench.bar.radius_mm + 1.0
+        low_mm = centre - (1.0 if axis == UPRIGHT else reach)  # the places are on the upper hemisphere
+        try:
+            tables = step_tables(tables, axis, step_mm, low_mm, centre + reach)
+        except ValueError as error:
+            raise TableRefused(str(error), "the machine's strokes are too short for this test; nothing was written") from None
+    return tables
+
+
+def _shifts(directions: F2, before: Readings, read: list[Readings], after: Readings) -> tuple[Shift, Shift, Shift]:
+    # after "before" comes the small step, then X, Y, Z, then "after": five equal times
+    found = [
+        bar_shift(directions, before.deviation_mm, one.deviation_mm, after.deviation_mm, U_READING_MM, share=(k + 2) / 5.0)
+        for k, one in enumerate(read)
+    ]
+    return found[0], found[1], found[2]
+
+
+def _doc(proof: SignProof) -> dict[str, Any]:
+    return {
+        "step_mm": proof.step_mm,
+        "response": proof.response.tolist(),
+        "u_response": proof.u.tolist(),
+        "faults": list(proof.faults),
+        "proved": proof.proved,
+    }
+
+
+async def commissioned(controller: Controller, store: Store, site: Site) -> bool | None:
+    """Whether the last commissioning of this machine's control has proved sign, axis and unit.
+
+    None: there was none, or since then another control or another firmware was put in.
+    """
+    info = identity(await controller.identify())
+    doc = await asyncio.to_thread(_last, store, site)
+    if doc is None or (doc["proved"] and doc.get("identity") != info):
+        return None
+    return bool(doc["proved"])
+
+
+def _last(store: Store, site: Site) -> dict[str, Any] | None:
+    ids = {c.id for c in store.campaigns() if store.machine(c.machine_id).name == site.name}
+    last = [s for s in store.solutions() if s.kind == KIND and s.campaign_id in ids][-1:]
+    return dict(last[0].doc) if last else None
+
+
+async def check_commissioned(controller: Controller, store: Store, site: Site) -> None:
+    """Refuse a table for a control of which nobody knows what it does with one.
+
+    Raises
+    ------
+    TableRefused
+        Sign, axis and unit were never proved, or the last commissioning found that the control does something else.
+    """
+    found = await commissioned(controller, store, site)
+    if found is False:
+        raise TableRefused(
+            "the last commissioning of this machine found that its control does not do what is written",
+            "mend that, then abbe comp commission again; nothing was written",
+        )
+    if found is None:
+        raise TableRefused(
+            "sign, axis and unit of this control's tables were never proved: a whole table could move the axes by another unit",
+            "abbe comp commission proves them with a small step, about ten minutes; nothing was written",
+        )

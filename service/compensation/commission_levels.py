@@ -1,0 +1,232 @@
+"""Commissioning of a controller's promises: each flag of `Capabilities` is proved by trying what must be refused, and what must be taken.
+
+Everything is tried with an exact copy of the table in force in the bank at rest. Whatever is accepted wrongly, and wherever this is broken
+off, the same numbers act as before. Nobody is asked to open, press or restart anything: what only that could show is said as not shown.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from contextlib import suppress
+from dataclasses import dataclass, fields
+
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import Refused
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.level_trial import ID_WORD, SEALED, Shown, Trial
+from abbe.service.compensation.level_trial_motion import while_moving
+from abbe.service.compensation.proved_levels import KIND, flags_of, identity, last_proof
+from abbe.service.compensation.recover import recover
+from abbe.service.errors import TableMismatch, UnsafeToMove
+from abbe.service.push.book import read_entries
+from abbe.service.push.levels import Capabilities
+from abbe.service.site import Site
+from abbe.service.storage.records import Doc
+from abbe.service.storage.store import Store
+from abbe.service.tables.base_table import read_base
+
+RESTART = "that a restart changes the boot id, and what it leaves in the banks: nobody restarted the controller"
+NOT_SHOWN = (
+    "that an open door, an e-stop or drives that are off refuse an activation: nobody was asked to open or press anything",
+    "that a command repeated with its old number does nothing: the driver never repeats one",
+)
+SHORT_LEASE_MS, RUNS_OUT_S, POLL_S = 300, 5.0, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """What was proved of a controller. ``shown``: every single observation; ``not_shown``: what this test cannot show."""
+
+    capabilities: Capabilities
+    shown: tuple[Shown, ...]
+    not_shown: tuple[str, ...]
+    identity: Doc
+    solution_id: int
+
+    def rows(self) -> list[tuple[str, bool, str]]:
+        """For people: flag, proved or not, how (or what spoke against it)."""
+        found = flags_of(self.capabilities)
+        return [(name, ok, how(self.shown, name)) for name, ok in found.items() if name != "can_disable"]
+
+
+async def commission_levels(controller: Controller, store: Store, site: Site, clock: Clock | None = None) -> Levels:
+    """Prove what a controller does for a safe push. One short move; the table in force stays what it is.
+
+    Raises
+    ------
+    UnsafeToMove
+        Somebody holds the lease of the banks, or a push is under way.
+    StillActive
+        An interrupted push could not be finished (yet).
+    TableMismatch
+        The table in force is not what its CRC says, or not what it was before.
+    DriverError
+        The link failed, or the controller restarted meanwhile: begin again.
+    """
+    await recover(controller, store, site)  # the bank at rest may hold the table that an interrupted push goes back to
+    info = await controller.identify()
+    base = await read_base(controller)
+    if base.status.lease_owner:
+        raise UnsafeToMove("another owner has the lease of the banks", "wait until it has run out, then begin again")
+    owner = (secrets.randbits(15) + 1) << 16
+    trial = Trial(controller, clock or SystemClock(), base, owner, owner ^ 1)
+    earlier = await asyncio.to_thread(_earlier_boots, store, site)
+    try:
+        await _try_all(trial, site)
+    finally:
+        await run_to_end(_put_back(trial))
+    await _boot_id(trial)
+    other_boots = earlier - {info.boot_id}
+    if other_boots:
+        trial.note("boot_id", "it is another one than an earlier run of this controller had")
+    capabilities = Capabilities(**{f.name: trial.proved(f.name) for f in fields(Capabilities)})
+    not_shown = (*(() if other_boots else (RESTART,)), *NOT_SHOWN)
+    doc = {
+        "identity": identity(info), "boot_id": info.boot_id, "flags": flags_of(capabilities), "level": capabilities.level,
+        "shown": [[s.flag, s.ok, s.what] for s in trial.shown], "not_shown": list(not_shown),
+    }  # fmt: skip
+    solution_id = await store.write(_keep, store, site, doc)
+    return Levels(capabilities, tuple(trial.shown), not_shown, identity(info), solution_id)
+
+
+def how(shown: tuple[Shown, ...], flag: str) -> str:
+    """How a flag was proved, or what spoke against it."""
+    of_it = [s for s in shown if s.flag == flag]
+    return "; ".join(s.what for s in of_it if not s.ok) or "; ".join(s.what for s in of_it) or "it could not be tried"
+
+
+def _keep(store: Store, site: Site, doc: Doc) -> int:
+    machine_id = store.add_machine(site.name, site.doc)
+    number = sum(c.name.startswith(f"{KIND} ") for c in store.campaigns()) + 1
+    return store.add_solution(store.add_campaign(machine_id, f"{KIND} {number}", {}), KIND, [], doc)
+
+
+def _earlier_boots(store: Store, site: Site) -> set[int]:
+    """Boot ids that earlier pushes and commissionings of this machine have met."""
+    boots = {int(e.doc["boot"]) for e in read_entries(store, site.name, site.control) if "boot" in e.doc}
+    last = last_proof(store, site)
+    return boots | ({int(last["boot_id"])} if last else set())
+
+
+async def _try_all(t: Trial, site: Site) -> None:
+    await t.hold()
+    if not await _two_banks(t):
+        return
+    try:
+        await _generation(t)
+        await _lease(t)
+        await _swap(t)
+        await while_moving(t, site)
+        await _right(t)
+    except Refused as error:
+        t.fail("two_banks", f"a copy of the table in force cannot be made ready: {error.detail}")
+
+
+async def _boot_id(t: Trial) -> None:
+    now = await t.status()
+    if now.boot_id == 0:
+        t.fail("boot_id", "it is zero")
+    elif t.boots != {now.boot_id}:
+        t.fail("boot_id", "it changed during the test")
+    else:
+        t.note("boot_id", "it is there and stays the same")
+
+
+async def _two_banks(t: Trial) -> bool:
+    """Two memories, of which the one in force takes no writes. Only the table's number is another one meanwhile: it does not act."""
+    image, c = t.base.image, t.controller
+    now = await t.status()
+    begin, end = 2 * ID_WORD, 2 * ID_WORD + 4
+    number = image[begin:end]
+    marked = image[:begin] + bytes(b ^ 0x5A for b in number) + image[end:]
+    why = await t.accepts(c.write_bank(1 - now.active_bank, marked))
+    if why:
+        t.fail("two_banks", f"the bank at rest takes no writes: {why}")
+        return False
+    apart = await c.read_bank(1 - now.active_bank, len(image)) == marked and await c.read_bank(now.active_bank, len(image)) == image
+    t.judge(
+        "two_banks", apart, "a write into the bank at rest is read from there and nowhere else", "a write into one bank is not kept apart"
+    )
+    why = await t.accepts(c.write_part(now.active_bank, ID_WORD, number))
+    t.judge("two_banks", bool(why), "the bank in force takes no writes", "the bank in force takes writes")
+    if not apart:  # the number is put back wherever it went
+        await t.accepts(c.write_part(now.active_bank, ID_WORD, number))
+    why = await t.accepts(c.write_bank(1 - now.active_bank, image))
+    return not why and apart
+
+
+async def _generation(t: Trial) -> None:
+    one, two = await t.status(), await t.status()
+    t.judge("generation", one.gen == two.gen, "it stands while nothing changes", "it changes although nothing was changed")
+    for _ in range(2):
+        gen = (await t.status()).gen
+        await t.accepts(t.write_again())
+        t.counted(gen, (await t.status()).gen, "a write")
+
+
+async def _lease(t: Trial) -> None:
+    c = t.controller
+    await t.accepts(c.release(t.owner))
+    other = 1 - (await t.status()).active_bank
+    t.refused("lease", await t.accepts(c.seal(other, t.owner)), "to seal without the lease")
+    await t.accepts(t.write_again())
+    await t.hold()
+    mine = (await t.status()).lease_owner == t.owner
+    t.judge("lease", mine, "it is told who has it", "it does not tell who has it")
+    t.refused("lease", await t.accepts(c.lease(t.stranger, 60_000, anyway=True)), "that a second owner takes it")
+    t.refused("lease", await t.accepts(c.release(t.stranger, anyway=True)), "that a second owner gives it away")
+    t.refused("lease", await t.accepts(c.seal(1 - (await t.status()).active_bank, t.stranger)), "that a second owner seals")
+    now = await t.sealed()
+    t.refused("lease", await t.activate(now, owner=t.stranger), "that a second owner activates")
+    now = await t.sealed()
+    await t.accepts(c.release(t.owner))
+    t.refused("lease", await t.activate(now), "to activate without the lease")
+    await t.accepts(c.lease(t.owner, SHORT_LEASE_MS))
+    end_s = t.clock.monotonic_s() + RUNS_OUT_S
+    while (await t.status()).lease_owner and t.clock.monotonic_s() < end_s:
+        await t.clock.sleep(POLL_S)
+    t.judge("lease", not (await t.status()).lease_owner, "it runs out", "it does not run out")
+
+
+async def _swap(t: Trial) -> None:
+    now = await t.sealed()
+    t.refused("swap_compares", await t.activate(now, crc=t.base.crc ^ 0xFFFF), "an activation with another CRC")
+    now = await t.sealed()
+    t.refused("swap_compares", await t.activate(now, gen=(now.gen - 1) % 2**32), "an activation with another generation")
+    before = await t.sealed()
+    await t.accepts(t.write_again())
+    await t.sealed()
+    t.refused("swap_compares", await t.activate(before), "an activation after the bank was written again")
+
+
+async def _right(t: Trial) -> None:
+    """The other half of every refusal: what is right is taken. Without it, a controller that takes nothing would be proved."""
+    now = await t.sealed()
+    other = 1 - now.active_bank
+    why = await t.activate(now)
+    after = await t.status()
+    if after.active_bank == other:
+        t.note("swap_compares", "what is right is taken")
+        t.counted(now.gen, after.gen, "an activation")
+    elif after.bank_state[other] not in (0, 1, SEALED):
+        t.note("swap_compares", "what is right is taken, to act after the next start")
+        await t.accepts(t.write_again())  # given up
+    else:
+        t.fail("swap_compares", f"what is right is refused as well: {why or 'it was acknowledged, but nothing changed'}")
+
+
+async def _put_back(t: Trial) -> None:
+    """The bank that was in force is so again; at least the same table is. The copy stays in the bank at rest, the lease is free."""
+    now = await t.status()
+    if now.active_bank != t.base.status.active_bank or now.bank_crc[now.active_bank] != t.base.crc:
+        with suppress(Refused):  # then the same table acts, from the other bank
+            await t.activate(await t.sealed())
+    await t.accepts(t.controller.release(t.owner))
+    now = await t.status()
+    if now.lease_owner in (t.owner, t.stranger):
+        await t.accepts(t.controller.release(now.lease_owner))
+    in_force = await t.controller.read_bank(now.active_bank, len(t.base.image))
+    if in_force != t.base.image:
+        raise TableMismatch("the table in force is not what it was before this test", "look at the controller; write the table anew")

@@ -1,0 +1,317 @@
+"""From a stored solution to a control's table files, and from files to what they would do."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.models.machine import AXES, Machine
+from abbe.service.errors import FileFormatError, FormatRefused, TableFileError
+from abbe.service.files import NotPlainError, read_plain
+from abbe.service.formats.choice import Choice, best_of, choices, rounded
+from abbe.service.formats.controls import CONTROLS, Control
+from abbe.service.formats.identified import Identified
+from abbe.service.formats.model import Compensation
+from abbe.service.formats.registry import FORMATS, format_of
+from abbe.service.formats.settings import Settings
+from abbe.service.formats.text import TextFile
+from abbe.service.identification.stored_prediction import stored_prediction
+from abbe.service.rendering.page_file import write_page
+from abbe.service.site import machine_from_doc
+
+LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
+ONLY_FRESH = "the tables hold for a machine that was measured without any: what was active while measuring has to be added"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Files for a control, the kinds of tables that were weighed against each other, and what a person has to know."""
+
+    files: tuple[TextFile, ...]
+    choices: tuple[Choice, ...]
+    notes: tuple[str, ...]
+
+
+def identified(doc: dict[str, Any]) -> Identified:
+    """The machine of a stored solution (``abbe-solution/1``): geometry, coefficients, lost motion where it was observed.
+
+    Raises
+    ------
+    FileFormatError
+        The document holds no coefficients or no machine.
+    """
+    for key, what in (("prediction", "coefficients"), ("machine", "machine")):
+        if not isinstance(doc.get(key), dict):
+            raise FileFormatError(f"the solution holds no {what} (key {key!r})", "solve the campaign again: abbe solve")
+    try:
+        machine = machine_from_doc(doc["machine"])
+        terms, coefficients, _ = stored_prediction(doc["prediction"])
+        told = doc.get("parameters", {})
+        lost = {a: told.get(f"backlash_{a}", {}) for a in AXES}
+        seen = {a: float(v["value"]) for a, v in lost.items() if v and v["status"] != "not observable"}
+    except (ValueError, KeyError, TypeError) as error:
+        raise FileFormatError(f"the solution cannot be read: {error}", "solve the campaign again: abbe solve") from None
+    return Identified(machine, terms, coefficients, seen)
+
+
+def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> dict[str, Any]:
+    """A solution by its number in the database, or by a JSON file (`abbe solve --json`).
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be read or is no JSON object.
+    """
+    if source.isdigit():
+        return stored(int(source))
+    try:
+        doc = json.loads(read_plain(Path(source), LARGEST_SOLUTION))
+    except OSError as error:
+        raise FileFormatError(f"{source}: cannot be read: {error.strerror}", "give the number of a solution or a file") from None
+    except ValueError as error:
+        raise FileFormatError(f"{source}: no JSON: {error}", "give a file of `abbe solve --json`") from None
+    if not isinstance(doc, dict):
+        raise FileFormatError(f"{source}: not an object", "give a file of `abbe solve --json`")
+    return doc
+
+
+def control_for(key: str) -> Control:
+    """A control by its key, or a format by its: what a control with that format alone can do.
+
+    Raises
+    ------
+    FormatRefused
+        Neither of them.
+    """
+    if key in CONTROLS:
+        return CONTROLS[key]
+    if key not in FORMATS:
+        raise FormatRefused(f"there is no format or control {key!r}", f"formats: {', '.join(FORMATS)}; controls: {', '.join(CONTROLS)}")
+    form = FORMATS[key]
+    for c in CONTROLS.values():
+        if key in (c.own, c.lattice, c.motions) and c.cross in ("", key):
+            return replace(c, own=key if c.own == key else "", lattice=key if c.lattice == key else "")
+    points = min(form.limits.points, 101)
+    shared = key if form.limits.cross else ""
+    home = next((c for c in CONTROLS.values() if key in (c.own, c.cross)), Control(key, form.name))
+    return replace(
+        home,
+        key=key,
+        name=form.name,
+        own=key,
+        own_points=points,
+        cross=shared,
+        cross_points=min(points, home.cross_points),
+        products=form.limits.products,
+        both_directions=form.limits.directional,
+        tables=None,
+    )
+
+
+def settings_for(control: Control, machine: Machine, reference_mm: F1) -> Settings:
+    """What the writers are told: reference, decimals of the control's unit, Fanuc's unit."""
+    x, y, z = (float(v) for v in reference_mm)
+    return Settings(
+        reference_mm=(x, y, z),
+        decimals=max(3, round(-math.log10(control.unit_mm))),
+        machine=machine,
+        unit_mm=control.unit_mm if control.unit_mm >= 1e-4 else 1e-3,
+    )
+
+
+def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh: bool = False) -> Exported:
+    """The best tables that a control (or a format alone) can hold, as its files.
+
+    Parameters
+    ----------
+    key : str
+        Of a format or a control.
+    reference_mm : array, shape (3,), optional
+        Where the tables are zero; default: start of every stroke.
+    fresh : bool
+        It is known that no correction was in force while the machine was measured (`abbe.service.tables.measured_with`).
+
+    Raises
+    ------
+    FormatRefused
+        No such format, or the tables do not fit it.
+    """
+    control = control_for(key)
+    reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
+    found = choices(known, control, reference)
+    best = best_of(found)
+    if best.numbers == 0:
+        raise FormatRefused(f"no kind of table of {control.name} leaves less than none", "the machine needs none; nothing was written")
+    files = files_of(best.compensation, control, settings_for(control, known.machine, reference))
+    return Exported(files, found, _notes(best.compensation, control, fresh=fresh))
+
+
+def files_of(comp: Compensation, control: Control, settings: Settings) -> tuple[TextFile, ...]:
+    """Each part in the format in which the control holds it."""
+    own = Compensation(comp.own)
+    cross = Compensation(comp.cross, comp.products)
+    if control.own == control.cross:
+        own, cross = Compensation(comp.tables, comp.products), Compensation()
+    parts = (
+        (control.own, own),
+        (control.cross, cross),
+        (control.lattice, Compensation(lattice=comp.lattice)),
+        (control.motions, Compensation(motions=comp.motions)),
+    )
+    out: list[TextFile] = []
+    for key, part in parts:
+        if key and part.numbers:
+            out += format_of(key).write(part, settings)
+    return tuple(out)
+
+
+def _notes(comp: Compensation, control: Control, *, fresh: bool) -> tuple[str, ...]:
+    out = [] if fresh else [ONLY_FRESH]
+    lost = {a: v for a, v in comp.lost_motion_mm.items() if abs(v) > 0.5e-3 * 1e-3}
+    if lost:
+        words = ", ".join(f"{a} {v * 1e3:.2f} µm" for a, v in lost.items())
+        out.append(f"lost motion is in no table: set the control's own backlash parameter ({words})")
+    for key in formats_in(control):
+        form = FORMATS[key]
+        out.append(f"{form.name}: {form.sign.evidence}; acts after: {form.live}")
+        if not form.sign.sure:
+            out.append(
+                f"{form.name}: no manual states the sign ({form.sign.words}): write the 10 µm step first and measure it (docs/formats.md)"
+            )
+    return tuple(out)
+
+
+def expected(known: Identified, control: Control, reference_mm: F1 | None = None) -> Compensation:
+    """What an export to this control would have written, rounded as there, without what is no table."""
+    reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
+    comp = best_of(choices(known, control, reference)).compensation
+    return replace(rounded(comp, control.unit_mm), lost_motion_mm={})
+
+
+def read_key(key: str, files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+    """Tables of one format, or of all the formats of a control together.
+
+    Raises
+    ------
+    TableFileError
+        A file is not what the control would read as a whole, or belongs to none of its formats.
+    """
+    control = control_for(key)
+    tables: list[Any] = []
+    out = Compensation()
+    names = formats_in(control)
+    for name in names:
+        mine = files if len(names) == 1 else tuple(f for f in files if belongs(f, name))
+        if not mine:
+            continue
+        part = format_of(name).read(mine, settings)
+        tables += part.tables
+        out = replace(out, products=out.products + part.products, lattice=out.lattice or part.lattice, motions=out.motions or part.motions)
+    if not tables and not out.products and out.lattice is None and out.motions is None:
+        raise TableFileError(f"none of the files belongs to {control.name}", "give the files of one export")
+    return replace(out, tables=tuple(tables))
+
+
+SUFFIXES = {
+    "linuxcnc-1": ".comp",
+    "linuxcnc-0": ".comp",
+    "linuxcnc-hal": ".hal",
+    "siemens-eec": "eec.ini",
+    "siemens-cec": "cec.ini",
+    "fanuc-pitch": "pitch.txt",
+    "fanuc-lattice": "lattice.csv",
+}
+
+
+def belongs(file: TextFile, key: str) -> bool:
+    """Whether a file of a control's folder is one of this format, by its name."""
+    return file.name.lower().endswith(SUFFIXES.get(key, ""))
+
+
+def formats_in(control: Control) -> tuple[str, ...]:
+    """Formats that a control reads; several tell their files apart by name, so they always go into a folder."""
+    return tuple(dict.fromkeys(k for k in (control.own, control.cross, control.lattice, control.motions) if k))
+
+
+def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False) -> list[Path]:
+    """One file to ``out``; several, or with ``folder``, into a new folder ``out``: all of them or, after any mistake, none.
+
+    Raises
+    ------
+    FileFormatError
+        It cannot be written, or the folder is there already.
+    """
+    if len(files) == 1 and not folder:
+        write_page(files[0].text, out)
+        return [out]
+    if out.exists():
+        raise FileFormatError(f"{out}: is there already, and the files need a new folder", "give another name")
+    aside: Path | None = None
+    try:
+        aside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+        for f in files:
+            with (aside / f.name).open("w", encoding="utf-8") as file:
+                file.write(f.text)
+                file.flush()
+                os.fsync(file.fileno())
+        aside.chmod(0o755)
+        aside.rename(out)
+    except OSError as error:
+        if aside is not None:
+            shutil.rmtree(aside, ignore_errors=True)
+        raise FileFormatError(f"{out}: cannot be written: {error.strerror}", "give a folder that may be written") from None
+    return [out / f.name for f in files]
+
+
+def read_files(path: Path) -> tuple[TextFile, ...]:
+    """A file, or all files of a folder by name.
+
+    Raises
+    ------
+    FileFormatError
+        It is not there, too large, or no text.
+    """
+    try:
+        paths = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")) if path.is_dir() else [path]
+        out = []
+        for p in paths:
+            out.append(TextFile(p.name, io.StringIO(read_plain(p, LARGEST_FILE).decode("utf-8"), None).read()))
+    except NotPlainError as error:
+        raise FileFormatError(f"{error.filename}: {error.strerror}: no compensation table", "give the table's file") from None
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror}", "give a file or a folder") from None
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path}: is no text", "give the table's file") from None
+    if not out:
+        raise FileFormatError(f"{path}: the folder is empty", "give a file or a folder of files")
+    return tuple(out)
+
+
+def reference_of(text: str | None) -> F1 | None:
+    """``"0,-200,-300"`` as positions of X, Y, Z, mm; None for None.
+
+    Raises
+    ------
+    FileFormatError
+        Not three numbers.
+    """
+    if text is None:
+        return None
+    try:
+        values = np.array([float(v) for v in text.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if values.size != 3 or not np.isfinite(values).all():
+        raise FileFormatError(f"--reference {text!r}: expected three positions, e.g. 0,0,-300", "give X,Y,Z in mm")
+    return values

@@ -1,0 +1,93 @@
+"""A rollback that a person orders of the service: `rollback`, with the machine alone, and only of the table that he has seen in force."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import DriverError
+from abbe.service.clock import Clock
+from abbe.service.compensation.deferred_rollback import LIMIT_S, finish_when_safe
+from abbe.service.compensation.rollback import Ordered, rollback
+from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.tables.push_outcome import STOPPED, Outcome
+from abbe.service.tables.table_history import offered
+
+
+@dataclass(frozen=True, slots=True)
+class BackOrder:
+    """What is ordered: the table of push ``push``, in force with ``crc``, goes; the one before comes."""
+
+    push: int
+    crc: int
+    ordered: Ordered
+
+
+async def bring_back(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> Outcome:
+    """Take the table back. What is returned is what was heard; which table is in force says the journal (`push_word.ordered`).
+
+    A refusal is an outcome, not an error: another process has the machine, the controller holds what the journal does not know, or the
+    journal moved on since the order was given.
+    """
+    try:
+        with alone(site.urls.cnc):
+            async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
+                return await _heard(session.controller, store, site, order, clock)
+    except MachineInUse as busy:
+        return Outcome("refused", f"{busy}; nothing was written")
+    except (AbbeError, DriverError, OSError) as error:
+        return Outcome("failed", _told(error))
+
+
+async def _heard(controller: Controller, store: Store, site: Site, order: BackOrder, clock: Clock) -> Outcome:
+    control = order.ordered.control
+    try:
+        await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
+        back = await rollback(controller, store, site, ordered=order.ordered)
+    except (TableRefused, TableMismatch) as no:
+        return Outcome("refused", _told(no))
+    except StillActive as open_:
+        return await _finished(controller, store, site, order, open_, clock)
+    except MachineInUse:
+        raise
+    except (AbbeError, DriverError, OSError) as error:
+        return Outcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
+    if back is None:
+        return Outcome("refused", "the table from before is in force already; nothing was written")
+    told = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
+    return Outcome("kept", f"{told}; the machine is unverified now: run a quick check")
+
+
+def check_unchanged(store: Store, machine: str, order: BackOrder, control: str = "") -> None:
+    """Refuse an order that was given in view of another table than the one in force by the journal now.
+
+    Raises
+    ------
+    TableRefused
+        It was, or nothing can be taken back any more.
+    """
+    now = offered(store, machine, control)
+    if (now.push, now.crc) != (order.push, order.crc):
+        raise TableRefused(
+            f"the table in force is {now.crc:08X} of push {now.push}, ordered back was {order.crc:08X} of push {order.push}",
+            "look at the table in force again; nothing was written",
+        )
+
+
+async def _finished(controller: Controller, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock) -> Outcome:
+    """The rollback broke off, and the way back from it is not open now: go it as soon as it is."""
+    finish = finish_when_safe(controller, store, site, limit_s=LIMIT_S, clock=clock, say=lambda _: None)
+    try:
+        done = await order.ordered.control.unless_stopped(finish)
+    except (AbbeError, DriverError, OSError) as again:
+        return Outcome("failed", f"{_told(error)}; {_told(again)}; it is taken back before the next check")
+    return Outcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+
+
+def _told(error: BaseException) -> str:
+    return "; ".join([str(error), *getattr(error, "__notes__", [])])

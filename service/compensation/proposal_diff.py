@@ -1,0 +1,137 @@
+"""How two sets of tables differ: nine curves on one grid, largest change and where, and the page that shows them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.models.compensation.tables import NineTables
+from abbe.models.machine import AXES
+from abbe.service.compensation.proposal_doc import Proposed, load
+from abbe.service.errors import TableRefused
+from abbe.service.rendering.diff_page import DiffCurve, DiffPage, render_diff
+from abbe.service.storage.store import Store
+
+ACTIVE = "ACTIVE"
+HEADINGS = ("table", "old max (µm)", "new max (µm)", "largest change (µm)", "U (µm)", "at (mm)", "rms change (µm)")
+
+
+@dataclass(frozen=True, slots=True)
+class CurveChange:
+    """One table of two sets on the grid of the new one, mm. ``u_mm``: standard uncertainty of the new entries."""
+
+    moved: str
+    corrected: str
+    position_mm: F1
+    old_mm: F1
+    new_mm: F1
+    u_mm: F1
+
+    @property
+    def change_mm(self) -> F1:
+        """New minus old."""
+        return np.asarray(self.new_mm - self.old_mm)
+
+    @property
+    def worst(self) -> int:
+        """Index of the largest change."""
+        return int(np.abs(self.change_mm).argmax())
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What is compared with what, and the nine tables."""
+
+    new: str
+    old: str
+    curves: tuple[CurveChange, ...]
+
+
+def compare(store: Store, number: int, with_what: str) -> Difference:
+    """Compare a proposal with the table that it was made on (``ACTIVE``), or with another proposal (its number).
+
+    Raises
+    ------
+    TableRefused
+        There is nothing of that name, or it is another machine's.
+    """
+    proposed = load(store, number)
+    if with_what.upper() == ACTIVE:
+        name = f"the table in force when it was made ({proposed.candidate.base_crc:08X})"
+        return Difference(f"proposal {number}", name, changes(proposed.base_tables, proposed.tables))
+    if not with_what.isdigit():
+        raise TableRefused(f"--with {with_what!r} is neither ACTIVE nor the number of a proposal", "abbe comp show lists them")
+    other = load(store, int(with_what))
+    if other.candidate.machine != proposed.candidate.machine:
+        raise TableRefused(
+            f"proposal {with_what} is for {other.candidate.machine!r}", f"compare proposals of {proposed.candidate.machine!r}"
+        )
+    return Difference(f"proposal {number}", f"proposal {with_what}", changes(other.tables, proposed.tables))
+
+
+def changes(old: NineTables | None, new: NineTables) -> tuple[CurveChange, ...]:
+    """Nine tables against nine others; None: against no correction."""
+    found = []
+    for a, moved in enumerate(AXES):
+        grid = new.position_mm[a]
+        for i, corrected in enumerate(AXES):
+            before = np.zeros(grid.size)
+            if old is not None:
+                before = np.interp(grid, old.position_mm[a], old.correction_mm[a][:, i])
+            found.append(CurveChange(moved, corrected, grid, before, new.correction_mm[a][:, i], new.u_mm[a][:, i]))
+    return tuple(found)
+
+
+def rows(found: Difference) -> list[tuple[str, ...]]:
+    """One line per table, for people; U is k = 2."""
+    out: list[tuple[str, ...]] = []
+    for c in found.curves:
+        k, change = c.worst, c.change_mm
+        figures = (_um(np.abs(c.old_mm).max()), _um(np.abs(c.new_mm).max()), f"{change[k] * 1e3:+.2f}", _um(2.0 * c.u_mm[k]))
+        rms = float(np.sqrt(np.mean(change**2)))
+        out.append((f"{c.corrected} over {c.moved}", *figures, f"{c.position_mm[k]:g}", _um(rms)))
+    return out
+
+
+def largest(found: Difference) -> str:
+    """The largest change of all nine tables, as a sentence."""
+    c = max(found.curves, key=lambda one: abs(one.change_mm[one.worst]))
+    k = c.worst
+    size, expanded = c.change_mm[k] * 1e3, 2e3 * c.u_mm[k]
+    where = f"in the table of {c.corrected} over {c.moved} at {c.position_mm[k]:g} mm"
+    return f"largest change: {size:+.2f} µm (U = {expanded:.2f} µm, k = 2) {where}"
+
+
+def diff_json(found: Difference) -> dict[str, Any]:
+    """For programs: every number of every curve."""
+    tables = [
+        {
+            "table": f"{c.corrected} over {c.moved}", "moved": c.moved, "corrected": c.corrected, "position_mm": c.position_mm.tolist(),
+            "old_um": (c.old_mm * 1e3).tolist(), "new_um": (c.new_mm * 1e3).tolist(), "u_um": (c.u_mm * 1e3).tolist(),
+            "largest_change_um": float(c.change_mm[c.worst] * 1e3), "at_mm": float(c.position_mm[c.worst]),
+        }
+        for c in found.curves
+    ]  # fmt: skip
+    return {"new": found.new, "old": found.old, "tables": tables}
+
+
+def diff_html(found: Difference, proposed: Proposed) -> str:
+    """The page: table of numbers and picture."""
+    p = proposed.predicted
+    lead = (
+        f"{proposed.candidate.machine}: {found.new}, made from campaign {proposed.campaign} by {proposed.by} at {proposed.utc}.",
+        f"Compared with {found.old}.",
+        f"The model promises {p.before_mm * 1e3:.1f} → {p.after_mm * 1e3:.1f} µm rms over the volume "
+        f"(U = {2e3 * p.u_model_mm:.1f} µm, k = 2). The {largest(found)}.",
+        *(f"Against it: {reason}" for reason in proposed.reasons),
+    )
+    curves = tuple(DiffCurve(c.moved, c.corrected, c.position_mm, c.old_mm * 1e3, c.new_mm * 1e3, c.u_mm * 1e3) for c in found.curves)
+    title = f"{found.new} against {found.old.split(' (')[0]}"
+    return render_diff(DiffPage(title, lead, HEADINGS, tuple(rows(found)), curves))
+
+
+def _um(mm: float) -> str:
+    return f"{mm * 1e3:.2f}"

@@ -1,0 +1,253 @@
+"""From an identification campaign to a stored proposal: what was measured with the table in force, solved, and what speaks against it.
+
+A machine that is measured while a table is active shows what that table has left. So the table that was active is read from the controller,
+must be the one all runs were measured with, and the new table is the old one plus what the runs still show. Nothing is written to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import getpass
+import os
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from abbe.drivers.api import Controller, TableFormat
+from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
+from abbe.service.campaign_data.campaign_folder import from_store
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.candidates import Promise, candidate_of, scene_of
+from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.identification.effect_removal import TakenOut, taken_out
+from abbe.service.identification.solve import Solved, solve_runs
+from abbe.service.identification.solve_report import solution_doc
+from abbe.service.identification.table_removal import TableThen
+from abbe.service.push.validate import reasons_against
+from abbe.service.runs.columns import load_run
+from abbe.service.site import Site
+from abbe.service.storage.base import utc_text
+from abbe.service.storage.records import CampaignRecord, RunRecord
+from abbe.service.storage.store import Store
+from abbe.service.tables.base_table import Base, read_base
+from abbe.service.tables.nine_tables import added
+
+GRID = (25, 21, 19)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Tables that a campaign proposes, absolute and quantised, and what they promise."""
+
+    solved: Solved
+    tables: NineTables
+    change: NineTables
+    predicted: Predicted
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """A campaign's complete runs, and the table in force, which all of them were measured with."""
+
+    campaign: CampaignRecord
+    records: list[RunRecord]
+    runs: list[dict[str, Any]]
+    base: Base
+    form: TableFormat
+
+
+@dataclass(frozen=True)
+class Made:
+    """A stored proposal and the solution that it follows from."""
+
+    number: int
+    proposed: Proposed
+    solved: Solved
+
+
+async def gather(controller: Controller, store: Store, site: Site, campaign: str | int) -> Gathered:
+    """Read a campaign and the table in force.
+
+    Raises
+    ------
+    TableMismatch
+        A run was measured with another table.
+    TableRefused
+        The campaign is another machine's.
+    """
+    record = await asyncio.to_thread(store.campaign, campaign)
+    measured_on = (await asyncio.to_thread(store.machine, record.machine_id)).name
+    if measured_on != site.name:
+        raise TableRefused(
+            f"campaign {record.name} was measured on {measured_on!r}, this is {site.name!r}", "name a campaign of this machine"
+        )
+    records = [r for r in await asyncio.to_thread(store.runs, record.id) if r.visible_status == "complete"]
+    runs = await load_runs(store, [r.id for r in records])
+    base = await read_base(controller)
+    check_same_table(base, [r for r in runs if r["role"] == "identify"])
+    return Gathered(record, records, runs, base, await controller.table_format())
+
+
+async def make(
+    store: Store,
+    site: Site,
+    gathered: Gathered,
+    *,
+    clock: Clock | None = None,
+    progress: ProgressSink,
+    agree: Callable[[Predicted], None] = lambda _: None,
+    by: str = "",
+) -> Made:
+    """Solve, and store what follows as a proposal, with every reason that speaks against it now.
+
+    ``agree``: sees what is promised; what it raises is raised, and nothing is stored. ``by``: who proposes; default: whose process it is.
+    """
+    clock = clock or SystemClock()
+    progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
+    name, base, form = gathered.campaign.name, gathered.base, gathered.form
+    known = await asyncio.to_thread(_without, store, name, base.tables)
+    proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, form.lsb_nm)
+    agree(proposal.predicted)
+    doc = solution_doc(proposal.solved) | known.doc | {"machine": site.doc}
+    solution_id = await store.write(store.add_solution, gathered.campaign.id, "joint", [r.id for r in gathered.records], doc)
+    promise = Promise(proposal.tables, proposal.change, proposal.predicted, None, *_ends_s(gathered.records))
+    candidate = candidate_of(site, promise, base, known.campaign.runs, form)
+    scene = await scene_of(site, store, base, form, proposal.tables, clock)
+    status = base.status
+    proposed = Proposed(
+        site.doc, name, solution_id, candidate, proposal.tables.u_mm,
+        BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people,
+        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, scene, site.limits)), known.lines,
+    )  # fmt: skip
+    plain = doc_of(proposed)
+    number = await store.write(store.add_proposal, site.name, solution_id, plain, digest_of_doc(plain))
+    return Made(number, proposed, proposal.solved)
+
+
+def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
+    """When the oldest and the newest of the runs that identify ended, UTC; 0 if one does not say so."""
+    used = [datetime.fromisoformat(r.ended_utc).timestamp() if r.ended_utc else 0.0 for r in records if r.role == "identify"]
+    return min(used, default=0.0), max(used, default=0.0)
+
+
+def propose(site: Site, runs: list[dict[str, Any]], base: Base, lsb_nm: int) -> Proposal:
+    """Absolute tables from runs that were measured while ``base`` was active (`taken_out`)."""
+    solved = solve_runs(site, runs)
+    change = nine_tables(solved.joint, GRID)
+    predicted = predict_residual(solved.joint, change)
+    return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted)
+
+
+async def solved_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:
+    """The solution that a stored proposal follows from: needed to ask what a newer run says of it. ``table``: in force when measured."""
+    known = await asyncio.to_thread(_without, store, campaign, table)
+    return await asyncio.to_thread(solve_runs, site, known.campaign.runs)
+
+
+def _without(store: Store, name: str, table: NineTables | None) -> TakenOut:
+    return taken_out(store, from_store(store, name), TableThen(table))
+
+
+def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
+    """Every run must have been measured with the table that is active now.
+
+    Raises
+    ------
+    TableMismatch
+        Which run was not, or does not say so.
+    """
+    for run in runs:
+        seen = run.get("table", {}).get("crc")
+        if seen != base.crc:
+            with_what = "does not say with which table it was measured" if seen is None else f"was measured with table {seen:08X}"
+            raise TableMismatch(f"run {run['run_id']} {with_what}; active is {base.crc:08X}", "measure again with the present table")
+        if base.tables is not None and run["table"].get("acting") is False:
+            why = f"run {run['run_id']} was measured while table {base.crc:08X} did not act: the compensation was switched off"
+            raise TableMismatch(why, "switch it on at the control and measure again")
+
+
+def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:
+    """Tables hold at the temperature they were measured at: outside of the allowed window none is pushed.
+
+    Raises
+    ------
+    TableRefused
+        Which run, which temperature.
+    """
+    low, high = site.temperature_c
+    for run in runs:
+        for t in run["columns"].get("temp_air_C", []):
+            if not low <= t <= high:
+                raise TableRefused(
+                    f"run {run['run_id']} was measured at {t:.1f} °C air, allowed are {low:g} to {high:g} °C",
+                    "measure again when the shop has settled, or change temperature_c under [limits]; nothing was written",
+                )
+
+
+def check_certificates(site: Site) -> None:
+    """Without a certificate of any instrument nothing will be pushed: said before an hour is measured for it.
+
+    Raises
+    ------
+    TableRefused
+        The machine file names no certificate.
+    """
+    if not site.calibrated_until:
+        raise TableRefused(
+            "the instruments have no calibration certificate", "name them under [calibration] in the machine file; nothing was measured"
+        )
+
+
+def login() -> str:
+    """The account of whoever sits at this command line."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a service account without a name
+        return f"user {os.getuid()}"
+
+
+def by_whom() -> str:
+    """Who ordered a table from this command line."""
+    return f"{login()}, by the command line"
+
+
+async def load_runs(store: Store, run_ids: list[int]) -> list[dict[str, Any]]:
+    """Runs of the store as ``abbe-run/1`` objects, read off the event loop; ``stored`` says when each ended."""
+    return await asyncio.to_thread(lambda: [load_run(store, k) | {"stored": {"ended_utc": store.run(k).ended_utc}} for k in run_ids])
+
+
+def check_before_runs(site: Site, base: Base, runs: list[dict[str, Any]], since_s: float, now_s: float) -> None:
+    """A verification to compare with has to be of this machine as it is now: after the identification, and since the last start.
+
+    Parameters
+    ----------
+    since_s, now_s : float
+        End of the newest run that identifies, and now, UTC.
+
+    Raises
+    ------
+    TableRefused
+        Which run is not, and why.
+    """
+    low, high = site.temperature_c
+    for run in runs:
+        text = (run.get("stored") or {}).get("ended_utc")
+        ended_s = datetime.fromisoformat(text).timestamp() if text else 0.0
+        air = [float(t) for t in run["columns"].get("temp_air_C", [])]
+        why = (
+            "is of another machine" if run.get("machine") != site.doc
+            else "is from before the control's last start" if run.get("table", {}).get("boot_id") != base.status.boot_id
+            else "was measured before the machine was identified" if ended_s < since_s
+            else f"is older than {site.limits.age_h:g} h" if now_s - ended_s > site.limits.age_h * 3600.0
+            else "ends in the future" if ended_s > now_s
+            else f"was measured outside of {low:g} to {high:g} °C" if not all(low <= t <= high for t in air)
+            else ""
+        )  # fmt: skip
+        if why:
+            raise TableRefused(
+                f"nothing can be compared with run {run['run_id']}: it {why}", "measure the verification before anew; nothing was written"
+            )

@@ -1,0 +1,168 @@
+"""A proposal that a person approved, pushed by the service where the machine file says so: the same one door, and nobody attends.
+
+Nobody attends means: the control was proved to level 3, the approval of a person holds (also where no second one is demanded), the last
+push is long enough ago, and the table has not walked away. The verification before is measured now.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from abbe.drivers.errors import DriverError
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.clock import Clock
+from abbe.service.compensation.commission import check_commissioned
+from abbe.service.compensation.correct import push
+from abbe.service.compensation.deferred_rollback import finish_when_safe
+from abbe.service.compensation.proposal_checks import hold
+from abbe.service.compensation.proposal_doc import load
+from abbe.service.compensation.proposal_states import standing
+from abbe.service.compensation.proposals import load_runs
+from abbe.service.compensation.proved_levels import check_level
+from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.session import Session
+from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
+from abbe.service.events import ProgressSink
+from abbe.service.sequences.campaigns import verification
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control, State
+from abbe.service.site import Site
+from abbe.service.storage.records import AlarmEntryRecord
+from abbe.service.storage.store import Store
+from abbe.service.tables.push_outcome import STOPPED, Outcome
+from abbe.service.verification.alarm_states import NO_ALARM, Kind
+
+WAIT_S = 600.0
+"""So long a machine that does not let the old table back at once is watched; after that the service tries again and again, and says so."""
+
+Begun = Callable[[], Awaitable[None]]
+"""Told, at least once, when the machine is ours and the try counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Approved:
+    """A proposal that waits for the service: its number, the approval that holds, and the alarm that asked for it (0: none)."""
+
+    proposal: int
+    approval: int
+    alarm: int
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """One try: which proposal, whom it is told that it began, who hears of its progress, and who may stop it."""
+
+    proposal: int
+    begun: Begun
+    progress: ProgressSink
+    control: Control
+
+
+@dataclass(frozen=True, slots=True)
+class _Bench:
+    session: Session
+    site: Site
+    store: Store
+    clock: Clock
+    rate_hz: int
+
+
+def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord], now_s: float) -> Approved | None:
+    """The proposal that was approved last, if the service has not tried it yet with this approval; None: nothing waits.
+
+    Older ones that are approved as well are not tried in its place: whoever approved the last one wanted that.
+    """
+    tried = {e.doc.get("approval") for e in entries if e.kind == Kind.PUSHING}
+    asked = {e.doc.get("proposal"): e.alarm for e in entries if e.kind == Kind.PROPOSED}
+    given = [(rows[-1].id, record.id) for record in store.proposals(machine) if (rows := store.approvals(record.id))]
+    if not given:
+        return None
+    approval, number = max(given)
+    try:
+        word = standing(store, number, load(store, number), now_s).word
+    except StoreError:  # a row that was changed: it is told where it is looked at, and never pushed
+        return None
+    if word == "approved" and approval not in tried:
+        return Approved(number, approval, asked.get(number, NO_ALARM))
+    return None
+
+
+async def push_approved(site: Site, store: Store, order: Order, *, clock: Clock, rate_hz: int = 100) -> Outcome:
+    """Verify with the table in force, push, prove, verify again; keep or go back. A refusal is an outcome, not an error.
+
+    What is returned is what was heard; which table is in force says the journal (`push_word.by_journal`).
+
+    Raises
+    ------
+    MachineInUse
+        Another process has the machine: nothing was begun, and the try does not count.
+    """
+    with alone(site.urls.cnc):
+        try:
+            async with recovered_session(store, site) as session:
+                await order.begun()
+                return await _heard(_Bench(session, site, store, clock, rate_hz), order)
+        except MachineInUse:
+            raise
+        except (AbbeError, DriverError, OSError) as error:  # the devices, before anything of it was begun
+            await order.begun()
+            return Outcome("failed", _told(error))
+
+
+async def _heard(bench: _Bench, order: Order) -> Outcome:
+    try:
+        return await _pushed(bench, order)
+    except TakenBack as back:
+        return Outcome("rolled back", _told(back))
+    except TableRefused as no:
+        return Outcome("refused", _told(no))
+    except StillActive as open_:
+        return await _back(bench, order, open_)
+    except (AbbeError, DriverError, OSError) as error:
+        return Outcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _told(error))
+
+
+async def _pushed(bench: _Bench, order: Order) -> Outcome:
+    session, store, site, control = bench.session, bench.store, bench.site, order.control
+    control.now(State.RUNNING)
+    await check_commissioned(session.controller, store, site)
+    await check_level(session.controller, store, site, attended=False)
+    proposed = await asyncio.to_thread(load, store, order.proposal)
+    against = (await hold(session.controller, store, site, order.proposal, proposed, bench.clock, attended=False)).reasons()
+    if against:
+        raise TableRefused("; ".join(against), "nothing was written")
+    before = await _before(bench, order)
+    done = await push(
+        session, store, site, order.proposal, before,
+        rate_hz=bench.rate_hz, progress=order.progress, clock=bench.clock, attended=False, control=control,
+    )  # fmt: skip
+    return Outcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
+
+
+async def _before(bench: _Bench, order: Order) -> list[dict[str, Any]]:
+    site = bench.site
+    name = f"verify-before proposal {order.proposal} {bench.clock.utc():%Y-%m-%d %H:%M:%S}"
+    plan = paced(verification(site.machine, rate_hz=bench.rate_hz, name=name), site.max_feed_mm_min)
+    manner = Manner(control=order.control, part=True)
+    return await load_runs(
+        bench.store, await measure(bench.session, bench.store, site, plan, progress=order.progress, clock=bench.clock, manner=manner)
+    )
+
+
+async def _back(bench: _Bench, order: Order, error: StillActive) -> Outcome:
+    """Watch the machine until the old table is back. A stop does not end that; after an abort the service goes back to it."""
+    said: list[str] = []
+    finish = finish_when_safe(bench.session.controller, bench.store, bench.site, limit_s=WAIT_S, clock=bench.clock, say=said.append)
+    try:
+        done = await order.control.unless_aborted(finish)
+    except (AbbeError, DriverError, OSError) as again:
+        return Outcome("failed", f"{_told(error)}; {_told(again)}; it is taken back as soon as it can be")
+    return Outcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+
+
+def _told(error: BaseException) -> str:
+    return "; ".join([str(error), *getattr(error, "__notes__", [])])

@@ -1,0 +1,203 @@
+"""Before anything moves: finish what an interrupted push left behind. An unverified table does not stay active (unconfirmed means back)."""
+
+from __future__ import annotations
+
+import asyncio
+
+from abbe.drivers.api import Controller
+from abbe.drivers.errors import DriverError
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.capture.recovery import recover_segments
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.old_pushes import finish_old_push
+from abbe.service.compensation.pushing import pushes_here
+from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
+from abbe.service.push import execute
+from abbe.service.push.adapter import ControllerPort, nobody
+from abbe.service.push.book import StoreBook
+from abbe.service.push.entries import WORD, Journal, facts
+from abbe.service.push.staging import LAID_ASIDE
+from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, State
+from abbe.service.site import Site
+from abbe.service.storage.owner import Owner, this_process
+from abbe.service.storage.store import Store
+from abbe.service.tables.push_history import operator_needed
+from abbe.service.tables.table_gate import accept_strange, check_in_force, said, vouch
+from abbe.service.tables.unverified import Known, known_tables
+from abbe.service.tables.whose_push import check_own, is_own
+
+READY = "make the machine ready (interlocks, link), then start again"
+
+
+async def recover(controller: Controller, store: Store, site: Site, *, accept_by: str = "") -> str | None:
+    """Finish what the last push left open, and take over what interrupted runs left; returns what was done in a sentence or two, or None.
+
+    Everything that moves the machine, or builds on its table, calls this first (tests/unit/service_jobs/test_every_door.py).
+
+    Parameters
+    ----------
+    accept_by : str
+        Who vouches for a table in force that this database did not push; empty: nobody does.
+
+    Raises
+    ------
+    MachineInUse
+        Another process is in the middle of a push on this machine.
+    StillActive
+        The unverified table is still active, because the controller refuses or does not answer.
+    TableMismatch
+        The controller holds a table that nothing has verified, under whatever name it was pushed, or that this database did not push: a
+        person must look (`abbe accept-table`).
+    StoreError, CaptureFault
+        The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only told.
+    """
+    # First: whatever is wrong with a segment, no unverified table stays active.
+    pushed = [await finish_old_push(controller, store, site), await finish_push(controller, store, site, accept_by=accept_by)]
+    runs = await asyncio.to_thread(recover_segments, store, site.capture)
+    return "; ".join([*filter(None, pushed), *(run.text for run in runs)]) or None
+
+
+async def finish_push(controller: Controller, store: Store, site: Site, clock: Clock | None = None, *, accept_by: str = "") -> str | None:
+    """Bring the last push into this machine's control to its end, from its journal and from what the controller says; then look at the
+    table in force (`check_in_force`).
+
+    Returns
+    -------
+    str or None
+        What was done; None if there was nothing to do.
+
+    Raises
+    ------
+    MachineInUse, StillActive, TableMismatch
+        As of `recover`.
+    """
+    told = await _ended(controller, store, site, clock or SystemClock())
+    try:
+        accepted = await accept_strange(controller, store, site, accept_by) if accept_by else None
+        await check_in_force(controller, store, site)
+    except (AbbeError, DriverError) as error:
+        if told:
+            error.add_note(told)
+        raise
+    return "; ".join(filter(None, (told, accepted))) or None
+
+
+async def _ended(controller: Controller, store: Store, site: Site, clock: Clock) -> str | None:
+    """The same without the look at the table: what was done of the last push."""
+    book = await StoreBook.last(store, site.name, clock, site.control)
+    journal: Journal = () if book is None else await book.entries()
+    if book is None or journal[-1].push == WORD:
+        return None
+    before = journal[-1].state
+    if before not in TERMINAL or before is State.OPERATOR:
+        await check_own(controller, site, journal)
+    if before is State.OPERATOR:
+        raise operator_needed(journal)
+    _refuse_if_under_way(store, site, journal)
+    ended = await run_to_end(execute.recover(ControllerPort(controller, nobody(), clock), book))
+    return _told(ended, before)
+
+
+def _told(ended: execute.Ended, before: State) -> str | None:
+    known, number = facts(ended.journal), ended.journal[-1].push
+    why = known.get("why", "interrupted before verification")
+    match ended.state:
+        case state if state is before and state in TERMINAL:
+            return None
+        case State.ROLLED_BACK:
+            return f"push {number} was not verified ({why}); the old table was made active again"
+        case State.ABORTED:
+            return f"push {number} was not finished ({why}); the old table is in force"
+        case State.OPERATOR:
+            raise operator_needed(ended.journal)
+    raise StillActive(f"the unverified table of push {number} is still active: {known.get('pending', ended.why)}", READY)
+
+
+async def accept(controller: Controller, store: Store, site: Site, by: str = "a person") -> str:
+    """A person vouches for the table that is active now: every push that is open with it is closed, under whatever name it was begun.
+
+    An interrupted push that can be finished is finished instead, and nothing is accepted: the person has looked at another table then.
+
+    Parameters
+    ----------
+    by : str
+        Who; it is kept in the journal.
+
+    Returns
+    -------
+    str
+        What was done.
+
+    Raises
+    ------
+    MachineInUse
+        Another process is in the middle of a push on this machine.
+    """
+    clock = SystemClock()
+    await finish_old_push(controller, store, site, accepted=True)
+    book = await StoreBook.last(store, site.name, clock, site.control)
+    journal: Journal = () if book is None else await book.entries()
+    if book is not None and journal[-1].state not in TERMINAL and await is_own(controller, site, journal):
+        _refuse_if_under_way(store, site, journal)
+        before = await controller.comp_status()
+        ended = await run_to_end(execute.recover(ControllerPort(controller, nobody(), clock), book))
+        journal, now = ended.journal, await controller.comp_status()
+        if ended.settled and journal[-1].state is not State.OPERATOR:
+            changed = before.active_bank != now.active_bank
+            what = (
+                "the table from before it was made active again: look at the controller once more" if changed else "its table is as it was"
+            )
+            return f"push {journal[-1].push} was interrupted and is finished now ({journal[-1].state}); {what}; nothing was accepted"
+    return await _accepted(controller, store, site, by)
+
+
+async def _accepted(controller: Controller, store: Store, site: Site, by: str) -> str:
+    now = await controller.comp_status()
+    crc, other = now.bank_crc[now.active_bank], 1 - now.active_bank
+    if now.bank_state[other] == LAID_ASIDE and now.bank_crc[other] != crc:
+        raise TableMismatch(
+            f"the control has another table laid aside (bank {other}, CRC {now.bank_crc[other]:08X}) and uses it after its next start",
+            "take that one away at the control first; nothing was accepted",
+        )
+    known = await asyncio.to_thread(known_tables, store)
+    chain = await asyncio.to_thread(store.push_chain, site.name, site.control)
+    await _given_to_a_person(store, site, chain)
+    for other_chain in _open_with(crc, known) - {chain}:
+        book = await _given_to_a_person(store, site, other_chain)
+        await book.append(await book.entries(), State.ACCEPTED, said(now, by))
+    await vouch(store, site, now, by)
+    told = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted by {by}"
+    push = known.unverified.get(crc)
+    if push is None:
+        return told
+    name = "" if push.chain == chain and push.machine == site.name else f" of machine {push.machine!r}"
+    return f"{told}; it is that of push {push.push}{name}, which no measurement has verified"
+
+
+def _open_with(crc: int, known: Known) -> set[str]:
+    """Journal of the last push that brought this table, if it is still open: under another name or address it would be taken back."""
+    push = known.pushed.get(crc)
+    return {push.chain} if push is not None and push.chain and push.may_be_active else set()
+
+
+async def _given_to_a_person(store: Store, site: Site, chain: str) -> StoreBook:
+    """The last push of a journal, with the decision left to a person if it was open."""
+    book = await StoreBook.of_chain(store, chain, SystemClock()) or await StoreBook.word(store, site.name, SystemClock(), site.control)
+    journal = await book.entries()
+    if journal and journal[-1].state not in TERMINAL:
+        _refuse_if_under_way(store, site, journal)
+        state = State.ABORTED if journal[-1].state in BEFORE_ACTIVATION else State.OPERATOR
+        await book.append(journal, state, {"why": "a person took the decision"})
+    return book
+
+
+def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
+    """A push that another process, or another task of this one, is driving is not recovered by us."""
+    last = journal[-1]
+    if last.state in TERMINAL or last.state is State.ROLLBACK_PENDING:
+        return
+    process = facts(journal).get("process")
+    owner = Owner(**process) if process else None
+    ours = owner == this_process()
+    if owner is not None and (pushes_here(store, site) if ours else not owner.is_gone()):
+        raise MachineInUse(f"push {last.push} is under way (process {owner.pid})", "wait until it has ended")

@@ -1,0 +1,1 @@
+"""Demonstrations: the whole job on simulated machines."""

@@ -1,0 +1,128 @@
+"""The demonstration: the whole job on a simulated machine over real wires.
+
+identify -> measure (before) -> commission -> solve -> push -> measure (after) -> keep or roll back; then the simulator's sealed truth says
+how well it went.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from abbe.service.campaigns.measure import measure
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.commission import commission
+from abbe.service.compensation.commission_levels import commission_levels
+from abbe.service.compensation.correct import Correction, correct
+from abbe.service.compensation.proposals import load_runs
+from abbe.service.demo.simulator_process import running_world, sealed_truth
+from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.push.limits import PushLimits
+from abbe.service.sequences.campaigns import identification, verification
+from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.storage.store import Store
+
+MAX_SAMPLES_PER_S = 6000
+"""Ball-bar samples per wall second that the demonstration asks for at most, so that a small PC follows at high speed."""
+
+CERTIFICATES = {"ballbar": date(2099, 12, 31), "laser": date(2099, 12, 31)}
+"""Simulated instruments are as good as their simulator says, for ever."""
+RAW = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
+"""Nobody has ever corrected these machines: their first tables replace nothing by everything, as a person would allow after a look."""
+
+
+@dataclass
+class DemoResult:
+    """Everything the demonstration found; the command line prints it, the report shows it."""
+
+    seed: int
+    speed: float
+    site: Site
+    folder: Path
+    started_utc: str
+    duration_s: float = 0.0
+    correction: Correction | None = None
+    truth_before: dict[str, Any] = field(default_factory=dict)
+    truth_after: dict[str, Any] = field(default_factory=dict)
+
+
+def bar_rate_hz(speed: float) -> int:
+    """Fastest ball-bar rate (a divisor of 1000 Hz) that keeps the wall-clock sample rate within `MAX_SAMPLES_PER_S`."""
+    return next((r for r in (1000, 500, 250, 200, 125, 100, 50, 40, 25, 20, 10) if r * speed <= MAX_SAMPLES_PER_S), 10)
+
+
+def demo_site(ready: dict[str, Any]) -> Site:
+    """The machine file's content for a simulated machine: its nominal geometry and where its devices listen."""
+    machine = machine_from_doc(ready["machine"])
+    urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
+    return Site("demo-machine", machine, machine_doc("demo-machine", machine), urls, limits=RAW, calibrated_until=CERTIFICATES)
+
+
+def write_machine_file(site: Site, folder: Path) -> Path:
+    """A machine file for the running simulated machine, so that other commands can talk to it."""
+
+    def row(values: Any) -> str:
+        return "[" + ", ".join(f"{float(v):g}" for v in values) + "]"
+
+    m = site.machine
+    lines = [f'name = "{site.name}"', f'chain = "{m.chain}"', f"tool_mm = {row(m.tool_mm)}", "", "[stroke_mm]"]
+    lines += [f"{a} = {row(m.stroke_mm[k])}" for k, a in enumerate("XYZ")]
+    lines += ["", "[pivots_mm]"] + [f"{a} = {row(m.pivots_mm[k])}" for k, a in enumerate("XYZ")]
+    lines += ["", "[devices]"] + [f'{k} = "{getattr(site.urls, k)}"' for k in ("cnc", "ballbar", "laser", "fixture")]
+    lines += ["", "[calibration]"] + [f"{kind} = {day.isoformat()}" for kind, day in sorted(site.calibrated_until.items())]
+    lines += [
+        "",
+        "[limits]",
+        f"table_value_um = {site.limits.value_mm * 1e3:g}",
+        f"table_change_um = {site.limits.change_mm * 1e3:g}",
+        f"table_walk_um = {site.limits.walk_mm * 1e3:g}",
+    ]
+    lines += ["", "[store]", 'url = "sqlite:///abbe.sqlite3"', ""]
+    path = folder / "machine.toml"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink, clock: Clock | None = None) -> DemoResult:
+    """Run the whole job on a simulated machine; ``folder`` keeps database, machine file and tables.
+
+    Raises
+    ------
+    AbbeError, DriverError
+        One cause, one remedy. The simulators are gone in any case.
+    """
+    clock = clock or SystemClock()
+    start = clock.monotonic_s()
+    world_args = ["--seed", str(seed)]
+    args = [*world_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]
+    async with running_world(args) as world:
+        site = demo_site(world.ready)
+        write_machine_file(site, folder)
+        result = DemoResult(seed, speed, site, folder, clock.utc().isoformat(timespec="seconds"))
+        store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")
+        try:
+            async with open_session(site.urls) as session:
+                await _job(session, store, result, progress)
+        finally:
+            store.close()
+    progress(Progress("truth", 0.0, 1.0, None, "asking the simulator's sealed truth"))
+    bank = folder / "active_bank.bin"
+    result.truth_before = await sealed_truth(world_args, None)
+    result.truth_after = await sealed_truth(world_args, bank)
+    result.duration_s = clock.monotonic_s() - start
+    return result
+
+
+async def _job(session: Session, store: Store, result: DemoResult, progress: ProgressSink) -> None:
+    site, rate = result.site, bar_rate_hz(result.speed)
+    await measure(session, store, site, identification(site.machine, rate_hz=rate), progress=progress)
+    before_ids = await measure(session, store, site, verification(site.machine, rate_hz=rate, name="verify-before"), progress=progress)
+    before = await load_runs(store, before_ids)
+    await commission_levels(session.controller, store, site)
+    await commission(session, store, site, progress=progress)
+    result.correction = await correct(session, store, site, "identify", before, rate_hz=rate, progress=progress)
+    (result.folder / "active_bank.bin").write_bytes(result.correction.image)

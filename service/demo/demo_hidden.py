@@ -1,0 +1,140 @@
+"""The demonstration of a discovery: a simulated machine that may hide an effect, and Abbe does not know which.
+
+measure -> search -> model book -> measure anew -> does the model hold? -> tables or remedy; the simulator's sealed truth is opened last.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from abbe.service.campaign_data.campaign_folder import from_store
+from abbe.service.campaign_data.decimation import picked
+from abbe.service.campaigns.measure import measure
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.commission import commission
+from abbe.service.compensation.correct import Correction, correct
+from abbe.service.compensation.proposals import load_runs
+from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
+from abbe.service.demo.simulator_process import running_world, sealed_truth
+from abbe.service.devices.session import Session, open_session
+from abbe.service.discovery.discover import Job, Journal, discover, prepare
+from abbe.service.discovery.discovery_engine import search
+from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.discovery.new_measurement import NewMeasurement, judged_anew
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.effects.model_book import current
+from abbe.service.errors import NotObservable, TableRefused
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.sequences.discovery_campaign import BACK, discovery_campaign, new_measurement
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+
+MOST = 5000
+"""Readings that are searched one by one: a point every 2 to 6 mm, and the search takes a quarter of the time."""
+CAMPAIGN, ANEW = "discover", "anew"
+
+
+@dataclass
+class HiddenDemo:
+    """Everything that the demonstration found, in the order in which it found it.
+
+    ``refused``: why no table was written where one was tried; ``truth``: the simulator's own words, opened at the end.
+    """
+
+    world_args: list[str]
+    site: Site
+    folder: Path
+    started_utc: str
+    finding: dict[str, Any] = field(default_factory=dict)
+    job: Job | None = None
+    journal: Journal | None = None
+    anew: NewMeasurement | None = None
+    correction: Correction | None = None
+    refused: str = ""
+    truth: dict[str, Any] = field(default_factory=dict)
+    duration_s: float = 0.0
+
+
+async def run_hidden_demo(
+    world_args: list[str], speed: float, folder: Path, progress: ProgressSink, *, tables: bool = True, clock: Clock | None = None
+) -> HiddenDemo:
+    """Play a discovery on a simulated machine over real wires.
+
+    Parameters
+    ----------
+    world_args : list of str
+        What the simulators are told: ``--hidden SEED``, or a scenario file. Nobody here looks into it.
+    folder : Path
+        Keeps database and machine file.
+    tables : bool
+        Whether tables for what tables take out are made and tried where the gap was explained.
+
+    Raises
+    ------
+    AbbeError, DriverError
+        One cause, one remedy. The simulators are gone in any case.
+    """
+    clock = clock or SystemClock()
+    start = clock.monotonic_s()
+    async with running_world([*world_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
+        site = demo_site(world.ready)
+        write_machine_file(site, folder)
+        result = HiddenDemo(world_args, site, folder, clock.utc().isoformat(timespec="seconds"))
+        store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")
+        try:
+            async with open_session(site.urls) as session:
+                await _job(session, store, result, progress, speed, tables=tables)
+        finally:
+            store.close()
+    progress(Progress("truth", 0.0, 1.0, None, "opening the simulator's sealed truth"))
+    result.truth = await sealed_truth(world_args, None)
+    result.duration_s = clock.monotonic_s() - start
+    return result
+
+
+def few(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Runs with about `MOST` ball-bar readings."""
+    return picked(runs, MOST)
+
+
+async def _job(session: Session, store: Store, result: HiddenDemo, progress: ProgressSink, speed: float, *, tables: bool) -> None:
+    site, rate = result.site, bar_rate_hz(2.0 * speed)  # half of what a small PC follows: it has hidden effects to move, too
+    await measure(session, store, site, discovery_campaign(site.machine, rate_hz=rate, name=CAMPAIGN), progress=progress)
+    old = await asyncio.to_thread(from_store, store, CAMPAIGN)
+    job = await asyncio.to_thread(prepare, old, catalogue(), current(store, site.name), thin=few)
+    journal = await asyncio.to_thread(journal_of, store, job)
+    result.job, result.journal = job, journal
+    result.finding = await _searched(job, journal, progress)
+    ids = await measure(session, store, site, new_measurement(site.machine, rate_hz=rate, name=ANEW), progress=progress)
+    progress(Progress("prediction", 0.0, 1.0, None, "the new measurement against what the model says"))
+    new = await asyncio.to_thread(from_store, store, ANEW)
+    model = current(store, site.name)
+    result.anew = await asyncio.to_thread(judged_anew, old, new, job.effects, model, thin=few)
+    if not tables or model is None:
+        return
+    try:
+        await commission(session, store, site, progress=progress)
+        before = [run for run in await load_runs(store, ids) if run["run_id"] != BACK]  # the verification, as tables are judged
+        result.correction = await correct(session, store, site, CAMPAIGN, before, rate_hz=rate, progress=progress)
+    except (TableRefused, NotObservable) as error:
+        result.refused = str(error)
+
+
+async def _searched(job: Job, journal: Journal, progress: ProgressSink) -> dict[str, Any]:
+    """The search, off the event loop; stopped, it ends with its next word about how far it is."""
+    stopped = threading.Event()
+
+    def told(p: Progress) -> None:
+        if stopped.is_set():
+            raise InterruptedError("the search was stopped")
+        progress(p)
+
+    try:
+        return await asyncio.to_thread(discover, job, journal, search, told)
+    except asyncio.CancelledError:
+        stopped.set()
+        raise

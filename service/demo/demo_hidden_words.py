@@ -1,0 +1,121 @@
+"""The story of a discovery's demonstration, as lines for the terminal and as JSON; the sealed truth judges at the end."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from abbe.service.demo.demo_hidden import HiddenDemo
+from abbe.service.discovery.discovery_words import book_lines, effect_lines, next_of, verdict_of
+from abbe.service.discovery.new_measurement import NewGap
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.rendering.numbers import plain
+
+FORMAT = "abbe-hidden-demo/1"
+
+
+def story(result: HiddenDemo) -> list[str]:
+    """What happened, one line a thing to know, in the order in which it happened."""
+    finding = result.finding
+    _, word, text = verdict_of(finding)
+    lines = [f"measured: {len(finding['runs'])} runs, {sum(r['readings'] for r in finding['runs'].values())} readings"]
+    lines += [f"{word}. {text}"]
+    lines += [f"{role} runs: {_gap_words(g['before_um'], g['after_um'], g['floor_um'])}" for role, g in finding["gaps"].items()]
+    for effect in finding["effects"]:
+        lines += effect_lines(effect)
+    lines += next_of(finding) + _model(result) + _anew(result) + _tables(result)
+    return [*lines, *truth_lines(result)]
+
+
+def _gap_words(before: float, after: float, floor: float) -> str:
+    return f"gap {plain(before)} -> {plain(after)} µm rms, {plain(floor)} µm is noise"
+
+
+def _model(result: HiddenDemo) -> list[str]:
+    version = None if result.journal is None else result.journal.version
+    if version is not None:
+        return [f"model book: version {version} of {result.site.name} knows it now"]
+    return book_lines(result.finding) or ["model book: unchanged, nothing was proved that could enter it"]
+
+
+def _anew(result: HiddenDemo) -> list[str]:
+    if result.anew is None:
+        return []
+    g = result.anew.gap
+    runs = [f"  {label}: {_gap_words(*_numbers(r))}" for label, r in result.anew.runs.items()]
+    return [f"measured anew at places that no fit has used, later: {_gap_words(*_numbers(g))}", *runs]
+
+
+def _numbers(gap: NewGap) -> tuple[float, float, float]:
+    return gap.before_um, gap.after_um, gap.floor_um
+
+
+def _tables(result: HiddenDemo) -> list[str]:
+    c = result.correction
+    if c is None:
+        return [f"tables: none written: {result.refused}"] if result.refused else []
+    kept = "kept" if c.decision.keep else "rolled back"
+    lines = [f"tables for what tables take out (the 21 error motions): {kept}; {c.decision.text}"]
+    return lines + [f"stays: {line}" for line in c.not_for_tables]
+
+
+def hidden_label(truth: dict[str, Any]) -> str | None:
+    """What was hidden as ``name:key``; None if nothing was."""
+    secret = truth.get("hidden")
+    if secret is None:
+        return None
+    return f"{secret['name']}:{secret['key']}" if secret["key"] else str(secret["name"])
+
+
+def judged(result: HiddenDemo) -> tuple[bool, str]:
+    """Whether the answer was right, and the sentence that says so.
+
+    Right is: the hidden name and key and no other; ``none`` where nothing is hidden; ``unknown`` where the catalogue has no such name.
+    """
+    label, finding = hidden_label(result.truth), result.finding
+    named = [e["label"] for e in finding["effects"]]
+    if label is None:
+        right = finding["verdict"] == "none"
+        return right, "nothing was hidden" + ("" if right else f", and yet it was said: {', '.join(named) or finding['verdict']}")
+    if result.truth["hidden"]["name"] not in {e.name for e in catalogue()}:
+        right = finding["verdict"] == "unknown" and not named
+        return right, f"hidden was {label}, which no catalogue names; the answer was {', '.join([finding['verdict'], *named])}"
+    right = finding["verdict"] == "named" and named == [label]
+    also = [n for n in named if n != label]
+    if label in named and also:
+        return False, f"hidden was {label}, and it was named; but beside it {', '.join(also)}, which is not there"
+    return right, f"hidden was {label}; the answer was {', '.join(named) or finding['verdict']}"
+
+
+def truth_lines(result: HiddenDemo) -> list[str]:
+    """The sealed truth beside the answer."""
+    right, text = judged(result)
+    lines = [f"sealed truth: {text}. {'RIGHT' if right else 'WRONG'}."]
+    secret = result.truth.get("hidden")
+    if secret is not None:
+        values = ", ".join(f"{k} {v:g}" for k, v in secret["parameters"].items())
+        bent = ", bent away from its formula" if secret["wild"] else ""
+        lines.append(f"  it was made with {values}{bent}")
+    return lines
+
+
+def hidden_json(result: HiddenDemo) -> dict[str, Any]:
+    """What `abbe demo --hidden SEED --json` prints."""
+    finding, c = result.finding, result.correction
+    told = ("label", "name", "key", "strength", "u_strength", "unit", "remedy", "remedy_text")
+    right, text = judged(result)
+    doc: dict[str, Any] = {
+        "format": FORMAT,
+        "verdict": finding["verdict"],
+        "effects": [{k: e[k] for k in told} for e in finding["effects"]],
+        "where": {k: v for k, v in finding["where"].items() if k != "table"},
+        "gaps": finding["gaps"],
+        "model_version": None if result.journal is None else result.journal.version,
+        "anew": None if result.anew is None else asdict(result.anew),
+        "tables": None if c is None else {"kept": c.decision.keep, "verdict": c.decision.text, "stays": list(c.not_for_tables)},
+        "tables_refused": result.refused or None,
+        "hidden": result.truth.get("hidden"),
+        "right": right,
+        "judgement": text,
+    }
+    return doc | {"duration_s": round(result.duration_s, 1)}

@@ -1,0 +1,287 @@
+"""The demonstration with ``--serve``: the service watches a machine, it drifts, and a proposal waits for a person.
+
+The service is the real one, a child process on a machine file that stands in the folder. The simulated machine drifts once the first
+scheduled check is in the store; all that follows, alarm, campaign, name of the effect, proposal, push and verification, the service does
+by itself. Only the approval is a person's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from abbe.drivers.links.shielded import run_to_end
+from abbe.service.campaigns.measure import measure
+from abbe.service.children import python_words
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.commission import commission
+from abbe.service.compensation.commission_levels import commission_levels
+from abbe.service.compensation.proposals import load_runs
+from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
+from abbe.service.demo.simulator_process import World, running_world
+from abbe.service.devices.session import Session, open_session
+from abbe.service.errors import AbbeError, StoreError
+from abbe.service.events import ignore_progress
+from abbe.service.identification.solve import solve_runs
+from abbe.service.identification.solve_report import solution_doc
+from abbe.service.sequences.campaigns import identification, verification
+from abbe.service.sequences.check import paced
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.users.people import People
+from abbe.service.verification.alarm_states import Kind
+from abbe.service.verification.alarms import alarms_of
+from abbe.service.verification.verify import COVERAGE, figure_rows, figures
+
+T = TypeVar("T")
+
+DRIFT_UM_PER_M = 160.0
+"""What happens to the machine after its first check: X grows."""
+USER = "approver"
+EVERY_MIN = 2.0
+"""Minutes of the real clock between checks: at the usual speed of the demonstration hours of the machine."""
+READY_S, STOP_S, LOOK_S = 30.0, 6.0, 0.5
+LOCKED_LOOKS = 60
+ROOM_UM = {"body_diagonal_um": 10.0, "helix_rms_um": 0.5}
+"""Nobody has corrected this machine, and it is good enough as it is: the limits are what it does today, U and so much more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """Where the page is, and who may approve there."""
+
+    page: str
+    user: str
+    password: str
+    log: Path
+
+
+async def run_served_demo(seed: int, speed: float, folder: Path, port: int, say: Callable[[str], None]) -> None:
+    """Commission a simulated machine, let the service watch it, tell the story, and go on until somebody ends it.
+
+    Raises
+    ------
+    AbbeError, DriverError
+        One cause, one remedy. Service and simulators are gone in any case.
+    """
+    async with running_world(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
+        site = demo_site(world.ready)
+        machine_file = write_machine_file(site, folder)
+        with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
+            say("what the control does with a table is proved first: abbe comp commission")
+            async with open_session(site.urls) as session:
+                await commission_levels(session.controller, store, site)
+                await commission(session, store, site, progress=ignore_progress)
+                say("what the machine does today is what its limits shall allow: a verification")
+                limits_um = await limits_of_today(session, store, site, bar_rate_hz(speed))
+                say("what its errors are today is kept, to tell later what has changed: an identification")
+                await solved_today(session, store, site, bar_rate_hz(speed))
+            async with served(machine_file, store, port, limits_um) as serving:
+                say(f"page: {serving.page}")
+                say(f"   log in as {serving.user} with {serving.password} (what the service writes: {serving.log})")
+                await story(world, site.name, store, serving, say)
+                say("the service goes on: Ctrl-C ends it")
+                await asyncio.Event().wait()
+
+
+async def limits_of_today(session: Session, store: Store, site: Site, rate_hz: int) -> dict[str, float]:
+    """Limits that the machine just keeps as it is now, µm."""
+    plan = paced(verification(site.machine, rate_hz=rate_hz, name="as it is"), site.max_feed_mm_min)
+    ids = await measure(session, store, site, plan, progress=ignore_progress)
+    rows = figure_rows(figures(await load_runs(store, ids)))
+    return {key: round(rows[key][0] + COVERAGE * rows[key][1] + room, 1) for key, room in ROOM_UM.items()}
+
+
+async def solved_today(session: Session, store: Store, site: Site, rate_hz: int) -> None:
+    """Measure and solve the machine as it is, and keep that; nothing is proposed."""
+    plan = paced(identification(site.machine, rate_hz=rate_hz, name="as delivered"), site.max_feed_mm_min)
+    ids = await measure(session, store, site, plan, progress=ignore_progress)
+    solved = await asyncio.to_thread(solve_runs, site, await load_runs(store, ids))
+    campaign = await asyncio.to_thread(store.campaign, plan.name)
+    await store.write(store.add_solution, campaign.id, "joint", ids, solution_doc(solved) | {"machine": site.doc})
+
+
+def served_lines(port: int, limits_um: dict[str, float]) -> str:
+    """What the machine file says more when it is served: a check every few minutes, and proposals by themselves."""
+    limits = "\n".join(f"{key} = {value:g}" for key, value in limits_um.items())
+    return f"""
+[web]
+port = {port}
+
+[verify]
+{limits}
+
+[alarm]
+push = "approved"
+
+[[schedule]]
+name = "every {EVERY_MIN:g} minutes"
+every_h = {EVERY_MIN / 60.0:.6f}
+recipe = "verification"
+grace_s = 3600.0
+on_alarm = "propose"
+"""
+
+
+def free_port(wanted: int) -> int:
+    """``wanted`` where nobody has it, or any other."""
+    for port in (wanted, 0):
+        with socket.socket() as one:
+            try:
+                one.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return int(one.getsockname()[1])
+    raise AbbeError("no port of this computer is free", "end another program")
+
+
+def add_approver(store: Store, clock: Clock) -> str:
+    """A user who may approve; his password, which is nowhere else."""
+    password = secrets.token_urlsafe(12)
+    People(store, clock).add(USER, "approver", password)
+    return password
+
+
+@asynccontextmanager
+async def served(
+    machine_file: Path, store: Store, port: int, limits_um: dict[str, float], clock: Clock | None = None
+) -> AsyncIterator[Serving]:
+    """The service on this machine file, as long as the block lasts.
+
+    Raises
+    ------
+    AbbeError
+        It did not start; its log says why.
+    """
+    port = free_port(port)
+    with machine_file.open("a", encoding="utf-8") as out:
+        out.write(served_lines(port, limits_um))
+    password = add_approver(store, clock or SystemClock())
+    log = machine_file.with_name("service.log")
+    with log.open("wb") as out_log:
+        process = await asyncio.create_subprocess_exec(
+            *python_words("abbe.service.cli", "serve", machine_file),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=out_log,
+            stderr=out_log,
+            start_new_session=True,  # Ctrl-C at the terminal is for us: we end it
+        )
+    try:
+        await _answers(process, port, log)
+        yield Serving(f"http://127.0.0.1:{port}/", USER, password, log)
+    finally:
+        await run_to_end(_end(process))
+
+
+async def _answers(process: asyncio.subprocess.Process, port: int, log: Path) -> None:
+    try:
+        async with asyncio.timeout(READY_S):
+            while process.returncode is None:
+                try:
+                    _, writer = await asyncio.open_connection("127.0.0.1", port)
+                except OSError:
+                    await asyncio.sleep(0.1)
+                    continue
+                writer.close()
+                return
+    except TimeoutError:
+        pass
+    raise AbbeError("the service did not start", f"{log} says why")
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is not None:
+        return
+    process.terminate()
+    try:
+        async with asyncio.timeout(STOP_S):
+            await process.wait()
+    except TimeoutError:
+        process.kill()
+        await process.wait()
+
+
+async def drift(world: World, um_per_m: float = DRIFT_UM_PER_M) -> None:
+    """Let the simulated machine's X axis grow. Only a simulator can be asked for that."""
+    host, port = str(world.ready["fixture"]).removeprefix("fixture+tcp://").rsplit(":", 1)
+    reader, writer = await asyncio.open_connection(host, int(port))
+    try:
+        writer.write(json.dumps({"id": 1, "op": "drift", "axis": "X", "um_per_m": um_per_m}).encode() + b"\n")
+        await writer.drain()
+        answer = json.loads(await reader.readline())
+    finally:
+        writer.close()
+    if not answer.get("ok"):
+        raise AbbeError(f"the simulated machine does not drift: {answer}", "check the scenario")
+
+
+async def story(world: World, machine: str, store: Store, serving: Serving, say: Callable[[str], None]) -> None:
+    """Say what happens, as it happens, one line each; ends when the alarm is over.
+
+    Raises
+    ------
+    AbbeError
+        The simulated machine does not drift.
+    """
+    say(f"1. check by the timetable: {await _check(store, machine, 1)}")
+    await drift(world)
+    say(f"2. unknown to the service, the machine's X axis grows by {DRIFT_UM_PER_M:g} µm/m")
+    say(f"3. check by the timetable: {await _check(store, machine, 2)}")
+    alarm = (await _until(lambda: alarms_of(store, machine)))[-1]
+    say(f"4. alarm {alarm.number}: {alarm.text}")
+    found = await _until(lambda: alarms_of(store, machine)[-1].last(Kind.DISCOVERED, Kind.ENDED, Kind.FAILED))
+    say(f"5. the service has measured the full campaign and searched: {found.doc['text']}")
+    proposed = await _until(lambda: alarms_of(store, machine)[-1].last(Kind.PROPOSED, Kind.ENDED, Kind.FAILED))
+    proposal = int(proposed.doc.get("proposal", 0))
+    say(f"   {proposed.doc['text']}")
+    if proposed.kind is not Kind.PROPOSED:
+        raise AbbeError("the story ends here: the service proposes nothing", f"{serving.log} says more; try another --seed")
+    say(f"   approve it at {serving.page}proposal?id={proposal}")
+    who = (await _until(lambda: store.approvals(proposal)))[-1].name
+    say(f"6. approved by {who}: the service pushes it now, proves its sign and verifies it")
+    pushed = await _until(lambda: alarms_of(store, machine)[-1].last(Kind.PUSHED))
+    say(f"7. {pushed.doc['text']}")
+    await _until(lambda: not alarms_of(store, machine)[-1].active)
+    checks = await _until(lambda: _checks(store, machine))
+    say(f"8. the check after it: {checks[-1]}; the alarm is over")
+
+
+def _checks(store: Store, machine: str) -> list[str]:
+    """What the scheduled checks of a machine found, oldest first."""
+    number = next((m.id for m in store.machines() if m.name == machine), None)
+    rows = [] if number is None else store.verifications(number)
+    return [str(v.doc.get("text", "")) for v in sorted(rows, key=lambda v: v.id) if v.doc.get("schedule")]
+
+
+async def _check(store: Store, machine: str, number: int) -> str:
+    """The text of the service's check ``number``, once there is one."""
+    return (await _until(lambda: _checks(store, machine)[number - 1 :]))[0]
+
+
+async def _until(look: Callable[[], T | None]) -> T:
+    """Look until there is something. The service writes to the same database: one that is locked is looked at again, for a while.
+
+    Raises
+    ------
+    StoreError
+        It could not be read `LOCKED_LOOKS` times on end.
+    """
+    refused = 0
+    while True:
+        try:
+            found = await asyncio.to_thread(look)
+            refused = 0
+        except StoreError:
+            found, refused = None, refused + 1
+            if refused >= LOCKED_LOOKS:
+                raise
+        if found:
+            return found
+        await asyncio.sleep(LOOK_S)

@@ -1,0 +1,1 @@
+"""Where simulation and measurement disagree, which effect is missing, and which measurement would tell more."""

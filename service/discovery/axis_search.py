@@ -1,0 +1,149 @@
+"""A positioning test of one axis against the whole catalogue: first what drifts, then what is missing beyond the scatter of its repeats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Discovery, Fitted, Significance
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.discover import Progress, discover
+from abbe.models.discovery.finding import gaps_of
+from abbe.models.discovery.lack import Floor
+from abbe.models.discovery.prediction import left_over, predictions, solve
+from abbe.models.discovery.whitened_problem import scene_of
+from abbe.models.effects.effect import Effect
+from abbe.models.probability import chi2_above
+from abbe.models.solvers.priors import U_WAVELENGTH
+from abbe.service.effects.axis_test import AXES, drift_at, drift_found, places_of
+
+CHANCE = 1e-3
+"""What is missing beyond the repeats' scatter is told if chance gives as much in fewer tests than this."""
+
+
+@dataclass(frozen=True)
+class _Scatter:
+    """How visits of one place differ, each run's mean left free: sd, mm; sums of neighbours vary ``long`` times more than single ones."""
+
+    sd_mm: float
+    long: float
+
+
+def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress | None = None) -> Discovery:
+    """What a test of one axis says: a drift of its repeats, and what the catalogue names in the rest; where not, what `drift_found` says.
+
+    What is named has to be more than the repeats scatter: their noise is known without any model.
+    """
+    told = drift_found(case)
+    drifts = drift_at(case) if told is not None and told.verdict == "named" else {}
+    quiet = _without(case, drifts)
+    found = discover(quiet, effects, progress=progress)
+    fitted, scatter = _scale(quiet), _scatter(quiet)
+    if told is None or scatter is None:
+        return replace(found, fitted=fitted)
+    if found.verdict == "none" or not _beyond(quiet, found, scatter):
+        return replace(told, fitted=fitted)
+    table = (*told.where.table, *found.where.table)
+    if told.verdict == "none":
+        return replace(found, where=replace(found.where, table=table), fitted=fitted)
+    return replace(_together(case, told, found, drifts, table), fitted=fitted)
+
+
+def _without(case: Case, drifts: dict[str, F1]) -> Case:
+    runs = tuple(
+        r if r.deviation_mm is None or r.path.label not in drifts else replace(r, deviation_mm=r.deviation_mm - drifts[r.path.label])
+        for r in case.runs
+    )
+    return replace(case, runs=runs)
+
+
+def _together(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, F1], table: tuple[Significance, ...]) -> Discovery:
+    """Drift and what was named in the rest as one finding; before is the present simulation of the readings as they were measured."""
+    scene = scene_of(case, baseline_of(case))
+    before = predictions(scene, solve(scene, ()))
+    seen = {r.path.setup for r in scene.runs}
+    left = {r.path.label: left_over(r, before[r.path.label], seen) for r in case.runs if r.deviation_mm is not None}
+    floor = {kind: Floor(sd, 1.0) for kind, sd in found.noise_mm.items()}
+    return replace(
+        found,
+        verdict="named" if found.verdict == "named" else "unknown",
+        effects=(*drift.effects, *found.effects),
+        where=replace(found.where, table=table),
+        next_test=drift.next_test or found.next_test,
+        gaps=gaps_of(scene, left, found.residual_after_mm, floor),
+        residual_before_mm=left,
+        predicted_mm={label: v + drifts[label] for label, v in found.predicted_mm.items()},
+        predicted_before_mm=before,
+        p_value=min(drift.p_value, found.p_value),
+        confounded_with=(*drift.confounded_with, *found.confounded_with),
+    )
+
+
+def _scatter(case: Case) -> _Scatter | None:
+    """Of the fitted runs; None where no place was visited twice or all visits are alike."""
+    runs = case.of("identify")
+    if len(runs) < 2:
+        return None
+    place, y, run = _stacked(case)
+    columns = np.column_stack([place[:, None] == np.unique(place), run[:, None] == np.unique(run)]).astype(np.float64)
+    left = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+    freedom = y.size - int(np.linalg.matrix_rank(columns))
+    if freedom < len(runs) or not left.any():
+        return None
+    near = run[1:] == run[:-1]
+    memory = float(left[1:][near] @ left[:-1][near] / max(float(left @ left), 1e-300))
+    memory = min(max(memory, 0.0), 0.9)
+    return _Scatter(float(np.sqrt(left @ left / freedom)), (1.0 + memory) / (1.0 - memory))
+
+
+def _stacked(case: Case) -> tuple[F1, F1, F1]:
+    """Place, reading and number of the run of all fitted readings that count."""
+    runs = case.of("identify")
+    data = [(places_of(r)[r.valid], r.data().deviation_mm[r.valid]) for r in runs]
+    number = np.concatenate([np.full(len(p), float(k)) for k, (p, _) in enumerate(data)])
+    return np.concatenate([p for p, _ in data]), np.concatenate([y for _, y in data]), number
+
+
+def _beyond(case: Case, found: Discovery, scatter: _Scatter) -> bool:
+    """Whether what was found moves the places by more than their repeats allow, and no name is smaller than its own U.
+
+    Names by what they change, a lack of fit by what is left.
+    """
+    if any(abs(e.strength) <= 2.0 * e.u_strength for e in found.effects):
+        return False
+    runs = case.of("identify")
+    resolution = case.resolution_mm["laser"] / np.sqrt(12.0)
+    before, after = found.residual_before_mm, found.residual_after_mm
+    moves = [np.nan_to_num(before[r.path.label] - (after[r.path.label] if found.effects else 0.0))[r.valid] for r in runs]
+    moved = np.concatenate([m - m.mean() for m in moves])
+    place, _, _ = _stacked(case)
+    _, at, count = np.unique(place, return_inverse=True, return_counts=True)
+    means = np.bincount(at, moved) / count
+    square = float(count @ means**2) / (max(scatter.sd_mm, resolution) ** 2 * scatter.long)
+    return bool(chi2_above(square, len(count)) < CHANCE)
+
+
+def _scale(case: Case) -> tuple[Fitted, ...]:
+    """Scale of the axis, which the present simulation fits: no search looks for it, and yet these runs show it.
+
+    By least squares together with a zero of every run and a lost motion that changes along the axis.
+    """
+    runs = case.of("identify")
+    look = runs[0].path.look[0]
+    axis = int(np.argmax(np.abs(look)))
+    x = np.concatenate([(r.path.at.q_mm @ look)[r.valid] for r in runs])
+    x -= x.mean()
+    up = np.concatenate([r.path.at.sign[r.valid, axis] for r in runs])
+    y = np.concatenate([r.data().deviation_mm[r.valid] for r in runs])
+    run = np.repeat(np.arange(len(runs)), [int(r.valid.sum()) for r in runs])
+    columns = np.column_stack([x, up, x * up, run[:, None] == np.unique(run)]).astype(np.float64)
+    freedom = y.size - int(np.linalg.matrix_rank(columns))
+    if freedom < 1 or float(np.ptp(x)) <= 0.0:
+        return ()
+    c = np.linalg.lstsq(columns, y, rcond=None)[0]
+    left = y - columns @ c
+    u = float(np.sqrt(left @ left / freedom * np.linalg.pinv(columns.T @ columns)[0, 0] + U_WAVELENGTH**2))
+    return (Fitted("scale", AXES[axis], float(c[0]) * 1e6, u * 1e6, "um/m"),)

@@ -1,0 +1,192 @@
+"""What has changed in a machine since its last solution, beside what its model lacks: the part of a discovery that names a drift.
+
+A table that was put in force in between is no change of the machine: what it does is taken out of the newer readings, and what the older
+table did is put in its place, so that both are of the same machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from abbe.models.compensation.smooth import smooth_of
+from abbe.models.discovery.changed import Change, Changed, changed_since
+from abbe.models.solvers.in_force import InForce
+from abbe.models.uncertainty.known_field import KnownField
+from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.campaign_data.provenance import machine_digest
+from abbe.service.effects.known_effects import LASTING, applies
+from abbe.service.effects.model_book import name_of, version
+from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
+from abbe.service.identification.effect_removal import less_effects
+from abbe.service.identification.solution_field import stored_field
+from abbe.service.identification.table_removal import NOTHING, Taken, as_left, less, table_then
+from abbe.service.runs.observations import run_data
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, images_of, tables_of
+from abbe.service.tables.nine_tables import tables_from_image
+
+Doc = dict[str, Any]
+LOST_MOTION = "backlash"
+
+
+@dataclass(frozen=True)
+class Since:
+    """The solution that a campaign is compared with, and how; comparing takes a second or two.
+
+    ``compare``: of the campaign, or of one that it was joined with, and what a search has just found in it (entries of a finding); what
+    cannot be told is its ``trouble``.
+    """
+
+    number: int
+    compare: Callable[[Campaign, Sequence[Doc]], Doc]
+
+
+@dataclass(frozen=True)
+class _Before:
+    """A solution and what it knows; the table that acted when it was measured, by its CRC; what had been taken out of its readings.
+
+    ``taken``: labels of the model book's ``version``, None: nothing of a book.
+    """
+
+    number: int
+    known: KnownField
+    crc: int | None
+    version: int | None
+    taken: frozenset[str]
+
+
+def since_of(store: Store, campaign: Campaign) -> Since | None:
+    """The last solution of the same machine from a campaign stored before, if there is one that can be compared.
+
+    It has to be of the same geometry and to hold its covariance. The tables that acted when both were measured have to be known, or to be
+    the same.
+    """
+    for record in _earlier(store, campaign):
+        try:
+            before = _before_of(store, record)
+            _tables_between(store, campaign, before)
+        except (Unusable, TableMismatch, KeyError, TypeError, ValueError):  # or stored by a version that kept less
+            continue
+        return Since(record.id, partial(_compare, store, before))
+    return None
+
+
+def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
+    """Solutions of all 21 motions of this machine's earlier campaigns, the newest first."""
+    numbers = {m.id for m in store.machines() if m.name == campaign.site.name}
+    mine = [c for c in store.campaigns() if c.machine_id in numbers]
+    at = next((c.id for c in mine if c.name == campaign.name), 0)
+    digest = machine_digest(campaign.site.machine)
+    for one in reversed([c for c in mine if c.id < at]):
+        for record in reversed(store.solutions(one.id)):
+            doc = record.doc
+            if str(doc.get("model", "")).startswith("rigid21") and (doc.get("inputs") or {}).get("machine") == digest:
+                yield record
+
+
+def _before_of(store: Store, record: SolutionRecord) -> _Before:
+    book = record.doc.get("machine_model") or {}
+    taken = frozenset(book.get("taken_out", []))
+    number = int(book["version"]) if taken else None
+    return _Before(record.id, stored_field(store, record).known, _acting(_tables_of(store, record)), number, taken)
+
+
+def _tables_of(store: Store, record: SolutionRecord) -> list[Doc]:
+    """What each run of a solution says of its table; what the solution says, where its runs say nothing."""
+    used = set(record.run_ids)
+    starts = [r.start_doc for r in store.runs(record.campaign_id) if r.id in used]
+    told = [start.get("imported", start).get("table") or {} for start in starts]
+    return told if any(told) else tables_of(record.doc)
+
+
+def _acting(told: Sequence[Doc]) -> int | None:
+    """CRC of the table that may have acted in all of some runs; None: in none of them.
+
+    Raises
+    ------
+    TableMismatch
+        Not in all of them, or another one.
+    """
+    found = {None if one.get("crc") is None or one.get("acting") is False else int(one["crc"]) for one in told}
+    if len(found) > 1:
+        raise TableMismatch("these runs were not all measured with one table")
+    return next(iter(found), None)
+
+
+def _tables_between(store: Store, campaign: Campaign, before: _Before) -> Taken | None:
+    """What is taken out of readings so that they are those of the machine with the earlier table; None: nothing.
+
+    Raises
+    ------
+    TableMismatch
+        One of two different tables is not known, or there was more than one at a time.
+    """
+    now = _acting([r.get("table") or {} for r in campaign.runs if r["role"] == "identify"])
+    return None if now == before.crc else Taken(_force(store, now), _force(store, before.crc))
+
+
+def _force(store: Store, crc: int | None) -> InForce:
+    """What axes that follow do by a table."""
+    if crc is None:
+        return NOTHING
+    image = images_of(store)(crc)
+    if image is None:
+        raise TableMismatch(f"table {crc:08X} is not known")
+    if int.from_bytes(image[KIND_AT], "big") == NO_CORRECTION:
+        return NOTHING
+    table = tables_from_image(image)
+    return NOTHING if table is None else InForce(smooth_of(table) or table.correction_at)
+
+
+def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[Doc]) -> Doc:
+    try:
+        return {"since": before.number} | _compared(store, before, campaign, found)
+    except StoreError:
+        raise
+    except (AbbeError, ValueError, ArithmeticError, LookupError) as trouble:  # what is missing is worth telling all the same
+        return {"since": before.number, "changes": [], "gap": None, "judged": None, "hidden_um_m": {}, "trouble": str(trouble)}
+
+
+def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence[Doc]) -> Doc:
+    """The campaign less what the solution's readings were without, too, and less what heat and instruments did in it alone."""
+    left = as_left(campaign, table_then(store, campaign).table)
+    if before.version is not None:
+        book = version(store, campaign.site.name, before.version).doc["effects"]
+        same = [e for e in book if e["label"] in before.taken and applies(e, campaign.name)]
+        left = less_effects(left, same, f"model version {before.version}")
+    left = less_effects(left, [e for e in found if e["family"] not in LASTING], "found in these runs")
+    used, out = [r for r in left.runs if r["role"] == "identify"], _tables_between(store, campaign, before)
+    doc = changed_doc(changed_since(before.known, tuple(run_data(r) for r in (used if out is None else less(used, out)))))
+    # A drive's lost motion is free in the comparison; what else lasts may have been there before, swallowed by the motions.
+    beside = [name_of(e) for e in found if e["family"] in LASTING and e["name"] != LOST_MOTION]
+    return doc | {"beside": beside}
+
+
+def changed_doc(found: Changed) -> Doc:
+    """The changes as they are stored with a finding: µm/m and µrad of what is linear, µm or µrad of shapes; ``gap`` as of a finding."""
+    gap = None
+    if found.before_mm is not None and found.after_mm is not None:
+        gap = {"before_um": found.before_mm * 1e3, "after_um": found.after_mm * 1e3, "floor_um": found.floor_mm * 1e3}
+    hidden = {k: v * 1e6 for k, v in found.hidden.items()}
+    return {"changes": [_change(c) for c in found.changes], "gap": gap, "judged": found.judged, "hidden_um_m": hidden}
+
+
+def _change(change: Change) -> Doc:
+    motion, _, shape = change.name.partition(" ")
+    angle = motion[1] in "ABC"
+    size = 1e6 if angle or not shape else 1e3
+    unit = "um/m" if not shape and motion[0] == "E" else "urad" if angle or not shape else "um"
+    return {
+        "motion": motion,
+        "part": shape or "linear",
+        "value": change.value * size,
+        "u": change.u * size,
+        "unit": unit,
+        "evidence": change.evidence,
+        "rivals": [{"name": name, "less_evidence": by} for name, by in change.rivals],
+        "halves": change.halves,
+    }

@@ -1,0 +1,30 @@
+"""The search for what a model lacks, with its progress."""
+
+from __future__ import annotations
+
+from abbe.models.discovery.answer import Discovery
+from abbe.models.discovery.case import Case
+from abbe.models.effects.effect import Effect
+from abbe.service.clock import SystemClock
+from abbe.service.effects.axis_test import is_axis_test
+from abbe.service.events import Progress, ProgressSink
+
+
+def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:
+    """Find what a case's present model lacks (`abbe.models.discovery.discover`), and tell how far it is and how long it will take.
+
+    In a positioning test of one axis alone repeats are asked for a drift first (`abbe.service.discovery.axis_search`).
+    """
+    from abbe.models.discovery.discover import discover
+    from abbe.service.discovery.axis_search import axis_discovery
+
+    clock = SystemClock()
+    begun = clock.monotonic_s()
+
+    def tell(text: str, share: float) -> None:
+        spent = clock.monotonic_s() - begun
+        sink(Progress("discover", share, 1.0, spent * (1.0 - share) / share if share > 0.0 else None, text))
+
+    found = (axis_discovery if is_axis_test(case) else discover)(case, effects, progress=tell)
+    sink(Progress("discover", 1.0, 1.0, 0.0, "done"))
+    return found

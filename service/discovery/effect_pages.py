@@ -1,0 +1,73 @@
+"""The catalogue of effects as a table, and one effect as a page of words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from abbe.models.effects.effect import Effect
+from abbe.service.discovery.discovery_words import ADDS, unit
+from abbe.service.effects.model_book import REMEDIES
+from abbe.service.rendering.numbers import plain
+
+HEADINGS = ("name", "what it is", "sits at", "usual size", "taken out by")
+
+
+def effect_row(effect: Effect) -> tuple[str, ...]:
+    """One line of the table."""
+    return (effect.name, effect.title, _keys(effect), _usual(effect), REMEDIES[effect.remedy])
+
+
+def _keys(effect: Effect) -> str:
+    keys = [k for k in effect.keys if k]
+    return ", ".join(keys) if len(keys) <= 6 else f"{', '.join(keys[:3])} … ({len(keys)})"
+
+
+def _usual(effect: Effect) -> str:
+    low, high = effect.typical
+    return f"{plain(low)} to {plain(high)} {unit(effect.unit)}"
+
+
+def effect_lines(effect: Effect) -> list[tuple[str, str]]:
+    """One effect's page: heading and text."""
+    lines = [
+        ("what it is", effect.title),
+        ("name", effect.name),
+        ("sits at", ", ".join(k for k in effect.keys if k) or "one place only"),
+        ("usual size", _usual(effect)),
+        ("how it looks", effect.signature),
+        ("what shows it", effect.needs),
+    ]
+    if effect.blind:
+        lines.append(("cannot be seen by", ", ".join(b.replace("_", " ") for b in effect.blind)))
+    for p in effect.shape:
+        lines.append((f"parameter {p.name}", f"{plain(p.low)} to {plain(p.high)} {unit(p.unit)}, usually {plain(p.typical)} ({p.source})"))
+    if effect.forms:
+        lines.append(("may be bent by", ", ".join(f.name for f in effect.forms)))
+    lines += [("taken out by", REMEDIES[effect.remedy]), ("what to do", effect.remedy_text)]
+    for rival, adds in effect.separated_by.items():
+        lines.append((f"told from {rival} by", "; or ".join(ADDS.get(a, a) for a in adds)))
+    return [*lines, ("source", effect.source)]
+
+
+def effect_doc(effect: Effect) -> dict[str, Any]:
+    """One effect for programs."""
+    return {
+        "name": effect.name,
+        "title": effect.title,
+        "family": effect.family,
+        "keys": [k for k in effect.keys if k],
+        "unit": effect.unit,
+        "typical": list(effect.typical),
+        "parameters": [
+            {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "typical": p.typical, "source": p.source} for p in effect.shape
+        ],
+        "forms": [f.name for f in effect.forms],
+        "kind": effect.kind,
+        "needs": effect.needs,
+        "blind": list(effect.blind),
+        "signature": effect.signature,
+        "remedy": effect.remedy,
+        "remedy_text": effect.remedy_text,
+        "separated_by": {rival: list(adds) for rival, adds in effect.separated_by.items()},
+        "source": effect.source,
+    }

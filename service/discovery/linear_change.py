@@ -1,0 +1,62 @@
+"""Which scale or squareness of a machine has changed most since it was solved last: what a drift is called by people."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from abbe.service.compensation.proposals import Made
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+
+NAMES = {
+    "EXX": "scale of X",
+    "EYY": "scale of Y",
+    "EZZ": "scale of Z",
+    "C0Y": "squareness of X and Y",
+    "B0Z": "squareness of X and Z",
+    "A0Z": "squareness of Y and Z",
+}
+COVERAGE = 2.0
+Means = dict[str, dict[str, Any]]
+
+
+def linear_words(store: Store, made: Made) -> str:
+    """The linear error that changed most since the solution before, with U; without one before the largest there is. Empty: none is known.
+
+    Only solutions that were measured with the same table in force are compared. What both share (the laser's wavelength) counts twice in U.
+    """
+    new = store.solution(made.proposed.solution_id)
+    means: Means = new.doc.get("mean_over_volume") or {}
+    known = {k: v for k, v in means.items() if k in NAMES and v.get("value") is not None and v.get("u") is not None}
+    if not known:
+        return ""
+    old = _before(store, new)
+    if old is None:
+        first = max(known, key=lambda k: abs(known[k]["value"]))
+        return f"; largest linear error: {NAMES[first]} {_size(known[first]['value'], known[first]['u'])}"
+    then: Means = old.doc["mean_over_volume"]
+    changes = {k: (v["value"] - then[k]["value"], math.hypot(v["u"], then[k]["u"])) for k, v in known.items() if k in then}
+    name = largest_sure(changes)
+    if name is None:
+        return f"; since solution {old.id} no scale and no squareness has changed by more than U"
+    return f"; changed most since solution {old.id}: {NAMES[name]} {_size(*changes[name])}"
+
+
+def largest_sure(changes: dict[str, tuple[float, float]]) -> str | None:
+    """Name of the largest change of those that exceed their U (k = 2), given value and standard uncertainty; None: none does."""
+    sure = {name: abs(change) for name, (change, u) in changes.items() if abs(change) > COVERAGE * u}
+    return max(sure, key=lambda name: sure[name], default=None)
+
+
+def _size(value: float, u: float) -> str:
+    return f"{value * 1e6:+.1f} ± {COVERAGE * u * 1e6:.1f} µm/m (U, k = 2)"
+
+
+def _before(store: Store, new: SolutionRecord) -> SolutionRecord | None:
+    """The last solution of the same machine, geometry included, that is comparable."""
+    machine = new.doc["inputs"]["machine"]
+    same = [c.id for c in store.campaigns() if c.machine_id == store.campaign(new.campaign_id).machine_id]
+    found = [s for number in same for s in store.solutions(number) if s.id < new.id and s.doc.get("mean_over_volume")]
+    found = [s for s in found if s.doc["inputs"]["machine"] == machine and s.doc["inputs"].get("tables") == new.doc["inputs"].get("tables")]
+    return max(found, key=lambda s: s.id, default=None)

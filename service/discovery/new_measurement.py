@@ -1,0 +1,73 @@
+"""Whether a model holds on a measurement that was made after it: predicted from the old runs alone, judged on the new ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from abbe.models.effects.effect import Effect
+from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.campaign_data.decimation import thinned
+from abbe.service.discovery.discover import Thin, prepare
+from abbe.service.discovery.discover_live import joined
+from abbe.service.discovery.discovery_doc import noise_mm_of
+from abbe.service.discovery.simulate import Simulation, simulate
+from abbe.service.storage.records import ModelRecord
+
+
+@dataclass(frozen=True, slots=True)
+class NewGap:
+    """Rms of measured minus predicted over new runs, µm: by the model as it was, by the model with what was found, and the noise."""
+
+    before_um: float
+    after_um: float
+    floor_um: float
+
+
+@dataclass(frozen=True)
+class NewMeasurement:
+    """The gap on all new runs together, and run by run."""
+
+    gap: NewGap
+    runs: dict[str, NewGap]
+
+
+def judged_anew(
+    old: Campaign, new: Campaign, effects: tuple[Effect, ...], model: ModelRecord | None, *, thin: Thin = thinned
+) -> NewMeasurement:
+    """Predict a new campaign from an old one and the model book, and compare.
+
+    Parameters
+    ----------
+    old : Campaign
+        What the model was found in. Only its identify runs are fitted.
+    new : Campaign
+        Measured later with the controller's clock running on. Nothing of it is fitted but what only it can tell: the zero of every laser
+        run, and where the cup of a new set-up stands.
+    model : ModelRecord, optional
+        The book's version with what was found. None: nothing was found, and before and after are the same.
+
+    Raises
+    ------
+    CampaignRefused
+        A new run cannot be what it says, or is a copy of an old one.
+    """
+    fresh = replace(new, runs=[run | {"role": "holdout"} for run in new.runs])
+    both = replace(joined(old, fresh), name=old.name)  # of the old name: heat and instruments are still those of that session
+    plain = simulate(prepare(both, effects, thin=thin))
+    known = plain if model is None else simulate(prepare(both, effects, model, thin=thin))
+    labels = [run["run_id"] for run in new.runs]
+    kinds = {run["run_id"]: "laser" if run["test"].startswith("laser") else "bar" for run in new.runs}
+    runs = {label: _gap([label], plain, known, kinds) for label in labels}
+    return NewMeasurement(_gap(labels, plain, known, kinds), runs)
+
+
+def _gap(labels: list[str], plain: Simulation, known: Simulation, kinds: dict[str, str]) -> NewGap:
+    floor = np.concatenate([np.full(known.left_mm[k].size, noise_mm_of(known.noise_mm, kinds[k])) for k in labels])
+    return NewGap(_rms_um([plain.left_mm[k] for k in labels]), _rms_um([known.left_mm[k] for k in labels]), _rms_um([floor]))
+
+
+def _rms_um(parts: list[np.ndarray]) -> float:
+    values = np.concatenate(parts)
+    return 1e3 * float(np.sqrt(np.nanmean(values**2)))

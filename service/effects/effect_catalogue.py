@@ -1,0 +1,119 @@
+"""All effects that are known by name: ours, and those that other packages offer (docs/how-to/own-effect.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import numpy as np
+
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.effect import Effect
+from abbe.models.effects.probe_paths import probe_paths
+from abbe.models.effects.self_test import declaration_faults, signal_faults
+from abbe.service.effects.axis_test import SLOW_DRIFT
+from abbe.service.errors import EffectPluginBroken, EffectUnknown
+
+GROUP = "abbe.effects"
+
+
+@dataclass(frozen=True)
+class Plugins:
+    """Effects of other packages that passed the self-test, and why others were left out."""
+
+    effects: tuple[Effect, ...]
+    broken: tuple[EffectPluginBroken, ...]
+
+
+def catalogue() -> tuple[Effect, ...]:
+    """All effects that are known by name: ours, then those of other packages that passed the self-test."""
+    return CATALOGUE + plugins().effects
+
+
+@cache
+def plugins() -> Plugins:
+    """Effects of other packages, looked up once per process, and why some were left out."""
+    return installed(e.name for e in CATALOGUE)
+
+
+def effect_named(name: str) -> Effect:
+    """One effect of the catalogue.
+
+    Raises
+    ------
+    EffectUnknown
+        There is none; what is spelt alike is told.
+    """
+    found = {e.name: e for e in (*catalogue(), SLOW_DRIFT)}
+    if name not in found:
+        close = get_close_matches(name, found, n=3, cutoff=0.4)
+        raise EffectUnknown(
+            f"the catalogue has no effect {name!r}", f"did you mean {', '.join(close)}?" if close else "`abbe effects` lists all"
+        )
+    return found[name]
+
+
+def installed(known: Iterable[str]) -> Plugins:
+    """All effects that installed packages offer.
+
+    Parameters
+    ----------
+    known : names that are taken: the catalogue's.
+
+    Returns
+    -------
+    Plugins
+        Never raises for what a plug-in does: one that cannot be imported, is no effect, has a name that is taken or fails the self-test of
+        the catalogue (`abbe.models.effects.self_test`) is left out, with one error that names it.
+    """
+    taken, effects, broken = set(known), [], []
+    for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value)):
+        try:
+            found = _load(entry)
+            _check(entry, found, taken)
+        except EffectPluginBroken as fault:
+            broken.append(fault)
+            continue
+        effects += found
+        taken |= {e.name for e in found}
+    return Plugins(tuple(effects), tuple(broken))
+
+
+def _load(entry: EntryPoint) -> list[Effect]:
+    try:
+        thing: Any = entry.load()
+    except Exception as fault:  # whatever a stranger's module does on import, it must not take the product down
+        raise _left_out(entry, f"{type(fault).__name__}: {fault}") from fault
+    found = list(thing) if isinstance(thing, tuple | list) else [thing]
+    for effect in found:
+        if not isinstance(effect, Effect):
+            raise _left_out(entry, f"an Effect or a tuple of them expected, got {type(effect).__name__}")
+    if not found:
+        raise _left_out(entry, "it offers no effect")
+    return found
+
+
+def _check(entry: EntryPoint, found: list[Effect], taken: set[str]) -> None:
+    names = [e.name for e in found]
+    for effect in found:
+        if effect.name in taken or names.count(effect.name) > 1:
+            raise _left_out(entry, f"the name {effect.name!r} is taken")
+        try:
+            with np.errstate(all="ignore"):
+                faults = declaration_faults(effect) or signal_faults(effect, probe_paths())
+        except Exception as fault:  # its own code runs here
+            raise _left_out(entry, f"{effect.name}: {type(fault).__name__}: {fault}") from fault
+        if faults:
+            raise _left_out(entry, f"{effect.name}: {faults[0]}" + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""))
+
+
+def _left_out(entry: EntryPoint, why: str) -> EffectPluginBroken:
+    package = entry.dist.name if entry.dist is not None else entry.module
+    return EffectPluginBroken(
+        f"plug-in {entry.name} of {package} ({entry.value}) is left out: {why}",
+        "repair or uninstall the package; docs/how-to/own-effect.md",
+    )

@@ -1,0 +1,1 @@
+"""From a campaign to error motions with uncertainty: solved, judged, stored, predicted from."""

@@ -1,0 +1,120 @@
+"""A stored solution as a map of the machine's volume: which motions may be asked for alone, and deviation with U at every node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.models.arrays import F1, F2
+from abbe.models.uncertainty.coverage import apart_from_zero
+from abbe.models.uncertainty.known_field import KnownField, field_map
+from abbe.models.volumetric import volume_grid
+from abbe.service.errors import NotObservable, Unusable
+from abbe.service.identification.stored_prediction import stored_prediction
+from abbe.service.site import machine_from_doc
+from abbe.service.storage.records import SolutionRecord
+from abbe.service.storage.store import Store
+from abbe.service.verification.deviations import standard_uncertainty_mm
+
+HIDDEN = "not observable"
+UM = 1e3
+
+
+@dataclass(frozen=True)
+class StoredField:
+    """A solution's field. ``hidden``: motions that its runs do not show by themselves, and why."""
+
+    number: int
+    known: KnownField
+    hidden: Mapping[str, str]
+    statuses: Mapping[str, str]
+    means: Mapping[str, tuple[float, float]]
+    """Scales (EXX, mm/mm) and squareness (C0Y, rad) averaged over the volume, with standard uncertainty: known where motions are not."""
+
+    @property
+    def motions(self) -> list[str]:
+        """All motions of the model, in its order."""
+        return list(dict.fromkeys(t.motion for t in self.known.terms))
+
+    def alone(self, motions: Iterable[str]) -> list[str]:
+        """Chosen motions in the model's order.
+
+        Raises
+        ------
+        NotObservable
+            One of them is not shown by these runs by itself.
+        Unusable
+            The solution does not have one of them.
+        """
+        wanted = list(dict.fromkeys(motions))
+        strange = [name for name in wanted if name not in self.motions]
+        if strange:
+            raise Unusable(f"solution {self.number} has no motion {', '.join(strange)}", "ask for motions of its model")
+        lost = [name for name in wanted if name in self.hidden]
+        if lost:
+            raise NotObservable(
+                f"{', '.join(lost)}: solution {self.number} does not show it by itself ({self.hidden[lost[0]]})",
+                "leave it out, or ask for all motions together",
+            )
+        return [name for name in self.motions if name in wanted]
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMap:
+    """Deviation at the nodes of an even grid, best-fit rigid motion removed, µm.
+
+    ``u_um``: standard uncertainty of dX, dY, dZ and of the length, shape (n, 4). ``told``: whether the ellipsoid that
+    holds the deviation with 95 % leaves out zero: where it does not, nobody knows whether and into which direction the machine errs there.
+    A length above its own U (k = 2) does not say so: a length is never negative, and noise in three components alone exceeds that often.
+    """
+
+    nodes: int
+    points_mm: F2
+    deviation_um: F2
+    u_um: F2
+    told: NDArray[np.bool_]
+
+    @property
+    def length_um(self) -> F1:
+        """Length of the deviation, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.deviation_um, axis=1))
+
+
+def stored_field(store: Store, record: SolutionRecord) -> StoredField:
+    """The field of a stored solution.
+
+    Raises
+    ------
+    Unusable
+        It was stored by a version that did not keep the covariance.
+    """
+    doc: dict[str, Any] = record.doc
+    if "prediction" not in doc:
+        raise Unusable(f"solution {record.id} does not hold its covariance: a version before it was kept stored it", "solve again")
+    terms, coefficients, covariance = stored_prediction(doc["prediction"])
+    machine = machine_from_doc(store.machine(store.campaign(record.campaign_id).machine_id).doc)
+    motions: Mapping[str, Mapping[str, Any]] = doc.get("motions") or {}
+    statuses = {name: str(told.get("status", "")) for name, told in motions.items()}
+    means = {name: (float(m["value"]), float(m["u"])) for name, m in (doc.get("mean_over_volume") or {}).items()}
+    hidden = {name: str(told.get("reason") or HIDDEN) for name, told in motions.items() if told.get("status") == HIDDEN}
+    scatter_mm = float(doc["prediction"].get("scatter_mm", 0.0))
+    return StoredField(record.id, KnownField(machine, terms, coefficients, covariance, scatter_mm), hidden, statuses, means)
+
+
+def node_map(stored: StoredField, nodes: int, motions: Sequence[str] = ()) -> NodeMap:
+    """Deviation and uncertainty at ``nodes`` times ``nodes`` times ``nodes`` points over the strokes; no motions: all together.
+
+    Raises
+    ------
+    NotObservable, Unusable
+        As `StoredField.alone`.
+    """
+    chosen = stored.alone(motions) if motions else None
+    points = volume_grid(stored.known.machine.stroke_mm, nodes)
+    found = field_map(stored.known, points, chosen)
+    u = standard_uncertainty_mm(found.deviation_mm, found.covariance_mm2)
+    return NodeMap(nodes, points, found.deviation_mm * UM, u * UM, apart_from_zero(found.deviation_mm, found.covariance_mm2))

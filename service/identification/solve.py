@@ -1,0 +1,276 @@
+"""Solve a campaign: runs to error parameters with uncertainty, and to what these runs cannot tell."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.models.paths.lines import DIAGONALS, step_diagonal
+from abbe.models.solvers.helix import HelixSolution, fit_run
+from abbe.models.solvers.joint import JointSolution, Model, implausible, solve_joint
+from abbe.models.solvers.observations import RunData, nominal_reading
+from abbe.models.solvers.observe import bar_normals, setup_unknowns
+from abbe.models.solvers.priors import U_WAVELENGTH, Priors
+from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
+from abbe.service.campaign_data.campaign_checks import check_files, check_readings, refuse
+from abbe.service.campaign_data.campaign_issue import Finding
+from abbe.service.campaign_data.copied_runs import copies
+from abbe.service.campaign_data.provenance import measured_digest, taken_from
+from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
+from abbe.service.runs.observations import bar_noise_mm, run_data
+from abbe.service.site import Site
+
+LASER_SIGMA_MM = 3e-4
+CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
+"""Set-up unknowns that cannot be off by five times their uncertainty: somebody calibrated them, or would have seen it."""
+LASER_REMEDY = "look at beam, mirror and temperature of that set-up"
+UNUSUAL = {
+    "cosine": ("the relative length error (beam and mirror askew, or its own wavelength)", LASER_REMEDY),
+    "bar_drift": ("the drift of the centre cup", "look at the cup's clamping, the spindle's temperature and t_s"),
+    "drift": ("the drift of the laser", "look at the air, the warming of laser and mirror, and t_s"),
+    "zero": ("the error of the first record", "look at the first record: was the machine standing still?"),
+}
+ALL_READINGS = 10**9
+PER_UNKNOWN = 2
+"""Readings that a campaign needs for every unknown that only readings can tell."""
+SIX, TWENTY_ONE = 6 + 3, 21 + 3 + 18 + 3
+"""Unknowns of the smallest model of each kind: six, or 21 motions with slope and curvature; and the lost motion of three axes."""
+HELIX_NOTE = (
+    "Ten-parameter figures describe the machine about that sphere only, from that run alone; over the volume the joint solution is the one "
+    "to use."
+)
+STEP_NOTE = (
+    "Step-diagonal figures are the paper's, for comparison: their uncertainty holds reading noise and the laser's wavelength only. Tilt of "
+    "the mirrors and angular errors of the axes bias them and are not in it; the joint solution knows both and is the one to use."
+)
+Say = Callable[[str], None]
+STEP_PLACE_MM = 0.1
+"""A row farther from where its step leads belongs to another step."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Joint solution plus the papers' own solutions of the same runs, for comparison.
+
+    ``flags``: what is odd about single runs without being wrong for certain. ``digests``: a hash of every run's data as measured, by its
+    name. ``tables``: the compensation table that each run was measured with, where it says so. ``taken``: what was taken out of the
+    readings. ``rows``: for every value of a run the first and the last row of its file (from 1) that went into it, shape (values, 2).
+    """
+
+    joint: JointSolution
+    helices: dict[str, HelixSolution]
+    step_totals: dict[str, dict[str, float]]
+    noise_bar_mm: float
+    flags: tuple[Finding, ...] = ()
+    digests: dict[str, str] = field(default_factory=dict)
+    rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    tables: dict[str, dict[str, Any]] = field(default_factory=dict)
+    taken: tuple[str, ...] = ()
+
+
+def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model | None = "rigid21", say: Say | None = None) -> Solved:
+    """Solve ``abbe-run/1`` objects together (role ``identify`` only), after it was checked that each can be what it says.
+
+    ``model`` None: rigid21, or rigid6 where there are too few readings for it; a flag tells.
+
+    Raises
+    ------
+    NotObservable
+        There is no run to identify from.
+    CampaignRefused
+        A run is in another unit, has exchanged axes, is a copy, or is of another machine; or there are too few readings for the model.
+    InstrumentsDisagree
+        A bar, cup or mirror would have to be impossibly wrong.
+    """
+    say = say or _silent
+    used = [r for r in runs if r["role"] == "identify"]
+    if not used:
+        raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
+    say(f"{len(used)} runs: units, axes, copies, machine")
+    model, smaller = (model, []) if model is not None else _affordable([run_data(r, blocks=ALL_READINGS) for r in used])
+    flags = smaller + check_campaign(site, used, [r for r in runs if r["role"] == "holdout"], model)
+    bars = [r for r in used if r["test"].startswith("ballbar")]
+    noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
+    data = tuple(run_data(r) for r in used)
+    joint = solve_joint(site.machine, data, model=model, progress=say)
+    flags += check_instruments(joint, data)
+    spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not tell ten parameters
+    helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
+    digests, tables = (
+        {r["run_id"]: measured_digest(r) for r in used},
+        {r["run_id"]: r["table"] for r in used if "crc" in r.get("table", {})},
+    )
+    return Solved(
+        joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(taken_from(used))
+    )
+
+
+def value_rows(runs: list[dict[str, Any]], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
+    """Rows of its file, from 1, that each value of a run was made of, (first, last) per value: long runs are averaged in blocks.
+
+    A row belongs to the value whose mean time is nearest; rows marked invalid belong to none.
+    """
+    out = {}
+    for run, values in zip(runs, data, strict=True):
+        t = np.asarray(run["columns"]["t_s"], dtype=np.float64)
+        rows = np.flatnonzero(np.asarray(run["columns"].get("valid", np.ones(t.size))).astype(bool))
+        if rows.size == values.t_s.size:
+            out[run["run_id"]] = np.stack([rows, rows], axis=1) + 1
+            continue
+        edges = np.searchsorted(t[rows], 0.5 * (values.t_s[1:] + values.t_s[:-1]))
+        first, last = np.concatenate([[0], edges]), np.concatenate([edges, [rows.size]]) - 1
+        out[run["run_id"]] = np.stack([rows[np.minimum(first, rows.size - 1)], rows[np.maximum(last, first)]], axis=1) + 1
+    return out
+
+
+def _silent(_: str) -> None:
+    return None
+
+
+def check_campaign(site: Site, used: list[dict[str, Any]], others: list[dict[str, Any]], model: Model) -> list[Finding]:
+    """Flags of the runs that are to be solved; ``others`` are only looked at for copies.
+
+    Raises
+    ------
+    CampaignRefused
+        One line: which run, what is wrong, what to do.
+    """
+    flags = check_files(site.doc, used)
+    known = {f.run for f in flags}
+    flags += [f for f in copies([*used, *others]) if f.run not in known]
+    refuse(flags)
+    data = [run_data(r, blocks=ALL_READINGS) for r in used]
+    check_enough(data, model)
+    flags += check_readings(site.machine, data)
+    refuse(flags)
+    return flags
+
+
+def check_enough(data: list[RunData], model: Model) -> None:
+    """Refuse a campaign with fewer than two readings for every unknown that only readings can tell.
+
+    Raises
+    ------
+    CampaignRefused
+        How many there are, how many are needed, and which run has the fewest.
+    """
+    count, unknowns = sum(r.deviation_mm.size for r in data), _unknowns(data, model)
+    if count < PER_UNKNOWN * unknowns:
+        fewest = min(data, key=lambda r: r.deviation_mm.size)
+        raise CampaignRefused(
+            f"{count} readings are too few for the {unknowns} unknowns of {model} and the set-ups ({PER_UNKNOWN * unknowns} are needed); "
+            f"run {fewest.label} has the fewest, {fewest.deviation_mm.size}",
+            "measure more positions" + (", or use --model rigid6" if model != "rigid6" else "") + "; nothing was stored",
+        )
+
+
+def _unknowns(data: list[RunData], model: Model) -> int:
+    return (TWENTY_ONE if model == "rigid21" else SIX) + sum(4 if r.kind == "bar" else 2 for r in data)
+
+
+def _affordable(data: list[RunData]) -> tuple[Model, list[Finding]]:
+    """The largest model that there are enough readings for, and the flag that tells where it is not the usual one."""
+    count, wanted = sum(r.deviation_mm.size for r in data), PER_UNKNOWN * _unknowns(data, "rigid21")
+    if count >= wanted:
+        return "rigid21", []
+    what = f"{count} readings in all are too few for rigid21 ({wanted} are needed): solved for rigid6, scales and squareness only"
+    return "rigid6", [Finding(min(data, key=lambda r: r.deviation_mm.size).label, what, "measure more positions", False)]
+
+
+def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[Finding]:
+    """Refuse a solution in which a bar, cup, mirror or the laser's scale would have to be impossibly wrong; other set-up errors are flags.
+
+    Raises
+    ------
+    InstrumentsDisagree
+        Which set-up unknown, and by how much.
+    """
+    setup = setup_unknowns(data, Priors())
+    found = implausible(joint, dict(zip(setup.names, (float(v) for v in setup.prior_sd), strict=True)))
+    hard = [(name, times) for name, times in found if name.startswith(CALIBRATED)]
+    if hard:
+        name, times = hard[0]
+        raise InstrumentsDisagree(
+            f"{name.replace('_', ' ')} would have to be {times:.0f} times its calibration uncertainty",
+            "check the laser's air compensation, the bar's length and the mirror before measuring again; nothing was written",
+        )
+    return [_unusual(name, times, data) for name, times in found]
+
+
+def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> Finding:
+    """A set-up error that is larger than a careful hand leaves, without being impossible."""
+    words, remedy = next(
+        (told for prefix, told in UNUSUAL.items() if name.startswith(prefix)), (name.replace("_", " "), "look at that set-up")
+    )
+    run = _whole([r.label for r in data], name)
+    setup = None if run else _whole([r.setup for r in data], name)
+    if run:
+        return Finding(run, f"{words} is {times:.0f} times what is usual", remedy, False)
+    first = next((r.label for r in data if r.setup == setup), name)
+    return Finding(first, f"{words} of set-up {setup} is {times:.0f} times what is usual", remedy, False)
+
+
+def _whole(names: list[str], unknown: str) -> str | None:
+    """The longest of the names that stands in the name of an unknown as a whole word between underscores: B1 is not in cup_B12_x."""
+    found = [n for n in names if re.search(rf"_{re.escape(n)}(_|$)", unknown)]
+    return max(found, key=len) if found else None
+
+
+def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """The papers' step-diagonal figures per step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
+
+    End errors of the nine curves (um), largest closure (um; its u is that of one closure), squareness contrasts (urad).
+    """
+    out = {}
+    for order in ("XYZ", "ZYX"):
+        found = {r["setup"]["diagonal"]: r for r in runs if r["test"] == "laser_diagonal" and r["setup"].get("order", "") == order}
+        if set(found) != set(ORDER) or not all(_whole_way_out(r, order) for r in found.values()):
+            continue
+        out[order] = _step_figures(found, order)
+    return out
+
+
+def _whole_way_out(run: dict[str, Any], order: str) -> bool:
+    """Whether the first 3 n + 1 rows are valid and stand where the steps of this order lead: else later rows are another's."""
+    setup, columns = run["setup"], run["columns"]
+    n = int(setup["steps"])
+    points = np.column_stack([np.asarray(columns[f"{a}_mm"], dtype=np.float64)[: 3 * n + 1] for a in "xyz"])
+    if len(points) < 3 * n + 1 or not np.all(np.asarray(columns.get("valid", np.ones(len(points))))[: 3 * n + 1]):
+        return False
+    span = n * np.abs(np.asarray(setup["increment_mm"], dtype=np.float64)) * DIAGONALS[setup["diagonal"]]
+    nominal = step_diagonal(points[0], points[0] + span, n, order, back=False)
+    return float(np.abs(points - nominal).max()) < STEP_PLACE_MM
+
+
+def _step_figures(found: dict[str, dict[str, Any]], order: str) -> dict[str, float]:
+    n = int(found["ppp"]["setup"]["steps"])
+    out_only = {k: np.asarray(r["columns"]["deviation_mm"][: 3 * n + 1]) for k, r in found.items()}
+    inc = np.abs(np.asarray(found["ppp"]["setup"]["increment_mm"]))
+    q = increments(out_only, order)
+    curves, u = wang_four(q, inc), u_wang_four(inc, n, LASER_SIGMA_MM, U_WAVELENGTH)
+    figures: dict[str, float] = {}
+    for i, a in ((i, a) for a in range(3) for i in range(3)):
+        key = f"E{'XYZ'[i]}{'XYZ'[a]}_end_um"
+        figures |= {key: float(curves[i, a, -1]) * 1e3, f"u_{key}": float(u[i, a, -1]) * 1e3}
+    figures["closure_max_um"] = float(np.abs(closure_mm(q)).max()) * 1e3
+    figures["u_closure_max_um"] = float(np.sqrt(8.0)) * LASER_SIGMA_MM * 1e3  # four differences of two readings
+    contrast = squareness_contrast({k: float(v[-1]) for k, v in out_only.items()}, inc * n, LASER_SIGMA_MM * np.sqrt(2.0))
+    for name in ("xy", "xz", "yz"):
+        figures[f"theta_{name}_urad"] = getattr(contrast, f"theta_{name}") * 1e6
+        figures[f"u_theta_{name}_urad"] = getattr(contrast, f"u_{name}") * 1e6
+    return figures
+
+
+def helix_misfit(solved: Solved, run: dict[str, Any]) -> float:
+    """Rms of a held-out ball-bar run that the solution does not explain (cup and length refitted), mm."""
+    data = run_data(run)
+    n = bar_normals(data)
+    lost = -0.5 * data.sign * np.array([v for v, _ in solved.joint.backlash_mm().values()])
+    y = data.deviation_mm - nominal_reading(data) - np.einsum("ni,ni->n", n, solved.joint.deviation_mm(data.axes_mm, data.tool_mm) + lost)
+    a = np.concatenate([n, np.ones((len(n), 1))], axis=1)
+    return float(np.sqrt(np.mean((y - a @ np.linalg.lstsq(a, y, rcond=None)[0]) ** 2)))

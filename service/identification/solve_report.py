@@ -1,0 +1,274 @@
+"""What is said about a solution: the stored document (`abbe-solution/1`), and lines for people. Every figure has its uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F2
+from abbe.models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability import Observability, observability_of
+from abbe.models.solvers.robust import Outlier
+from abbe.models.uncertainty.budget import Budget, BudgetLine, budget_over, worst_point
+from abbe.models.uncertainty.frame import volume_frame
+from abbe.models.uncertainty.mask import CompensableMask, compensable_mask
+from abbe.models.uncertainty.prediction import Prediction, predict_deviation
+from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.volumetric import volume_grid
+from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, versions
+from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
+from abbe.service.identification.solve_verdict import Verdict, layout_line, verdict
+from abbe.service.identification.stored_prediction import prediction_doc
+from abbe.service.tables.measured_with import distinct
+
+FORMAT = "abbe-solution/1"
+HIDDEN_NOTE = "not observable by itself: for this tool only"
+NODES = 6
+"""Nodes per axis of the grid over the strokes on which the uncertainty is stated."""
+LISTED = 20
+"""So many outliers and correlations are listed for people; the document holds all outliers."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """A solution and everything that is said about it. ``prediction`` is over the whole volume, best-fit rigid motion removed."""
+
+    solved: Solved
+    observability: Observability
+    sources: ErrorSources
+    prediction: Prediction
+    budget: Budget
+    mask: CompensableMask
+    mean: tuple[MeanParameter, ...]
+
+    @property
+    def joint(self) -> JointSolution:
+        """The joint solution."""
+        return self.solved.joint
+
+    def predict(self, points_mm: F2) -> Prediction:
+        """Deviation and uncertainty elsewhere, in the same frame."""
+        return predict_deviation(self.sources, points_mm, frame=volume_frame(self.joint.machine))
+
+
+def account(solved: Solved) -> Account:
+    """Ask a solution what it knows: observability, uncertainty over the volume, budget."""
+    joint = solved.joint
+    sources = error_sources(joint)
+    prediction = predict_deviation(sources, volume_grid(joint.machine.stroke_mm, NODES), frame=volume_frame(joint.machine))
+    return Account(
+        solved,
+        observability_of(joint),
+        sources,
+        prediction,
+        budget_over(prediction),
+        compensable_mask(prediction),
+        mean_linear(joint),
+    )
+
+
+def model_key(joint: JointSolution) -> str:
+    """Which model was fitted and who chose its order, e.g. ``rigid21/legendre7+order-by-heldout``."""
+    if joint.model == "rigid6":
+        return "rigid6" + ("+by-heldout" if joint.order_choice else "")
+    return f"{joint.model}/legendre{joint.order}" + ("+order-by-heldout" if joint.order_choice else "+order-given")
+
+
+def not_observable(found: Account) -> list[str]:
+    """In words: what the runs cannot tell apart, why, and what would show it."""
+    return [g.text for g in found.observability.hidden]
+
+
+def solution_doc(solved: Solved | Account) -> dict[str, Any]:
+    """The solution as it is stored: parameters with uncertainty in SI-like units, what is not observable, tests, versions, digests."""
+    found = solved if isinstance(solved, Account) else account(solved)
+    joint = found.joint
+    key = model_key(joint)
+    return {
+        "format": FORMAT,
+        "model": key,
+        "order": joint.order,
+        "versions": versions(),
+        "verdict": _verdict(found),
+        "inputs": _inputs(found, key.partition("/")[0]),
+        **_parameters(found),
+        **_observability(found),
+        **_residuals(found.solved),
+        "flags": [f.line for f in found.solved.flags],
+        "uncertainty": _uncertainty(found),
+        "prediction": prediction_doc(found.sources),
+        "ten_parameter_helix": {
+            label: {n: {"value": h.estimate.value(n), "u": h.estimate.u(n)} for n in h.estimate.names}
+            for label, h in found.solved.helices.items()
+        },
+        "ten_parameter_helix_note": HELIX_NOTE,
+        "step_diagonals": found.solved.step_totals,
+        "step_diagonals_note": STEP_NOTE,
+    }
+
+
+def judged(found: Account) -> Verdict:
+    """The verdict on a solution (`abbe.service.identification.solve_verdict`)."""
+    flagged = len({t.run for t in found.joint.residual_tests if t.flagged})
+    return verdict(found.observability.number, found.prediction, found.mask.share, flags=len(found.solved.flags), not_noise=flagged)
+
+
+def _verdict(found: Account) -> dict[str, Any]:
+    told = judged(found)
+    return {"word": told.word, "text": told.text, "reasons": list(told.reasons), "layout": layout_line(found.observability.number)}
+
+
+def _inputs(found: Account, model: str) -> dict[str, Any]:
+    machine = machine_digest(found.joint.machine)
+    return {
+        "digest": campaign_digest(found.solved.digests, "\n".join([model, *found.solved.taken]), machine),
+        "machine": machine,
+        "runs": found.solved.digests,
+        "tables": distinct(found.solved.tables.values()),
+    }
+
+
+def _parameters(found: Account) -> dict[str, Any]:
+    return {
+        "parameters": {
+            p.name: {"value": p.value, "u": p.u, "data_share": p.share, "status": p.status} for p in found.observability.parameters
+        },
+        "mean_over_volume": {p.name: {"value": p.value, "u": p.u} for p in found.mean},
+        "mean_over_volume_note": f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
+        "motions": {m.name: {"status": m.status, "u": m.u, "data_share": m.share, "reason": m.reason} for m in found.observability.motions},
+    }
+
+
+def _observability(found: Account) -> dict[str, Any]:
+    o = found.observability
+    return {
+        "rank": {"rank": o.rank, "of": len(o.terms), "effective_rank": o.seen.effective_rank},
+        "not_observable": not_observable(found),
+        "advice": [a.text for a in o.advice],
+        "observability": {"number": o.number.value, "median": o.number.median, "verdict": o.number.verdict, "text": o.number.text},
+        "correlations": [{"first": c.first, "second": c.second, "r": c.r} for c in o.correlations[:LISTED]],
+    }
+
+
+def _residuals(solved: Solved) -> dict[str, Any]:
+    joint, e = solved.joint, solved.joint.estimate
+    counts = {r.label: sum(o.run == r.label for o in joint.outliers) for r in joint.runs}
+    return {
+        "chi2": e.chi2,
+        "dof": e.dof,
+        "variance_factor": e.variance_factor,
+        "runs": {
+            r.label: {
+                "readings": r.residual_mm.size,
+                "rms_um": r.rms_mm * 1e3,
+                "expected_um": r.expected_mm * 1e3,
+                "outliers": counts[r.label],
+            }
+            for r in joint.runs
+        },
+        "noise": {
+            kind: {"sigma_um": sigma * 1e3, "repeats_um": None if repeats is None else repeats * 1e3}
+            for kind, sigma in joint.noise_mm.items()
+            for repeats in [joint.noise_repeats_mm.get(kind)]
+        },
+        "outliers": [
+            {"run": o.run, "index": o.index, "rows": _rows(solved, o), "t_s": _time(joint, o), "size_sigma": o.size, "weight": o.weight}
+            for o in joint.outliers
+        ],
+        "residual_tests": [
+            {
+                "run": t.run,
+                "test": t.name,
+                "statistic": t.statistic,
+                "p": t.p,
+                "p_adjusted": t.p_adjusted,
+                "flagged": t.flagged,
+                "text": t.text,
+            }
+            for t in joint.residual_tests
+        ],
+    }
+
+
+def _uncertainty(found: Account) -> dict[str, Any]:
+    p, at = found.prediction, worst_point(found.prediction)
+    return {
+        "frame": "best-fit rigid motion over the strokes removed",
+        "worst_point": {
+            "at_mm": [float(v) for v in p.points_mm[at]],
+            "deviation_um": [float(v) for v in p.deviation_mm[at] * 1e3],
+            "u_um": [float(v) for v in p.u_mm[at] * 1e3],
+            "expanded_um": [float(v) for v in p.expanded_mm[at] * 1e3],
+            "expanded_vector_um": float(p.expanded_vector_mm[at]) * 1e3,
+        },
+        "rms_um": float(np.sqrt(np.mean(p.u_vector_mm**2))) * 1e3,
+        "budget": [_budget_line(found, line) for line in found.budget.lines],
+        "compensable_share": found.mask.share,
+    }
+
+
+def _budget_line(found: Account, line: BudgetLine) -> dict[str, Any]:
+    """A source with the type of its evaluation and its degrees of freedom; null: stated, or the allowance for them."""
+    source = found.sources.source(line.name)
+    dof = float(source.dof) if np.isfinite(source.dof) else None
+    return {"source": line.name, "words": line.words, "u_um": line.u_mm * 1e3, "share": line.share, "type": source.evaluation, "dof": dof}
+
+
+def worst_line(found: Account) -> str:
+    """Where the deviation is known worst, in one line."""
+    p, at = found.prediction, worst_point(found.prediction)
+    place = ", ".join(f"{v:.0f}" for v in p.points_mm[at])
+    return (
+        f"Worst known point ({place}) mm: deviation {np.linalg.norm(p.deviation_mm[at]) * 1e3:.1f} µm, "
+        f"95 % region of the vector ± {p.expanded_vector_mm[at] * 1e3:.1f} µm (rigid motion removed). {found.mask.text()}"
+    )
+
+
+def noise_lines(joint: JointSolution) -> list[str]:
+    """Noise found per instrument, and what repeats alone say of it."""
+    names = {"bar": "ball-bar", "laser": "laser"}
+    out = []
+    for kind, sigma in joint.noise_mm.items():
+        repeats = joint.noise_repeats_mm.get(kind)
+        more = f", {repeats * 1e3:.2f} µm from repeats alone" if repeats is not None else ", nothing was repeated"
+        out.append(f"{names.get(kind, kind)}: {sigma * 1e3:.2f} µm for one reading{more}")
+    return out
+
+
+def _rows(solved: Solved, outlier: Outlier) -> list[int]:
+    """First and last row of the run's columns, from 1, that went into the value."""
+    rows = solved.rows.get(outlier.run)
+    return [] if rows is None or outlier.index >= len(rows) else [int(v) for v in rows[outlier.index]]
+
+
+def _time(joint: JointSolution, outlier: Outlier) -> float:
+    return float(next(r.t_s[outlier.index] for r in joint.data if r.label == outlier.run))
+
+
+def outlier_lines(solved: Solved) -> list[str]:
+    """Readings that count less, largest first, with their rows in the run's file."""
+    joint = solved.joint
+    lines = [
+        f"run {o.run}, {_where(_rows(solved, o))} (t = {_time(joint, o):.1f} s): {abs(o.size):.1f} sigma, counts {o.weight:.0%}"
+        for o in joint.outliers[:LISTED]
+    ]
+    more = len(joint.outliers) - len(lines)
+    return [*lines, f"and {more} more"] if more > 0 else lines
+
+
+def _where(rows: list[int]) -> str:
+    if not rows:
+        return "a value"
+    first, last = rows
+    return f"row {first}" if first == last else f"mean of rows {first} to {last}"
+
+
+def residual_lines(joint: JointSolution) -> list[str]:
+    """What the tests of the residuals found, one line per run, most significant run first."""
+    found: dict[str, list[str]] = {}
+    for test in sorted((t for t in joint.residual_tests if t.flagged), key=lambda t: t.p_adjusted):
+        found.setdefault(test.run, []).append(test.text.removeprefix(f"{test.run}: "))
+    return [f"{run}: " + "; ".join(texts) for run, texts in found.items()]

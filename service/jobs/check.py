@@ -1,0 +1,132 @@
+"""The unattended check: measure a recipe, judge its figures against the machine file's limits with their uncertainty."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from abbe.service.campaigns.builtin_recipes import recipe_plan
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.plausibility import INSTRUMENTS, ended_certificates
+from abbe.service.capture.live import LiveFeed
+from abbe.service.clock import Clock, SystemClock
+from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.config_schema import MachineFile
+from abbe.service.devices.machine_lock import alone
+from abbe.service.events import ProgressSink
+from abbe.service.runs.columns import load_run
+from abbe.service.sequences.control import Control
+from abbe.service.sequences.needed import BALLBAR, LASER
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import site_of
+from abbe.service.storage.store import Store
+from abbe.service.verification.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
+
+MEASURED_WITH = {"body_diagonal_um": LASER, "helix_rms_um": BALLBAR}
+MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """What a check found. ``uncertainties`` are expanded (k = 2); figures in µm by name."""
+
+    verdict: Verdict
+    values: dict[str, float]
+    uncertainties: dict[str, float]
+    limits: dict[str, float]
+    run_labels: list[str]
+    campaign: str
+    started_utc: datetime
+    duration_s: float
+    text: str
+    comparable: bool = True
+    """Whether the figures can be put beside those of other checks: the air was within its limits, no certificate had ended."""
+
+
+async def run_check(
+    config: MachineFile,
+    store: Store,
+    recipe: str,
+    progress: ProgressSink,
+    clock: Clock | None = None,
+    *,
+    control: Control | None = None,
+    live: LiveFeed | None = None,
+) -> CheckResult:
+    """Open the devices, measure the recipe, close them, judge.
+
+    ``control`` pauses, resumes, stops or aborts the measurement; ``live`` is shown what its paths read.
+
+    Raises
+    ------
+    AbbeError, DriverError
+        One cause, one remedy; the run in hand is closed as failed and the axes are stopped.
+    """
+    clock = clock or SystemClock()
+    started, start_s = clock.utc(), clock.monotonic_s()
+    site = site_of(config)
+    plan = recipe_plan(recipe, site.machine)
+    # With the machine: services that share a database check at the same second, and a campaign's name is there once.
+    plan = CampaignPlan(f"{plan.name} {config.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
+    with alone(site.urls.cnc):
+        async with recovered_session(store, site) as session:
+            run_ids = await measure(session, store, site, plan, progress=progress, clock=clock, manner=Manner(control=control, live=live))
+    runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
+    return judged(config, runs, plan.name, started, clock.monotonic_s() - start_s)
+
+
+def judged(config: MachineFile, runs: list[dict[str, Any]], campaign: str, started: datetime, duration_s: float) -> CheckResult:
+    """Judge the runs of a check's recipe.
+
+    Raises
+    ------
+    MeasurementFault
+        They are none: a body diagonal is missing, a run was not measured to its end.
+    """
+    rows = figure_rows(figures(runs))
+    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
+    verdict = overall([judge(*rows[k], limits[k]) for k in limits if k in rows])
+    text = f"{MARK[verdict]}: " + ", ".join(f"{_name(k)} {rows[k][0]:.1f} µm (limit {limits[k]:g})" for k in limits if k in rows)
+    against = [*_air(runs, config.limits.temperature_c), *_ended(config, rows, started)]
+    if against:
+        verdict = "cannot tell"
+        text = f"{' and '.join(against)}, so the figures cannot be judged; {text}"
+    return CheckResult(
+        verdict,
+        {k: v for k, (v, _) in rows.items()},
+        {k: COVERAGE * u for k, (_, u) in rows.items()},
+        {k: v for k, v in limits.items() if k in rows},
+        [r["run_id"] for r in runs],
+        campaign,
+        started,
+        duration_s,
+        text,
+        not against,
+    )
+
+
+def _name(key: str) -> str:
+    return {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}[key]
+
+
+def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list[str]:
+    """Instruments of these figures that no certificate carried when the check began: they cannot say what is within limits."""
+    roles = {MEASURED_WITH[name] for name in names if name in MEASURED_WITH}
+    ended = ended_certificates(site_of(config), started.astimezone(UTC).date(), roles)
+    return [f"the certificate of the {INSTRUMENTS[role]} ended on {day}" for role, day in ended.items()]
+
+
+def _air(runs: list[dict[str, Any]], window: tuple[float, float]) -> list[str]:
+    outside, (low, high) = _outside(runs, window), window
+    return [] if outside is None else [f"air temperature {outside:.1f} C is outside of {low:g}..{high:g} C"]
+
+
+def _outside(runs: list[dict[str, Any]], window: tuple[float, float]) -> float | None:
+    """The air temperature farthest outside of the window, None if all are inside or none was measured."""
+    low, high = window
+    seen = [float(t) for r in runs for t in r["columns"].get("temp_air_C", [])]
+    worst = max(seen, key=lambda t: max(low - t, t - high), default=None)
+    return worst if worst is not None and not low <= worst <= high else None

@@ -1,0 +1,179 @@
+"""The full campaign for a person who is led through its set-ups: measured, solved, proposed.
+
+Never approves, and writes no table but what an interrupted push left to be taken back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from abbe.models.compensation.tables import Predicted
+from abbe.models.machine import Machine
+from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, USUAL_HZ, parted
+from abbe.service.campaigns.measure import Manner, measure, start_campaign
+from abbe.service.campaigns.plausibility import certificates
+from abbe.service.compensation.correct import check_promise
+from abbe.service.compensation.proposals import check_certificates
+from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.session import Session
+from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.jobs.investigate import NO, Bench, made_of, promise_words
+from abbe.service.sequences.campaigns import identification
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import COMPENSATION_ON
+from abbe.service.sequences.needed import check_devices, needed_by
+from abbe.service.sequences.recipe_file import parse_recipe, recipe_source
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.tables.base_table import read_base
+
+SOLVING = "all is measured, and nothing moves while it is solved"
+
+
+@dataclass(frozen=True, slots=True)
+class Led:
+    """How it ended: "proposed", or "ended" where there is no proposal that could be approved; why; and what is in the store of it."""
+
+    word: str
+    text: str
+    solution: int | None = None
+    proposal: int | None = None
+
+
+def is_full(recipe: str, names: tuple[str, ...]) -> bool:
+    """Whether a recipe is one of these full campaigns; with a rate of the ball-bar only the shipped one: a file has its own."""
+    name, rate_hz = parted(recipe)
+    return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
+
+
+def full_campaign(recipe: str, machine: Machine, folder: Path) -> tuple[CampaignPlan, dict[str, Any]]:
+    """The plan of ``identification`` or of a recipe file of a folder, and what `abbe measure --resume` can make it from again.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or is no recipe.
+    """
+    name, rate_hz = parted(recipe)
+    if name == IDENTIFICATION:
+        return identification(machine, rate_hz=rate_hz, name=recipe), _source(name, rate_hz)
+    text = recipe_source(folder / recipe)
+    _, recipes = parse_recipe(text, recipe)
+    return CampaignPlan(recipe, tuple(r.plan(machine) for r in recipes)), _source(recipe, USUAL_HZ, text)
+
+
+def _source(recipe: str, rate_hz: int, text: str | None = None) -> dict[str, Any]:
+    return {"recipe": recipe, "helix": "", "rate_hz": rate_hz, "text": text}
+
+
+async def led_campaign(bench: Bench, source: dict[str, Any], by: str) -> Led:
+    """Measure the bench's plan under its name, solve it and propose; whoever mounts at a console is asked by ``bench.control.prompts``.
+
+    Parameters
+    ----------
+    source : dict
+        What the plan can be made from again.
+    by : str
+        Who proposes: where two people are needed another one has to approve.
+
+    Raises
+    ------
+    Stopped, Aborted
+        Asked for. What is complete stays; a note says how to go on.
+    TableMismatch
+        The runs would be measured without the table in force, or it cannot be read; nothing was measured.
+    AbbeError, DriverError, OSError, ArithmeticError, ValueError
+        A device or the measurement failed; the same.
+    """
+    name = bench.plan.name
+    bench.control.now(State.RUNNING)
+    await bench.control.gate()
+    try:
+        check_certificates(bench.site)
+        _check_not_ended(bench)
+    except NO as no:
+        return Led("ended", f"no proposal: {no}")
+    await _measured(bench, source)
+    try:
+        return await _proposed(bench, by)
+    except NO as no:
+        return Led("ended", f"no proposal: {no}; campaign {name!r} stays, and `abbe solve` shows what it says")
+    except BaseException as error:
+        error.add_note(f"campaign {name!r} is measured: `abbe comp propose MACHINE.toml {name!r}` solves it and proposes")
+        raise
+
+
+async def _measured(bench: Bench, source: dict[str, Any]) -> None:
+    site, store, name = bench.site, bench.store, bench.plan.name
+    plan = paced(bench.plan, site.max_feed_mm_min)
+    whoever = _Whoever(bench.control)
+    manner = Manner(control=bench.control, source=source, part=True, live=bench.live)
+    with alone(site.urls.cnc):
+        async with recovered_session(store, site, ask=whoever.ask) as session:
+            whoever.session = session
+            await check_devices(session, plan, air=site.watching.air_c is not None)
+            await bench.control.gate()
+            await _check_table_acts(session)
+            begun = await start_campaign(session, store, site, name)
+            try:
+                await measure(session, store, site, plan, progress=bench.progress, clock=bench.clock, campaign=begun, manner=manner)
+            except BaseException as error:
+                error.add_note(
+                    f"what is complete of campaign {name!r} stays: `abbe measure MACHINE.toml --resume {name!r}` goes on, then "
+                    f"`abbe comp propose MACHINE.toml {name!r}`"
+                )
+                raise
+
+
+async def _proposed(bench: Bench, by: str) -> Led:
+    await bench.control.gate()
+    bench.control.hurry = SOLVING
+
+    def agree(promised: Predicted) -> None:
+        bench.control.check()
+        check_promise(promised)
+
+    made = await made_of(bench, bench.plan.name, agree, by)
+    solution, against = made.proposed.solution_id, made.proposed.reasons
+    if against:
+        return Led("ended", f"proposal {made.number} cannot be approved: {'; '.join(against)}", solution, made.number)
+    return Led("proposed", await asyncio.to_thread(promise_words, bench.store, made), solution, made.number)
+
+
+def _check_not_ended(bench: Bench) -> None:
+    """No hour is measured for a table that no certificate carries any more."""
+    ended = certificates(bench.site, bench.clock.utc().date(), needed_by(bench.plan).first)
+    if ended:
+        raise TableRefused("; ".join(ended), "have it calibrated, then start again; nothing was measured")
+
+
+async def _check_table_acts(session: Session) -> None:
+    """The same of a table in force that is switched off: nothing could be proposed from what is measured then."""
+    base = await read_base(session.controller)
+    status = await session.controller.status()
+    if base.tables is not None and not status.bits >> COMPENSATION_ON & 1:
+        why = f"table {base.crc:08X} does not act: the compensation is switched off"
+        raise TableMismatch(why, "switch it on at the control and start again; nothing was measured")
+
+
+class _Whoever:
+    """Passes on what the fixture at the console asks, with the place where the spindle stands; a stop ends the wait."""
+
+    def __init__(self, control: Control) -> None:
+        self._control = control
+        self.session: Session | None = None
+
+    async def ask(self, text: str) -> None:
+        if self.session is not None:
+            x, y, z = (await self.session.controller.status()).position_mm
+            text = f"Spindle at X {x:.1f} mm Y {y:.1f} mm Z {z:.1f} mm. {text}"
+        await self._control.unless_stopped(self._control.prompts.ask(text))
+
+
+def named_now(bench: Bench, recipe: str) -> Bench:
+    """The bench with its plan named as campaigns of this recipe are: recipe, machine, and when."""
+    return replace(bench, plan=replace(bench.plan, name=f"{recipe} {bench.site.name} {bench.clock.utc():%Y-%m-%d %H:%M:%S}"))

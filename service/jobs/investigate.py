@@ -1,0 +1,218 @@
+"""What the service does about an alarm by itself: measure the full campaign, solve, look for the effect, propose. Never approve or write.
+
+Each step is a line of the alarm before the next begins, so that an interrupted investigation goes on where its lines end. What speaks
+against tables - an effect that no table takes out, nothing that the catalogue knows, too little to gain - is its text, no error.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from abbe.models.compensation.tables import Predicted
+from abbe.service.campaign_data.campaign_folder import from_store
+from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.capture.live import LiveFeed
+from abbe.service.clock import Clock
+from abbe.service.compensation.correct import check_promise
+from abbe.service.compensation.proposal_diff import compare, largest
+from abbe.service.compensation.proposals import Made, check_temperature, gather, make
+from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.session import DeviceUrls
+from abbe.service.discovery.changed_since import since_of
+from abbe.service.discovery.changed_words import changed_words
+from abbe.service.discovery.discover import discover, prepare
+from abbe.service.discovery.discovery_engine import search
+from abbe.service.discovery.discovery_states import entering
+from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.discovery.discovery_words import size_text, verdict_of
+from abbe.service.discovery.linear_change import linear_words
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.effects.model_book import REMEDIES, current, name_of
+from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.identification.table_removal import table_then
+from abbe.service.sequences.check import paced
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.verification.alarm_states import TRIES, Alarm, Doc, Kind, next_step
+
+BESIDE = 0.5
+"""What is left for another remedy than a table may be at most this share of what tables promise; above it that remedy comes first."""
+NO = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
+"""Answers, not faults: they are the alarm's text, and trying again would give the same."""
+
+Note = Callable[[Kind, Doc], Awaitable[Alarm]]
+"""Writes a line of the alarm; gives the alarm with it."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What an investigation works with. ``plan``: the full campaign, named anew for each try; ``live``: is shown what its paths read."""
+
+    site: Site
+    store: Store
+    plan: CampaignPlan
+    clock: Clock
+    progress: ProgressSink
+    control: Control = field(default_factory=Control)
+    """Who may pause and stop it."""
+    live: LiveFeed | None = None
+
+
+async def investigate(bench: Bench, alarm: Alarm, note: Note) -> None:
+    """Take an alarm as far as it goes: to a proposal that waits for approval, or to the reason why there is none.
+
+    Raises
+    ------
+    MachineInUse
+        Another process has the machine: no line was written for that, and the try does not count.
+    Stopped, Aborted
+        Asked for.
+    AbbeError, DriverError, OSError, ArithmeticError, ValueError
+        A device or the measurement failed. Lines that were written stay; the next call goes on behind them.
+    """
+    bench.control.now(State.RUNNING)
+    try:
+        while (step := next_step(alarm)) is not None:
+            await bench.control.gate()
+            alarm = await _STEPS[step](bench, alarm, note)
+    except NO as no:
+        await note(Kind.ENDED, {"text": f"no proposal: {no}", "code": no.code})
+
+
+async def _measured(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
+    tries = sum(s.kind is Kind.BEGUN for s in alarm.work) + 1
+    if tries > TRIES:
+        return await note(Kind.ENDED, {"text": f"no proposal: {TRIES} tries to measure the full campaign were not completed"})
+    again = "" if tries == 1 else ", anew: the last try was not completed"
+    plan = replace(bench.plan, name=f"alarm {alarm.number} {bench.clock.utc():%Y-%m-%d %H:%M:%S}")
+    site, manner = bench.site, Manner(control=bench.control, part=True, live=bench.live)
+    with alone(site.urls.cnc):
+        async with recovered_session(bench.store, site) as session:
+            # Only now: while another process has the machine nothing of this try has begun.
+            await note(Kind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
+            plan = paced(plan, site.max_feed_mm_min)
+            ids = await measure(session, bench.store, site, plan, progress=bench.progress, clock=bench.clock, manner=manner)
+    return await note(Kind.MEASURED, {"text": f"campaign {plan.name!r} is measured: {len(ids)} runs", "campaign": plan.name})
+
+
+async def _discovered(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
+    stopped = threading.Event()
+
+    def tell(progress: Progress) -> None:
+        if stopped.is_set() or bench.control.stopping:
+            raise Stopped("the search was stopped", "it is begun anew")
+        bench.progress(progress)
+
+    try:
+        number, finding = await asyncio.to_thread(_search, replace(bench, progress=tell), _campaign(alarm))
+    except asyncio.CancelledError:
+        stopped.set()  # the thread ends at its next word: a service that stops does not wait for the rest of the search
+        raise
+    _, word, told = verdict_of(finding)
+    names = ", ".join(f"{name_of(e)} {size_text(e)}" for e in finding["effects"])
+    changes = changed_words(finding)
+    doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {told}", changes) if t), "discovery": number}
+    return await note(Kind.DISCOVERED, doc | _against(finding, bench.store, bench.site.name))
+
+
+def _search(bench: Bench, campaign: str) -> tuple[int | None, dict[str, Any]]:
+    store = bench.store
+    measured = from_store(store, campaign)
+    book, since = current(store, bench.site.name), since_of(store, measured)
+    job = prepare(measured, catalogue(), book, table=table_then(store, measured), since=since)
+    journal = journal_of(store, job)
+    return journal.id, discover(job, journal, search, bench.progress)
+
+
+def _against(finding: dict[str, Any], store: Store, machine: str) -> Doc:
+    """Why a table could be the wrong answer to a finding (``against``, empty: it is not), and how much that is (``rms_um``, of readings).
+
+    What entered the machine's model is taken out of the readings before tables are made; what is named without that proof is in them.
+    """
+    gap = finding["gaps"].get("identify")
+    rms_um = 0.0 if gap is None else math.sqrt(max(gap["before_um"] ** 2 - gap["floor_um"] ** 2, 0.0))
+    record = current(store, machine)
+    known = {e["label"] for e in record.doc["effects"]} if record is not None else set()
+    wrong = [e for e in entering(finding) if e["remedy"] != "table" and e["label"] not in known]
+    why = [f"{name_of(e)} is a matter for {REMEDIES[e['remedy']]}: {e['remedy_text']}" for e in wrong]
+    if finding["verdict"] == "unknown":
+        why.append("something is missing in the model that the catalogue does not know, and a table would hide it")
+    unnamed = finding["verdict"] == "unknown" and not finding["effects"]
+    return {"against": "; ".join(why), "rms_um": rms_um, "unnamed": unnamed}
+
+
+async def _proposed(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
+    known = alarm.last(Kind.DISCOVERED)
+    assert known is not None
+    if known.doc["unnamed"]:
+        return await note(Kind.ENDED, {"text": f"no proposal: {known.doc['against']} ({known.doc['text']})"})
+
+    def agree(promised: Predicted) -> None:
+        check_promise(promised)
+        check_cause(promised, known.doc["against"], float(known.doc["rms_um"]))
+
+    made = await made_of(bench, _campaign(alarm), agree)
+    doc = {"proposal": made.number, "text": await asyncio.to_thread(promise_words, bench.store, made)}
+    if made.proposed.reasons:
+        return await note(Kind.ENDED, doc | {"text": f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"})
+    return await note(Kind.PROPOSED, doc | {"beside": known.doc["against"]})
+
+
+async def made_of(bench: Bench, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> Made:
+    """Solve a measured campaign and store what follows as a proposal, on the table that the controller has in force.
+
+    ``agree`` and ``by`` as in `proposals.make`, whose errors are raised as well as those of a device.
+    """
+    site, store = bench.site, bench.store
+    with alone(site.urls.cnc):
+        async with recovered_session(store, site, DeviceUrls(site.urls.cnc)) as session:
+            gathered = await gather(session.controller, store, site, campaign)
+            check_temperature(site, gathered.runs)
+            return await make(store, site, gathered, clock=bench.clock, progress=bench.progress, agree=agree, by=by)
+
+
+def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
+    """Refuse tables where what no table takes out is not small beside what they promise.
+
+    Raises
+    ------
+    TableRefused
+        The readings hold more than `BESIDE` of the promised gain that the tables' model does not explain.
+    """
+    gain_um = (promised.before_mm - promised.after_mm) * 1e3
+    if against and rms_um > BESIDE * gain_um:
+        raise TableRefused(f"{rms_um:.1f} µm rms of the readings are no matter for tables, which promise {gain_um:.1f} µm", against)
+
+
+def promise_words(store: Store, made: Made) -> str:
+    """A proposal that waits, as a sentence: what it promises with U (k = 2), its largest change, and what is not in the tables."""
+    p = made.proposed.predicted
+    gain, expanded = (p.before_mm - p.after_mm) * 1e3, 2e3 * p.u_model_mm
+    left_out = "".join(f"; not in the tables: {line}" for line in made.proposed.not_for_tables)
+    return (
+        f"proposal {made.number} waits for approval: {p.before_mm * 1e3:.1f} → {p.after_mm * 1e3:.1f} µm rms, better by "
+        f"{gain:.1f} ± {expanded:.1f} µm (U, k = 2); {largest(compare(store, made.number, 'ACTIVE'))}{linear_words(store, made)}{left_out}"
+    )
+
+
+def _campaign(alarm: Alarm) -> str:
+    measured = alarm.last(Kind.MEASURED)
+    if measured is None:
+        raise AbbeError(f"alarm {alarm.number} has no measured campaign")
+    return str(measured.doc["campaign"])
+
+
+_STEPS: dict[Kind, Callable[[Bench, Alarm, Note], Awaitable[Alarm]]] = {
+    Kind.MEASURED: _measured,
+    Kind.DISCOVERED: _discovered,
+    Kind.PROPOSED: _proposed,
+}

@@ -1,0 +1,75 @@
+"""Where a planned campaign is set up: every path in the machine's volume, numbered in the order of measuring."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.service.rendering.plots.isometric import Paper, Window, depth, draw_box, label_edges
+from abbe.service.rendering.svg import Svg
+
+F2 = NDArray[np.float64]
+
+WIDTH, HEIGHT = 760.0, 620.0
+MAX_POINTS = 400
+"""Points per drawn path: more cannot be told apart."""
+STYLES = {"bar": "c1", "line": "c2", "diagonal": "c3"}
+NAMES = {"bar": "ball-bar, its cup", "line": "laser along an axis", "diagonal": "laser along a body diagonal"}
+
+
+@dataclass(frozen=True, slots=True)
+class SetupPath:
+    """One planned measurement in space.
+
+    Parameters
+    ----------
+    number : int
+        Of its set-up.
+    kind : "bar", "line" or "diagonal"
+    words : str
+        What it is; shown when the pointer rests on it.
+    path_mm : array, shape (n, 3)
+        Commanded positions.
+    mount_mm : array, shape (3,)
+        Where the cup stands or the laser line starts.
+    """
+
+    number: int
+    kind: str
+    words: str
+    path_mm: F2
+    mount_mm: NDArray[np.float64]
+
+
+def setups_picture(stroke_mm: F2, paths: Sequence[SetupPath], *, key: str = "setups") -> str:
+    """Isometric view of the strokes with all paths and, at each set-up, its number.
+
+    Parameters
+    ----------
+    stroke_mm : array, shape (3, 2)
+        First and last position of X, Y, Z.
+    paths : sequence of SetupPath
+        In the order of measuring.
+    """
+    count = len({p.number for p in paths})
+    words = "; ".join(f"{p.number}: {p.words}" for p in paths)
+    svg = Svg(WIDTH, HEIGHT, key, f"{count} set-ups in the machine's volume", words)
+    low, high = stroke_mm[:, 0], stroke_mm[:, 1]
+    paper = Paper.around(low, high, Window((WIDTH / 2.0, HEIGHT / 2.0 - 14.0), WIDTH - 150.0, HEIGHT - 130.0))
+    draw_box(svg, paper, low, high)
+    middles = np.array([p.path_mm.mean(axis=0) for p in paths]).reshape(-1, 3)
+    for i in np.argsort(depth(middles), kind="stable"):  # far ones first, near ones over them
+        path = paths[int(i)]
+        thinned = path.path_mm[:: max(1, len(path.path_mm) // MAX_POINTS)]
+        svg.polyline([paper(point) for point in (*thinned, path.path_mm[-1])], f"s-{STYLES[path.kind]} thin")
+    for path in {p.number: p for p in reversed(paths)}.values():
+        x, y = paper(path.mount_mm)
+        svg.dot((x, y), 4.0, f"f-{STYLES[path.kind]}", path.words)
+        svg.text((x + 7.0, y - 5.0), path.number, "t-head t-halo")
+    label_edges(svg, paper, low, high)
+    used = [k for k in STYLES if any(p.kind == k for p in paths)]
+    svg.legend((30.0, HEIGHT - 12.0), [(f"s-{STYLES[k]}", NAMES[k]) for k in used])
+    return svg.render()

@@ -1,0 +1,126 @@
+"""A plane through the machine's volume: commanded grid, the same with its errors magnified, an arrow at each node where one is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.service.rendering.axes import Panel
+from abbe.service.rendering.numbers import MM, UM, Unit, placed, plain, tidy
+from abbe.service.rendering.palette import SEQUENCE
+from abbe.service.rendering.plots.isometric import round_down
+from abbe.service.rendering.svg import Svg
+
+Array = NDArray[np.float64]
+
+WIDTH, SIDE, LEFT, TOP, BOTTOM = 620.0, 420.0, 74.0, 52.0, 104.0
+MARGIN = 0.11
+"""Room for the magnified errors beside the strokes, as a share of the longer one."""
+HANDY = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+PLANES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
+"""Axes to the right, upwards and through the paper."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slice:
+    """Nodes of one plane, shape (a, b, 3), mm; deviation, µm; U (k = 2) of its length, µm, and whether that is exceeded, shape (a, b)."""
+
+    plane: str
+    grid_mm: Array
+    deviation_um: Array
+    expanded_um: Array
+    told: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """What the picture says, in the reader's language; places and errors in the reader's units."""
+
+    heading: str
+    nominal: str
+    actual: str
+    untold: str
+    magnified: str
+    place: Unit = MM
+    error: Unit = UM
+
+
+def colour_top(length: Array) -> float:
+    """Upper end of the colour scale that holds these lengths: five equal handy steps, at most a third longer than needed."""
+    longest = float(length.max()) if length.size else 0.0
+    if longest <= 0.0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(longest / SEQUENCE))
+    return SEQUENCE * power * next(m for m in HANDY if longest / SEQUENCE <= m * power * (1.0 + 1e-9))
+
+
+def magnification(span_mm: float, longest_um: float) -> float:
+    """Handy factor at which the longest error spans a tenth of the volume."""
+    return round_down(0.1 * span_mm / (longest_um * 1e-3)) if longest_um > 0.0 and span_mm > 0.0 else 1.0
+
+
+def slice_plot(data: Slice, top: float, magnified: float, words: Words, *, key: str = "slice") -> str:
+    """One plane. ``top``: upper end of the colours in the reader's unit; ``magnified``: mm drawn per mm of error."""
+    across, up, _ = PLANES[data.plane]
+    grid = data.grid_mm / words.place.size
+    low, high = grid[0, 0], grid[-1, -1]
+    size = max(float(high[across] - low[across]), float(high[up] - low[up]))
+    pad = MARGIN * size
+    scale = SIDE / (size + 2.0 * pad)
+    width, height = (float(high[a] - low[a] + 2.0 * pad) * scale for a in (across, up))
+    ranges = [(float(low[a] - pad), float(high[a] + pad)) for a in (across, up)]
+    panel = Panel(LEFT, TOP, width, height, ranges[0], ranges[1])
+    length = np.linalg.norm(data.deviation_um, axis=2) / words.error.size
+    sizes = f"{words.heading}: {plain(float(length.min()))} … {plain(float(length.max()))} {words.error.sign}"
+    svg = Svg(WIDTH, TOP + height + BOTTOM, key, words.heading, sizes)
+    svg.text((LEFT, 18.0), words.heading, "t-head")
+    svg.text((LEFT, 36.0), words.magnified, "t-soft")
+    panel.draw_x(svg, f"{'XYZ'[across]} {words.place.sign}", count=5)
+    panel.draw_y(svg, f"{'XYZ'[up]} {words.place.sign}", count=5)
+    actual = grid + data.deviation_um * 1e-3 * magnified / words.place.size
+    known = np.where(data.told[..., None], actual, np.nan)  # a line breaks where nobody knows where it runs
+    for nodes, style in ((grid, "hidden-edge"), (known, "s-c2 thin")):
+        for line in (*nodes, *np.swapaxes(nodes, 0, 1)):
+            svg.polyline([panel.at(float(p[across]), float(p[up])) for p in line], style)
+    _arrows(svg, panel, data, (grid, actual), top, words)
+    panel.draw_frame(svg)
+    _key(svg, TOP + height + 62.0, top, words)
+    return svg.render()
+
+
+def _arrows(svg: Svg, panel: Panel, data: Slice, ends: tuple[Array, Array], top: float, words: Words) -> None:
+    """From the first ends to the second."""
+    across, up, _ = PLANES[data.plane]
+    (grid, actual), unit = ends, words.error
+    for index in np.ndindex(data.told.shape):
+        node, error, expanded = grid[index], data.deviation_um[index] / unit.size, float(data.expanded_um[index]) / unit.size
+        foot = panel.at(float(node[across]), float(node[up]))
+        length = float(np.linalg.norm(error))
+        place = ", ".join(placed(float(v), words.place) for v in data.grid_mm[index])
+        tip = f"({place}) {words.place.sign}: {plain(length)} {unit.sign}, U = {plain(expanded, 2)} {unit.sign}"
+        if not data.told[index]:
+            svg.circle(foot, 4.0, "frame")
+            svg.dot(foot, 0.0, "key-head", tip)
+            continue
+        colour = 1 + min(SEQUENCE - 1, int(SEQUENCE * length / top))
+        svg.arrow(foot, panel.at(float(actual[index][across]), float(actual[index][up])), f"seq{colour}", tip)
+
+
+def _key(svg: Svg, y: float, top: float, words: Words) -> None:
+    """Colours with their numbers, and what the lines mean."""
+    cell, step = 52.0, top / SEQUENCE
+    for i in range(SEQUENCE):
+        svg.rect((LEFT + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")
+        svg.text((LEFT + i * cell, y + 23.0), tidy(i * step), "t-small", anchor="middle")
+    svg.text((LEFT + SEQUENCE * cell, y + 23.0), f"{tidy(top)} {words.error.sign}", "t-small", anchor="middle")
+    svg.circle((LEFT + SEQUENCE * cell + 56.0, y + 4.0), 4.0, "frame")
+    svg.text((LEFT + SEQUENCE * cell + 66.0, y + 9.0), words.untold, "t-small")
+    svg.legend((LEFT, y + 40.0), [("hidden-edge", words.nominal), ("s-c2", words.actual)])
+
+
+def steps(top: float) -> list[str]:
+    """Numbers at the ends of the five colours, in words."""
+    return [tidy(i * top / SEQUENCE) for i in range(SEQUENCE + 1)]

@@ -1,0 +1,111 @@
+"""A campaign's paths in the three views of a drawing: from above, from the front, from the side; strokes, set-ups, bars and cups."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.service.rendering.axes import Panel
+from abbe.service.rendering.numbers import MM, Unit
+from abbe.service.rendering.svg import Svg
+
+F2 = NDArray[np.float64]
+F1 = NDArray[np.float64]
+
+WIDTH, HEIGHT = 760.0, 760.0
+SIDE = 300.0
+MAX_POINTS = 600
+"""Points per drawn path: more cannot be told apart."""
+STYLES = {"bar": "c1", "laser": "c2"}
+VIEWS = ((0, 1, "from above"), (0, 2, "from the front"), (1, 2, "from the side"))
+CORNERS = ((70.0, 40.0), (70.0, 420.0), (450.0, 420.0))
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnTest:
+    """One test in space.
+
+    Parameters
+    ----------
+    order : int
+        Place in the campaign, from 1.
+    kind : "bar" or "laser"
+    words : str
+        What it is; shown when the pointer rests on it.
+    path_mm : array, shape (n, 3)
+        Commanded positions that are read, in order.
+    mount_mm : array, shape (3,)
+        Where the cup stands or the laser line starts.
+    radius_mm : float
+        Of the bar, 0 for a laser.
+    mounts : bool
+        Whether its set-up begins with it: its number is drawn.
+    """
+
+    order: int
+    kind: str
+    words: str
+    path_mm: F2
+    mount_mm: F1
+    radius_mm: float
+    mounts: bool
+
+
+def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views", unit: Unit = MM) -> str:
+    """The drawing: paths of all tests in three views with one scale, the strokes as frames, set-ups numbered in the order of measuring.
+
+    Parameters
+    ----------
+    stroke_mm : array, shape (3, 2)
+        First and last position of X, Y, Z.
+    tests : sequence of DrawnTest
+        In the order of measuring.
+    unit : Unit, optional
+        What the reader sees places in.
+    """
+    words = "; ".join(f"{t.order}: {t.words}" for t in tests)
+    svg = Svg(WIDTH, HEIGHT, key, f"Paths of {len(tests)} tests in three views", words)
+    size = float((stroke_mm[:, 1] - stroke_mm[:, 0]).max()) * 1.04
+    for (a, b, title), corner in zip(VIEWS, CORNERS, strict=True):
+        middle = stroke_mm.mean(axis=1)
+        low = middle - 0.5 * size
+        panel = Panel(*corner, SIDE, SIDE, (low[a], low[a] + size), (low[b], low[b] + size))
+        _draw_scales(svg, panel, (a, b), unit)
+        svg.text((corner[0], corner[1] - 8.0), title, "t-head")
+        first, last = panel.at(stroke_mm[a, 0], stroke_mm[b, 1]), panel.at(stroke_mm[a, 1], stroke_mm[b, 0])
+        svg.rect(first, (last[0] - first[0], last[1] - first[1]), "ring-zero", "strokes")
+        for test in tests:
+            _draw(svg, panel, test, (a, b))
+        for test in tests:
+            if test.mounts:
+                x, y = panel.at(test.mount_mm[a], test.mount_mm[b])
+                svg.dot((x, y), 4.0, f"f-{STYLES[test.kind]}", test.words)
+                svg.text((x + 6.0, y - 5.0), test.order, "t-head t-halo")
+    names = {"bar": "ball-bar: path, its bar, cup", "laser": "laser: path, where it starts"}
+    used = [k for k in STYLES if any(t.kind == k for t in tests)]
+    svg.legend((450.0, 70.0), [(f"s-{STYLES[used[0]]}", names[used[0]])] if used else [])
+    if len(used) > 1:
+        svg.legend((450.0, 92.0), [(f"s-{STYLES[used[1]]}", names[used[1]])])
+    svg.text((450.0, 120.0), "grey frame: strokes of the axes", "t-small")
+    return svg.render()
+
+
+def _draw_scales(svg: Svg, panel: Panel, plane: tuple[int, int], unit: Unit) -> None:
+    """Grid and numbers at round values of the reader's unit."""
+    (x_low, x_high), (y_low, y_high) = ((low / unit.size, high / unit.size) for low, high in (panel.x_range, panel.y_range))
+    scaled = replace(panel, x_range=(x_low, x_high), y_range=(y_low, y_high))
+    scaled.draw_x(svg, f"{'XYZ'[plane[0]]} {unit.sign}")
+    scaled.draw_y(svg, f"{'XYZ'[plane[1]]} {unit.sign}")
+
+
+def _draw(svg: Svg, panel: Panel, test: DrawnTest, plane: tuple[int, int]) -> None:
+    a, b = plane
+    path = test.path_mm[:: max(1, len(test.path_mm) // MAX_POINTS)]
+    svg.polyline([panel.at(p[a], p[b]) for p in (*path, test.path_mm[-1])], f"s-{STYLES[test.kind]} thin")
+    if test.radius_mm:
+        end = test.path_mm[0]
+        svg.line(panel.at(test.mount_mm[a], test.mount_mm[b]), panel.at(end[a], end[b]), "key")
+        svg.dot(panel.at(end[a], end[b]), 2.5, "key-head", f"{test.order}: the bar where its path begins")

@@ -1,0 +1,129 @@
+"""The machine's volume in isometric view, with an arrow for the error at every node.
+
+Before and after are drawn with one exaggeration and one colour scale: a picture in which each side is scaled to fill its box would hide
+the improvement.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.service.rendering.axes import nice_step, round_up
+from abbe.service.rendering.model import ArrowField
+from abbe.service.rendering.numbers import plain, tidy
+from abbe.service.rendering.palette import SEQUENCE
+from abbe.service.rendering.plots.isometric import Paper, Window, depth, draw_box, label_edges, round_down
+from abbe.service.rendering.svg import Svg
+
+F2 = NDArray[np.float64]
+
+WIDTH, HEIGHT = 500.0, 450.0
+MAX_ARROWS = 420
+"""More arrows than this are a thicket; nodes are then thinned out evenly (the figures still use all of them)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrowScale:
+    """What both pictures share. ``exaggeration``: mm drawn per mm of error; ``top_um``: length at the upper end of the colours."""
+
+    exaggeration: float
+    top_um: float
+
+
+def common_scale(*fields: ArrowField) -> ArrowScale:
+    """Scale at which the longest arrow of all fields spans at most a sixth of the volume's diagonal."""
+    lengths = [_lengths(f) for f in fields]
+    longest = max((float(np.nanmax(v)) for v in lengths if np.isfinite(v).any()), default=0.0)
+    diagonal = max((_diagonal(f.grid_mm) for f in fields), default=0.0)
+    if longest <= 0.0 or diagonal <= 0.0:
+        return ArrowScale(1.0, 1.0)
+    step = round_up(longest / SEQUENCE)
+    return ArrowScale(round_down(0.16 * diagonal / (longest * 1e-3)), SEQUENCE * step)
+
+
+def volume_arrows(field: ArrowField, scale: ArrowScale, *, key: str, heading: str) -> str:
+    """One volume with its arrows, scale key and figures.
+
+    Parameters
+    ----------
+    field : ArrowField
+        Nodes (n, 3) in mm and deviations (n, 3) in µm.
+    scale : ArrowScale
+        From ``common_scale``, shared by all pictures that are to be compared.
+    key : str
+        Identifier, unique in the page.
+    heading : str
+        Words above the picture.
+    """
+    lengths = _lengths(field)
+    good = lengths[np.isfinite(lengths)]
+    longest = float(good.max()) if good.size else math.nan
+    rms = float(np.sqrt(np.mean(good**2))) if good.size else math.nan
+    figures = f"longest {plain(longest)} µm, rms {plain(rms)} µm over {good.size} nodes"
+    svg = Svg(
+        WIDTH, HEIGHT, key, f"Volumetric error, {heading}", f"Isometric view of the machine volume with an error arrow per node: {figures}."
+    )
+    svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
+    svg.text((WIDTH / 2.0, 36.0), figures, "t-soft", anchor="middle")
+    finite_grid = field.grid_mm[np.isfinite(field.grid_mm).all(axis=1)] if field.grid_mm.size else field.grid_mm
+    if finite_grid.size:
+        low, high = finite_grid.min(axis=0), finite_grid.max(axis=0)
+        # Arrows at the faces leave the box: the margin leaves them room.
+        window = Window((WIDTH / 2.0, 58.0 + (HEIGHT - 110.0) / 2.0), WIDTH - 120.0, HEIGHT - 178.0)
+        paper = Paper.around(low, high, window)
+        draw_box(svg, paper, low, high)
+        _draw_arrows(svg, paper, field, scale)
+        label_edges(svg, paper, low, high)
+        _draw_key(svg, paper, scale)
+    return svg.render()
+
+
+def volume_pair(before: ArrowField | None, after: ArrowField | None, *, key: str = "volume") -> list[str]:
+    """Before and after at one scale; a side without data is left out."""
+    sides = [(before, "before"), (after, "after")]
+    scale = common_scale(*(f for f, _ in sides if f is not None))
+    return [volume_arrows(f, scale, key=f"{key}-{name}", heading=f"{name.capitalize()} correction") for f, name in sides if f is not None]
+
+
+def _draw_arrows(svg: Svg, paper: Paper, field: ArrowField, scale: ArrowScale) -> None:
+    lengths = _lengths(field)
+    order = np.argsort(depth(field.grid_mm), kind="stable")  # far ones first, near ones over them
+    for i in order[:: max(1, math.ceil(order.size / MAX_ARROWS))]:
+        if not (np.isfinite(lengths[i]) and np.isfinite(field.grid_mm[i]).all()):
+            continue
+        node, error = field.grid_mm[i], field.deviation_um[i]
+        colour = 1 + min(SEQUENCE - 1, int(SEQUENCE * lengths[i] / scale.top_um))
+        place = ", ".join(tidy(float(v)) for v in node)
+        parts = ", ".join(plain(float(v)) for v in error)
+        tip = f"({place}) mm: ({parts}) µm, length {plain(float(lengths[i]))} µm"
+        svg.arrow(paper(node), paper(node + error * 1e-3 * scale.exaggeration), f"seq{colour}", tip)
+
+
+def _draw_key(svg: Svg, paper: Paper, scale: ArrowScale) -> None:
+    step = scale.top_um / SEQUENCE
+    x, y, cell = 24.0, HEIGHT - 34.0, 46.0
+    for i in range(SEQUENCE):
+        svg.rect((x + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")
+        svg.text((x + i * cell, y + 23.0), tidy(i * step), "t-small", anchor="middle")
+    svg.text((x + SEQUENCE * cell, y + 23.0), f"{tidy(scale.top_um)} µm", "t-small", anchor="middle")
+    # Arrows lie askew in space; the key is a length in the plane of the paper, as every arrow parallel to it is drawn.
+    bar = nice_step(scale.top_um, 3)
+    length = bar * 1e-3 * scale.exaggeration * paper.zoom
+    right = WIDTH - 24.0
+    svg.line((right - length, y + 5.0), (right, y + 5.0), "key")
+    for end in (right - length, right):
+        svg.line((end, y + 1.0), (end, y + 9.0), "key")
+    svg.text((right, y + 23.0), f"{tidy(bar)} µm (errors drawn {tidy(scale.exaggeration)} ×)", "t-small", anchor="end")
+
+
+def _lengths(field: ArrowField) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.norm(field.deviation_um.reshape(-1, 3), axis=1), dtype=np.float64)
+
+
+def _diagonal(grid: F2) -> float:
+    finite_grid = grid[np.isfinite(grid).all(axis=1)] if grid.size else grid
+    return float(np.linalg.norm(np.ptp(finite_grid, axis=0))) if finite_grid.size else 0.0

@@ -1,0 +1,68 @@
+"""The picture of a dry run: from a plan to a page."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from abbe.models.machine import AXES, Machine
+from abbe.service.rendering.dry_page import DryPage, render_dry
+from abbe.service.rendering.numbers import MM, Unit
+from abbe.service.rendering.plots.views import DrawnTest, three_views
+from abbe.service.sequences.check import DryRun
+from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, Point, ReadBar, ReadLaser, RecordPath, TestPlan
+
+NAMES = {
+    "ballbar_helix": "ball-bar helix",
+    "ballbar_circle": "ball-bar circle",
+    "laser_diagonal": "laser diagonal",
+    "laser_linear": "laser line",
+}
+
+
+def dry_page(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> str:
+    """The page of a checked plan: paths in three views with strokes, set-ups, bars and cups, and a row for each test."""
+    seconds, readings = sum(r.duration_s for r in runs), sum(r.readings for r in runs)
+    used = [f"{AXES[a]} {min(r.lowest_mm[a] for r in runs):.0f} to {max(r.highest_mm[a] for r in runs):.0f} mm" for a in range(3)]
+    mounted = sum(t.mounts for t in plan.tests)
+    lead = (
+        f"{name}: {len(runs)} tests in {mounted} set-ups, {seconds / 60.0:.1f} min of machine time, {readings} readings.",
+        f"Strokes used: {', '.join(used)}. Largest speed {max(r.fastest_mm_min for r in runs):.0f} mm/min.",
+    )
+    headings = ("No", "Test", "Set-up", "Kind", "s", "path mm", "X mm", "Y mm", "Z mm", "mm/min", "readings")
+    rows = tuple(_row(k, test, run) for k, (test, run) in enumerate(zip(plan.tests, runs, strict=True), start=1))
+    return render_dry(DryPage(f"Dry run: {plan.name}", lead, headings, rows, picture(machine, plan)))
+
+
+def picture(machine: Machine, plan: CampaignPlan, unit: Unit = MM) -> str:
+    """The paths of a plan in three views with strokes, set-ups, bars and cups, as SVG; ``unit``: of its axes."""
+    return three_views(machine.stroke_mm, [_drawn(k, test) for k, test in enumerate(plan.tests, start=1)], unit=unit)
+
+
+def _row(k: int, test: TestPlan, run: DryRun) -> tuple[str, ...]:
+    extent = (f"{run.lowest_mm[a]:.0f} to {run.highest_mm[a]:.0f}" for a in range(3))
+    numbers = (f"{run.duration_s:.0f}", f"{run.path_mm:.0f}", *extent, f"{run.fastest_mm_min:.0f}", str(run.readings))
+    return (str(k), run.label, str(test.setup["setup_id"]), NAMES.get(run.test, run.test), *numbers)
+
+
+def _drawn(order: int, test: TestPlan) -> DrawnTest:
+    bar = test.test.startswith("ballbar")
+    path = np.array(_read_places(test))
+    mount = np.array(test.setup["centre_mm"] if bar else test.setup["start_mm"], dtype=np.float64)
+    radius = float(test.setup["radius_mm"]) if bar else 0.0
+    hung = ", bar hung in here" if any(isinstance(s, MountBar) for s in test.steps) else ""
+    words = f"{test.label}: {NAMES.get(test.test, test.test)}{hung}"
+    return DrawnTest(order, "bar" if bar else "laser", words, path, mount, radius, test.mounts)
+
+
+def _read_places(test: TestPlan) -> list[Point]:
+    """Where something is read, in order: the paths that are recorded, the places of single readings."""
+    out: list[Point] = []
+    here: Point | None = None
+    for step in test.steps:
+        if isinstance(step, MoveTo):
+            here = step.target_mm
+        elif isinstance(step, RecordPath):
+            out += step.points_mm
+        elif isinstance(step, ReadLaser | ReadBar) and here is not None:
+            out.append(here)
+    return out

@@ -1,0 +1,132 @@
+"""One report of anything that is stored, or of a campaign folder: which one is meant, and in which form it is written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
+from abbe.service.config_schema import MachineFile
+from abbe.service.errors import FileFormatError, NotStored, StoreError
+from abbe.service.rendering.document import Document
+from abbe.service.rendering.document_data import document_csv, document_json
+from abbe.service.rendering.document_page import document_html, document_pdf
+from abbe.service.rendering.page_file import write_page
+from abbe.service.report.report_discovery import discovery_report
+from abbe.service.report.report_done import push_report, verification_report
+from abbe.service.report.report_measured import Measured, campaign_report, run_report
+from abbe.service.report.report_parts import Rules
+from abbe.service.report.report_table import table_said
+from abbe.service.report.report_then import of_then
+from abbe.service.runs.columns import load_run
+from abbe.service.storage.records import CampaignRecord, RunRecord
+from abbe.service.storage.store import Store
+
+FORMS: dict[str, Callable[[Document], str | bytes]] = {
+    ".pdf": document_pdf,
+    ".html": document_html,
+    ".csv": document_csv,
+    ".json": document_json,
+}
+NUMBERED = ("push", "discovery", "verification")
+
+
+def rules_of(config: MachineFile | None) -> Rules:
+    """What a machine file adds: limits of the check, certificates, allowed temperature. Nothing without a file."""
+    if config is None:
+        return Rules()
+    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
+    days = {"ballbar": config.calibration.ballbar, "laser": config.calibration.laser}
+    return Rules(limits, {k: v for k, v in days.items() if v is not None}, config.limits.temperature_c)
+
+
+def numbered_report(store: Store, what: str, number: int, rules: Rules, machine: str | None = None) -> Document:
+    """Report of push, discovery or verification ``number``; ``machine``: whose push, where several machines have one.
+
+    Raises
+    ------
+    NotStored
+        There is none.
+    StoreError
+        Several machines have a push of this number.
+    """
+    if what == "discovery":
+        return discovery_report(store, number, rules)
+    if what == "verification":
+        return verification_report(store, number, rules)
+    names = list(dict.fromkeys(m.name for m in store.machines())) if machine is None else [machine]
+    chains = {store.push_chain(n): n for n in names}  # machines that were renamed share one
+    having = [n for chain, n in chains.items() if any(e.push == number for e in store.push_entries_of(chain))]
+    if len(having) != 1:
+        if not having:
+            raise NotStored(f"no push {number} in the database", "abbe correct pushes tables; pushes count from 1")
+        raise StoreError(f"machines {', '.join(having)} each have a push {number}", "say of which machine: --of NAME")
+    return push_report(store, having[0], number, rules)
+
+
+def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules) -> Document:
+    """Report of a stored run or campaign."""
+    if isinstance(record, CampaignRecord):
+        found = _measured(store, record.name)
+        return of_then(campaign_report(found, rules), store, found.campaign.site.name, record.created_utc, found.campaign.runs)
+    campaign = from_store(store, record.campaign)
+    if all(r["run_id"] != record.label for r in campaign.runs):  # incomplete: what is there is reported and said to be so
+        campaign = Campaign(campaign.name, campaign.site, [*campaign.runs, load_run(store, record.id)], None, campaign.doc)
+    facts = {"Started": record.started_utc, "Ended": record.ended_utc or "not ended"}
+    runs = [r for r in campaign.runs if r["run_id"] == record.label]
+    table = table_said(store, campaign.site.name, runs)
+    document = run_report(Measured(campaign, facts, [_state(record)], table=table), record.label, rules)
+    return of_then(document, store, campaign.site.name, record.started_utc, runs)
+
+
+def folder_report(folder: Path, rules: Rules) -> Document:
+    """Report of a campaign folder that nobody has imported: figures of the standards; there is no solution with it."""
+    return campaign_report(Measured(from_folder(folder)), rules)
+
+
+def _measured(store: Store, name: str) -> Measured:
+    record = store.campaign(name)
+    runs = store.runs(record.id)
+    facts = {"Created": record.created_utc}
+    if runs:
+        ends = [r.ended_utc for r in runs if r.ended_utc]
+        facts |= {"First run started": min(r.started_utc for r in runs)} | ({"Last run ended": max(ends)} if ends else {})
+    solution = next(((s.id, s.doc) for s in reversed(store.solutions(record.id)) if "mean_over_volume" in s.doc), None)
+    campaign = from_store(store, name)
+    table = table_said(store, campaign.site.name, campaign.runs)
+    return Measured(campaign, facts, [_state(r) for r in runs], solution, table)
+
+
+def _state(run: RunRecord) -> tuple[str, ...]:
+    return run.label, run.test, run.role, run.visible_status, run.reason
+
+
+def default_name(document: Document) -> str:
+    """File name of a report that nobody has named: its title in letters, digits and dashes."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", document.title).strip("-").lower()[:60] + ".pdf"
+
+
+def form_of(target: Path) -> Callable[[Document], str | bytes]:
+    """How a file of this name is written.
+
+    Raises
+    ------
+    FileFormatError
+        Its ending is none of ours.
+    """
+    try:
+        return FORMS[target.suffix.lower()]
+    except KeyError:
+        raise FileFormatError(f"{target}: a report is written as {', '.join(FORMS)}", "give a file with one of these endings") from None
+
+
+def write_report(document: Document, target: Path) -> None:
+    """Write a report whole or not at all; the file's ending says how.
+
+    Raises
+    ------
+    FileFormatError
+        Another ending, or the file cannot be written.
+    """
+    write_page(form_of(target)(document), target)

@@ -1,0 +1,107 @@
+"""Report of a stored discovery: what the model lacks, how large it is, what proves it, what else it could be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from abbe.service.campaign_data.campaign_folder import from_store
+from abbe.service.campaign_data.decimation import thinned
+from abbe.service.discovery.discovery_states import taken_back
+from abbe.service.discovery.discovery_words import book_lines, rival_lines, unit
+from abbe.service.effects.model_book import name_of
+from abbe.service.errors import StoreError
+from abbe.service.rendering.discovery_model import DiscoveryPage
+from abbe.service.rendering.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.rendering.numbers import NOT_AVAILABLE, plain
+from abbe.service.rendering.plots.gap import gap_bars, place_plot, trace_plot
+from abbe.service.report import report_parts as parts
+from abbe.service.report.discovery_pages import discovery_page
+from abbe.service.report.report_parts import Rules
+from abbe.service.storage.store import Store
+
+SIGNS: dict[str, Sign] = {"ok": "ok", "open": "open", "bad": "bad"}
+
+
+def discovery_report(store: Store, number: int, rules: Rules) -> Document:
+    """A discovery as it was stored; nothing is searched again.
+
+    Raises
+    ------
+    StoreError
+        There is no such discovery, or it has not found anything yet.
+    """
+    record = store.discovery(number)
+    steps = store.discovery_steps(number)
+    finding = next((taken_back(s.doc["finding"]) for s in steps if "finding" in s.doc), None)
+    if finding is None:
+        raise StoreError(f"discovery {number} has not ended", "give the same abbe discover command again: it goes on there")
+    name = next(c.name for c in store.campaigns() if c.id == record.campaign_id)
+    campaign = from_store(store, name)
+    first = steps[0].doc
+    states = [(s.state, str(s.doc.get("why", ""))) for s in steps]
+    told = {"title": "", "flags": list(first.get("flags", [])), "states": states, "provenance": {}}
+    page = discovery_page(finding, thinned(campaign.runs), {}, told)
+    condition, remarks = parts.conditions(campaign.runs, rules)
+    made = {str(k): str(v) for k, v in (first.get("versions") or {}).items()}
+    sign, word, text = page.verdict
+    return Document(
+        kind="discovery",
+        title=f"Discovery {number}: what the simulation of {campaign.site.name} lacks",
+        about=parts.machine_facts(campaign.site.doc)
+        | {"Campaign": name, "Begun": record.created_utc, "Ended": steps[-1].utc, "State": steps[-1].state}
+        | {"Present model": ", ".join(first.get("present_model", []))},
+        verdict=(SIGNS[sign], word, text),
+        figures=_figures(finding),
+        instruments=parts.instruments(campaign.runs, campaign.doc, rules),
+        conditions=condition,
+        not_observable=_open(finding, page),
+        remarks=[*told["flags"], *book_lines(finding), *remarks],
+        statements=["U of a named effect is that of its refit together with everything else that these runs leave free."],
+        provenance=parts.provenance(parts.data_digest(campaign.runs), made) | {"Search (SHA-256)": record.digest},
+        tables=_tables(page),
+        pictures=_pictures(page),
+    )
+
+
+def _figures(finding: dict[str, Any]) -> list[Figure]:
+    out = []
+    for e in finding["effects"]:
+        group = f"Effect: {name_of(e)}"
+        out.append(Figure(group, e["label"], e["title"], e["strength"], e["u_strength"], unit(e["unit"]), e["source"]))
+        out += [
+            Figure(group, n, n.replace("_", " "), p.get("value"), p.get("u"), unit(p.get("unit", ""))) for n, p in e["parameters"].items()
+        ]
+    for role, gap in finding["gaps"].items():
+        for key, words in (("before", "measured minus simulated, rms"), ("after", "the same with what was found"), ("floor", "noise")):
+            out.append(Figure(f"Gap of the {role} runs", key, words, gap.get(f"{key}_um"), None, "µm"))
+    return out
+
+
+def _open(finding: dict[str, Any], page: DiscoveryPage) -> list[str]:
+    out = ["these runs cannot tell it from: " + ", ".join(finding["confounded_with"])] if finding["confounded_with"] else []
+    out += [f"{name_of(e)} could also be: {line}" for e in finding["effects"] for line in rival_lines(e)]
+    return out + list(page.next_test)
+
+
+def _tables(page: DiscoveryPage) -> list[TextTable]:
+    runs = [(r.label, r.test, r.role, str(r.readings), plain(r.before_um), plain(r.after_um), plain(r.floor_um)) for r in page.runs]
+    out = [TextTable("Runs", ("Run", "Test", "Role", "Readings", "Before, µm", "After, µm", "Noise, µm"), runs)]
+    out.append(TextTable("How it was decided", ("State", "Why"), page.states))
+    if page.changed:
+        out.append(TextTable("What has changed", ("Compared with the solution from before",), [(line.strip(),) for line in page.changed]))
+    if page.effects:
+        cards = [(c.name, c.where or NOT_AVAILABLE, c.do) for c in page.effects]
+        out.append(TextTable("What to do", ("Effect", "Where", "What to do at the machine"), cards))
+    if page.rejected:
+        out.append(TextTable("Looked at and rejected", ("Effect", "Why"), page.rejected))
+    return out
+
+
+def _pictures(page: DiscoveryPage) -> list[Picture]:
+    out = [Picture("Gap of every run before and after, against its noise.", gap_bars(page.runs), wide=True)] if page.runs else []
+    for i, t in enumerate(page.traces):
+        out.append(Picture(f"Run {t.label} against {t.x_label}: {t.why}.", trace_plot(t, key=f"trace-{i}"), wide=True))
+    for i, p in enumerate(page.places):
+        words = f"Where the gap lives, {p.x_axis}{p.y_axis}: rms over the noise."
+        out.append(Picture(words, place_plot(p, key=f"place-{i}")))
+    return out

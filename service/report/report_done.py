@@ -1,0 +1,217 @@
+"""Reports of what was done: a stored verification, and a push with its whole journal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from abbe.models.compensation.tables import NineTables
+from abbe.service.campaign_data.campaign_folder import Campaign, from_store
+from abbe.service.errors import NotStored, TableMismatch
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import WORD, Entry, JournalBroken, check_chain, facts
+from abbe.service.push.states import TERMINAL, State
+from abbe.service.rendering.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.rendering.model import TableCurve
+from abbe.service.rendering.plots.tables import table_plot
+from abbe.service.report import report_parts as parts
+from abbe.service.report.report_parts import Doc, Rules
+from abbe.service.report.report_table import table_said
+from abbe.service.report.report_then import of_then
+from abbe.service.storage.records import VerificationRecord
+from abbe.service.storage.store import Store
+from abbe.service.tables.nine_tables import tables_from_image
+from abbe.service.tables.push_history import push_log
+from abbe.service.verification.iso_report import Evaluated, evaluate
+from abbe.service.verification.verify import COVERAGE
+
+MANY = 10**6
+AXES = "XYZ"
+VERDICTS: dict[str, tuple[Sign, str]] = {"pass": ("ok", "Passed"), "fail": ("bad", "Failed")}
+ENDS: dict[State, tuple[Sign, str]] = {
+    State.KEEP: ("ok", "Kept"),
+    State.ACCEPTED: ("open", "Accepted by a person"),
+    State.ROLLED_BACK: ("bad", "Taken back: the old table is in force"),
+    State.REJECTED: ("open", "Refused: nothing was written"),
+    State.ABORTED: ("open", "Never in force: the old table stayed"),
+    State.OPERATOR: ("bad", "A person has to look"),
+}
+
+
+def verification_report(store: Store, number: int, rules: Rules) -> Document:
+    """A stored verification with the runs that it rests on.
+
+    Raises
+    ------
+    NotStored
+        There is none of this number.
+    """
+    record = next((v for v in store.verifications(limit=MANY) if v.id == number), None)
+    if record is None:
+        raise NotStored(f"no verification {number} in the database", "abbe serve and abbe correct store verifications; count from 1")
+    machine = store.machine(record.machine_id)
+    campaign = None if record.campaign_id is None else from_store(store, store.campaign(record.campaign_id).name)
+    runs = [] if campaign is None else campaign.runs
+    told = Evaluated() if campaign is None else evaluate(runs, campaign.doc.get("instruments"))
+    table = table_said(store, machine.name, runs)
+    figures = verification_figures(record, rules)
+    condition, remarks = parts.conditions(runs, rules)
+    about = parts.machine_facts(machine.doc) | {"Verification": str(number), "Decided": record.utc}
+    about |= {"Campaign": campaign.name} if campaign is not None else {}
+    about |= _occasion(record.doc)
+    sign, word = VERDICTS.get(record.verdict, ("open", record.verdict[:1].upper() + record.verdict[1:]))
+    verdict = (sign, word, str(record.doc.get("text", "")))
+    verdict = verdict if record.verdict == "fail" else table.verdict(verdict)  # a no needs no other
+    document = Document(
+        kind="verification",
+        title=f"Verification {number} of {machine.name}",
+        about=about,
+        verdict=verdict,
+        figures=[*figures, *told.figures],
+        instruments=_instruments(campaign, rules),
+        conditions=condition,
+        not_observable=told.not_observable if campaign is not None else ["its readings: no campaign is stored with it"],
+        remarks=[*table.remarks, *told.remarks, *remarks],
+        statements=[parts.VERIFICATION_STATEMENT, *told.statements],
+        provenance=parts.provenance(parts.data_digest(runs) if runs else parts.doc_digest(record.doc)),
+        pictures=told.pictures,
+    )
+    return of_then(document, store, machine.name, str(record.doc.get("started_utc") or record.utc), runs)
+
+
+def verification_figures(record: VerificationRecord, rules: Rules) -> list[Figure]:
+    """The figures that a verification was decided by, with limits: those stored with it, else the machine file's."""
+    rows = _stored_rows(record.doc)
+    limits = record.doc.get("limits") or rules.limits_um
+    return parts.judged(rows, Rules({k: float(v) for k, v in limits.items() if v is not None}), f"Verification {record.id}")[0]
+
+
+def _stored_rows(doc: Doc) -> dict[str, tuple[float, float]]:
+    """Figures and standard uncertainties, µm: as a correction stores them, or as a scheduled check does (with expanded ones)."""
+    if "figures" in doc:
+        return {k: (float(v["value"]), float(v["u"])) for k, v in doc["figures"].items()}
+    expanded = doc.get("uncertainties") or {}
+    rows = {k: (v, expanded.get(k)) for k, v in (doc.get("values") or {}).items()}
+    return {k: (float(v), math.nan if u is None else float(u) / COVERAGE) for k, (v, u) in rows.items() if v is not None}
+
+
+def _occasion(doc: Doc) -> dict[str, str]:
+    """Why it was measured: after a push, or because a schedule said so."""
+    names = {"push": "Of push", "schedule": "Schedule", "recipe": "Recipe", "slot_utc": "Due"}
+    return {name: str(doc[key]) for key, name in names.items() if doc.get(key) is not None}
+
+
+def _instruments(campaign: Campaign | None, rules: Rules) -> Any:
+    return [] if campaign is None else parts.instruments(campaign.runs, campaign.doc, rules)
+
+
+def push_report(store: Store, machine: str, number: int, rules: Rules) -> Document:
+    """A push: which table on which base, who agreed, every transition of its journal, and the verification that decided.
+
+    Raises
+    ------
+    NotStored
+        The machine has no push of this number.
+    """
+    entries = read_entries(store, machine)
+    journal = tuple(e for e in entries if e.push == number != WORD)
+    if not journal:
+        raise NotStored(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {WORD})}, counted from 1")
+    known = facts(journal)
+    machine = str(known.get("machine", machine))  # as it was called then
+    doc = _machine_doc(store, machine)
+    verified = [v for v in store.verifications(limit=MANY) if _is_of(store, v, machine, number)]
+    campaigns = [from_store(store, store.campaign(v.campaign_id).name) for v in verified if v.campaign_id is not None]
+    runs = [r for c in campaigns for r in c.runs]
+    condition, remarks = parts.conditions(runs, rules) if runs else ({}, [])
+    tables = _tables(str(known.get("image", "")))
+    document = Document(
+        kind="push",
+        title=f"Push {number} into {machine}",
+        about=parts.machine_facts(doc) | _about(store, journal, known),
+        verdict=_verdict(journal, known),
+        figures=[f for v in verified for f in verification_figures(v, rules)] + _sizes(tables),
+        instruments=[i for c in campaigns[:1] for i in parts.instruments(c.runs, c.doc, rules)],
+        conditions=condition,
+        not_observable=[] if verified else ["whether the machine became better: no verification is stored for this push"],
+        remarks=[*_chain(entries), *remarks],
+        statements=[
+            "Corrections are what the controller adds to the command, as the independent decoder reads them; they have no U of their own."
+        ],
+        provenance=parts.provenance(parts.doc_digest([e.digest for e in journal]))
+        | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": str(known.get("meaning", ""))},
+        tables=[
+            TextTable(
+                "Journal", ("Entry", "What happened"), [(str(e.seq), line) for e, line in zip(journal, push_log(journal), strict=True)]
+            )
+        ],
+        pictures=[]
+        if tables is None
+        else [Picture("The new table: what is added to the command.", table_plot(_curves(tables)), wide=True)],
+    )
+    return of_then(document, store, machine, journal[-1].utc, []) if journal[-1].state is State.KEEP else document
+
+
+def _is_of(store: Store, record: VerificationRecord, machine: str, push: int) -> bool:
+    return record.doc.get("push") == push and store.machine(record.machine_id).name == machine
+
+
+def _machine_doc(store: Store, machine: str) -> Doc:
+    """The latest description of the machine."""
+    return next(m.doc for m in reversed(store.machines()) if m.name == machine)
+
+
+def _about(store: Store, journal: Sequence[Entry], known: Doc) -> dict[str, str]:
+    out = {"Begun": journal[0].utc, "Last entry": journal[-1].utc, "State": str(journal[-1].state)}
+    if "crc" in known:
+        out["New table"] = f"CRC {known['crc']:08X}, bank {known['target']}"
+        out["Table before"] = f"CRC {known['base_crc']:08X}, bank {known['base_bank']}"
+    if known.get("table"):
+        table = store.table(int(known["table"]))
+        out["Stored as"] = f"table {table.id}" + ("" if table.solution_id is None else f", from solution {table.solution_id}")
+    out["Capability of the control"] = f"level {known.get('level', 'unknown')}" + (", a person is there" if known.get("attended") else "")
+    for key, name in (("approved_by", "Approved by"), ("probe", "Proof of sign, axis and unit"), ("verify", "Verification")):
+        if known.get(key):
+            out[name] = str(known[key])
+    return out
+
+
+def _verdict(journal: Sequence[Entry], known: Doc) -> tuple[Sign, str, str]:
+    state = journal[-1].state
+    sign, word = ENDS.get(state, ("open", "Not ended"))
+    reasons = "; ".join(str(r) for r in known.get("reasons", []))
+    why = str(known.get("why") or known.get("verify") or reasons or "")
+    return sign, word, (why or f"it stands at {state}") + ("" if state in TERMINAL else f" (state {state})")
+
+
+def _chain(entries: Sequence[Entry]) -> list[str]:
+    try:
+        check_chain(entries)
+    except JournalBroken as error:
+        return [f"THE JOURNAL WAS CHANGED: {error}"]
+    return []
+
+
+def _tables(image: str) -> NineTables | None:
+    try:
+        return tables_from_image(bytes.fromhex(image)) if image else None
+    except (TableMismatch, ValueError):
+        return None
+
+
+def _curves(tables: NineTables) -> list[TableCurve]:
+    return [TableCurve(AXES[a], AXES[i], tables.position_mm[a], tables.correction_mm[a][:, i] * 1e3) for a in range(3) for i in range(3)]
+
+
+def _sizes(tables: NineTables | None) -> list[Figure]:
+    if tables is None:
+        return []
+    out = []
+    for curve in _curves(tables):
+        size = float(np.abs(np.asarray(curve.correction_um)).max())
+        name = f"largest correction of {curve.axis_out} when {curve.axis_in} moves"
+        out.append(Figure("Corrections of the new table", f"{curve.axis_in} to {curve.axis_out}", name, size, None, "µm", "as stored"))
+    return out

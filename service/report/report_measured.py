@@ -1,0 +1,240 @@
+"""Reports of what was measured: one run, or a campaign with its latest stored solution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from abbe.models.machine import AXES
+from abbe.models.solvers.observations import nominal_reading
+from abbe.models.verification import helix_figure
+from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.errors import AbbeError, MeasurementFault
+from abbe.service.rendering.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.rendering.model import ParameterRow, PolarTrace, ResidualSeries
+from abbe.service.rendering.numbers import plain
+from abbe.service.rendering.plots.bars import uncertainty_bars
+from abbe.service.rendering.plots.polar import polar_plot
+from abbe.service.rendering.plots.residuals import residual_plot
+from abbe.service.report import report_parts as parts
+from abbe.service.report.report_parts import Doc, Rules
+from abbe.service.report.report_table import NOTHING_SAID, TableSaid
+from abbe.service.runs.coverage import not_judged
+from abbe.service.runs.helix_axis import about_axis, path_axis
+from abbe.service.runs.observations import run_data
+from abbe.service.verification.iso_report import Evaluated, evaluate
+from abbe.service.verification.verify import DIAGONALS, Verdict, figure_rows, figures
+
+SOLUTION_SIGNS: dict[str, Sign] = {"good": "ok", "usable with care": "open", "mostly assumption": "bad"}
+NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine) states limits."
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a report of a measurement is made of.
+
+    ``runs``: ``abbe-run/1`` objects that are complete; ``facts``: further lines for the head; ``states``: run, test, role, state, why and
+    when of every run, also of incomplete ones; ``solution``: latest stored solution and its number; ``table``: what is
+    known of the tables in force.
+    """
+
+    campaign: Campaign
+    facts: dict[str, str] = field(default_factory=dict)
+    states: Sequence[Sequence[str]] = ()
+    solution: tuple[int, Doc] | None = None
+    table: TableSaid = NOTHING_SAID
+
+
+def campaign_report(found: Measured, rules: Rules) -> Document:
+    """Everything a campaign says: figures of the standards, figures of a verification, the solution."""
+    campaign = found.campaign
+    told = evaluate(campaign.runs, campaign.doc.get("instruments"))
+    checked, verdict = _verification(campaign.runs, rules)
+    condition, remarks = parts.conditions(campaign.runs, rules)
+    solved = _solution(found.solution)
+    remarks = [*found.table.remarks, *_unfinished(found.states, campaign.runs), *solved.remarks, *told.remarks, *remarks]
+    return Document(
+        kind="campaign",
+        title=f"Campaign {campaign.name}",
+        about=parts.machine_facts(campaign.site.doc) | {"Campaign": campaign.name} | found.facts,
+        verdict=found.table.verdict(parts.verdict_of(verdict, remarks, _solution_verdict(found.solution))),
+        figures=[*checked, *solved.figures, *told.figures],
+        instruments=parts.instruments(campaign.runs, campaign.doc, rules),
+        conditions=condition,
+        not_observable=[*solved.not_observable, *told.not_observable],
+        remarks=remarks,
+        statements=[*solved.statements, *([parts.VERIFICATION_STATEMENT] if checked else []), *told.statements],
+        provenance=parts.provenance(parts.data_digest(campaign.runs), _made(found.solution)),
+        tables=[_run_table(found), *_budget(found.solution)],
+        pictures=[*solved.pictures, *told.pictures],
+    )
+
+
+def run_report(found: Measured, label: str, rules: Rules) -> Document:
+    """One run: what its standard says of it, and its readings."""
+    run = next(r for r in found.campaign.runs if r["run_id"] == label)
+    told = evaluate([run], found.campaign.doc.get("instruments"))
+    condition, remarks = parts.conditions([run], rules)
+    own, why = _own(run), not_judged(run)
+    setup = [(k, _words(v)) for k, v in sorted(run["setup"].items())]
+    return Document(
+        kind="run",
+        title=f"Run {found.campaign.name}/{label}",
+        about=parts.machine_facts(run["machine"]) | {"Campaign": found.campaign.name, "Run": label, "Test": run["test"]} | found.facts,
+        verdict=found.table.verdict(("open", "Not judged", f"{why}." if why else NOT_JUDGED)),
+        figures=[*own.figures, *told.figures],
+        instruments=parts.instruments([run], found.campaign.doc, rules),
+        conditions=condition,
+        not_observable=[*own.not_observable, *told.not_observable],
+        remarks=[*found.table.remarks, *_unfinished(found.states, [run]), *told.remarks, *remarks],
+        statements=told.statements,
+        provenance=parts.provenance(parts.data_digest([run])),
+        tables=[TextTable("Set-up", ("Name", "Value"), setup)],
+        pictures=[*told.pictures, *own.pictures],
+    )
+
+
+def _verification(runs: Sequence[Doc], rules: Rules) -> tuple[list[Figure], Verdict | None]:
+    """Figures that the machine file has limits for, where these runs hold the four body diagonals, once out and back."""
+    known = [r for r in runs if r["columns"].get("deviation_mm") is not None and r["setup"].get("cycles", 1) == 1 and not not_judged(r)]
+    body = {r["setup"].get("diagonal") for r in known if r["test"] == "laser_diagonal" and not r["setup"].get("order")}
+    if not body >= DIAGONALS:
+        return [], None
+    try:
+        return parts.judged(figure_rows(figures(known)), rules, "Verification")
+    except MeasurementFault:  # too few readings in one of them: the figures of the standards say which
+        return [], None
+
+
+def _solution(stored: tuple[int, Doc] | None) -> Evaluated:
+    if stored is None:
+        return Evaluated(not_observable=["error motions of the machine: this campaign has no stored solution (abbe solve)"])
+    number, doc = stored
+    group = f"Linear errors, mean over the volume (solution {number}, {doc['model']})"
+    rows = []
+    for name, p in doc["mean_over_volume"].items():
+        scale = name[0] == "E"
+        rows.append(ParameterRow(name, p["value"] * 1e6, p["u"] * 1e6, "µm/m" if scale else "µrad"))
+    words = {"µm/m": "scale error", "µrad": "squareness"}
+    known = doc["uncertainty"]
+    worst = known["worst_point"]
+    place = ", ".join(f"{v:.0f}" for v in worst["at_mm"])
+    size = float(np.linalg.norm(worst["deviation_um"]))
+    note = str(doc["mean_over_volume_note"])
+    statement = (
+        f"Solution {number}: {known['frame']}. At the worst known point ({place}) mm the deviation is {plain(size)} µm, and its 95 % "
+        f"region reaches {plain(worst['expanded_vector_um'])} µm. {note[:1].upper()}{note[1:]}."
+    )
+    return Evaluated(
+        figures=[Figure(group, r.name, words[r.unit], r.value, r.u, r.unit, "joint solution") for r in rows],
+        pictures=[Picture(f"Solution {number}: linear errors with U.", svg) for svg in uncertainty_bars(rows)],
+        remarks=[*doc["flags"]],
+        not_observable=[*doc["not_observable"]],
+        statements=[statement],
+    )
+
+
+def _solution_verdict(stored: tuple[int, Doc] | None) -> tuple[Sign, str, str]:
+    if stored is None:
+        return "open", "Not judged", NOT_JUDGED
+    told = stored[1]["verdict"]
+    word = str(told["word"])
+    return SOLUTION_SIGNS[word], word[:1].upper() + word[1:], str(told["text"])
+
+
+def _made(stored: tuple[int, Doc] | None) -> dict[str, str] | None:
+    if stored is None:
+        return None
+    number, doc = stored
+    return {str(k): str(v) for k, v in doc["versions"].items()} | {"solution": f"{number}, inputs SHA-256 {doc['inputs']['digest']}"}
+
+
+def _budget(stored: tuple[int, Doc] | None) -> list[TextTable]:
+    if stored is None:
+        return []
+    rows = [(b["words"], plain(b["u_um"], 2), f"{b['share']:.0%}") for b in stored[1]["uncertainty"]["budget"]]
+    return [TextTable("Uncertainty budget of the predicted deviation, rms over the volume", ("Source", "u in µm", "Share"), rows)]
+
+
+def _run_table(found: Measured) -> TextTable:
+    head = ("Run", "Test", "Role", "State", "Readings", "SHA-256 (first 16)")
+    whole = {r["run_id"]: r for r in found.campaign.runs}
+    states = found.states or [(r["run_id"], r["test"], r["role"], "complete", "") for r in found.campaign.runs]
+    rows = []
+    for label, test, role, state, _ in states:
+        run = whole.get(label)
+        readings = "" if run is None else str(len(run["columns"]["t_s"]))
+        rows.append((label, test, role, state, readings, "" if run is None else parts.data_digest([run])[:16]))
+    return TextTable("Runs", head, rows)
+
+
+def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[str]:
+    """Runs that are in no figure; of one that was gone on with, where its readings are."""
+    whole = {piece["run"]: r["run_id"] for r in runs for piece in (r.get("timing") or {}).get("pieces", [])}
+    short = {r["run_id"]: why for r in runs if (why := not_judged(r))}
+    out = []
+    for label, _, _, state, why in states:
+        reason = f": {why}" if why else ""
+        if label in whole:
+            out.append(f"run {label} is {state}{reason}; {whole[label]} went on with it, its readings count there")
+        elif label in short:
+            out.append(f"run {label} is {short.pop(label)}, it is not in the figures{reason}")
+        elif state != "complete":
+            out.append(f"run {label} is {state}, it is not in the figures{reason}")
+    return [*out, *(f"run {label} is {why}, it is not in the figures" for label, why in short.items())]
+
+
+def _own(run: Doc) -> Evaluated:
+    """What can be said of any run: its readings along it, noise and rms; of a helix its figure."""
+    if run["columns"].get("deviation_mm") is None:
+        return Evaluated(not_observable=["its readings: the run is sealed"])
+    try:
+        data = run_data(run)
+    except AbbeError as error:
+        return Evaluated(not_observable=[f"figures of this run: {error.detail}"])
+    above = (data.deviation_mm - nominal_reading(data)) * 1e3
+    valid = int(np.sum(np.asarray(run["columns"].get("valid", np.ones(len(run["columns"]["t_s"]))), dtype=bool)))
+    group = "Readings"
+    rows = [Figure(group, "n", f"valid readings of {len(run['columns']['t_s'])}", float(valid), None, "", "count")]
+    series = ResidualSeries(data.label, "time of the campaign in s", data.t_s, above)
+    pictures = [
+        Picture(f"Run {data.label}: deviation against time, as read.", residual_plot(series, noise_um=None, key="readings"), wide=True)
+    ]
+    if why := not_judged(run):
+        return Evaluated(figures=rows, pictures=pictures, not_observable=[f"any figure of the whole path: {why}"])
+    rows += [
+        Figure(group, "min", "smallest deviation", float(above.min()), None, "µm", "as read"),
+        Figure(group, "max", "largest deviation", float(above.max()), None, "µm", "as read"),
+    ]
+    if data.test == "helix":
+        found = helix_figure(data)
+        rows.append(
+            Figure(
+                group,
+                "helix rms",
+                "rms about its own centre and length",
+                found.value_mm * 1e3,
+                found.u_mm * 1e3,
+                "µm",
+                parts.VERIFICATION,
+            )
+        )
+        try:
+            axis = path_axis(run, data.axes_mm)
+        except MeasurementFault as error:
+            return Evaluated(figures=rows, pictures=pictures, not_observable=[f"its picture: {error.detail}"])
+        angle = np.degrees(about_axis(data.axes_mm - np.asarray(data.centre_mm), axis))
+        words = f"Deviation of the helix around its axis ({AXES[axis]}), centre and length of the bar fitted away."
+        pictures.append(Picture(words, polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")))
+    return Evaluated(figures=rows, pictures=pictures)
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(_words(v) for v in value)
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    return str(value)

@@ -1,0 +1,167 @@
+"""What every report says: machine, instruments with their certificates, conditions, where the data come from, and what was judged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from abbe.service.campaign_data.provenance import run_digest, versions
+from abbe.service.rendering.document import Figure, Instrument, Sign
+from abbe.service.rendering.numbers import finite, plain, tidy
+from abbe.service.verification.verify import Verdict, judge, overall
+
+Doc = dict[str, Any]
+NAMES = {"ballbar": "telescoping ball-bar", "laser": "laser displacement meter"}
+SIGNS: Mapping[Verdict, tuple[Sign, str]] = {
+    "pass": ("ok", "Within limits"),
+    "fail": ("bad", "Out of limits"),
+    "cannot tell": ("open", "Cannot tell"),
+}
+VERIFICATION = "verification"
+VERIFICATION_STATEMENT = (
+    "U of verification figures holds noise, wavelength and, for the helix, that the bar is hung in again, but not the temperature of the "
+    "scales: they compare one machine with itself. ISO 230-6 figures of the same diagonals hold it, so their U is larger."
+)
+SENSORS = (
+    ("temp_air_C", "air temperature", "°C"),
+    ("temp_x_C", "temperature of X", "°C"),
+    ("temp_y_C", "temperature of Y", "°C"),
+    ("temp_z_C", "temperature of Z", "°C"),
+    ("temp_spindle_C", "temperature of the spindle", "°C"),
+    ("pressure_air_Pa", "air pressure", "Pa"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What a machine file adds to the data: limits of figures (µm, by their names in `figure_rows`), certificates, allowed temperature."""
+
+    limits_um: Mapping[str, float] = field(default_factory=dict)
+    calibrated_until: Mapping[str, date] | None = None
+    temperature_c: tuple[float, float] | None = None
+
+
+def machine_facts(machine: Doc) -> dict[str, str]:
+    """Head of the report: which machine, and its geometry."""
+    strokes = "; ".join(f"{a} {tidy(float(lo))} to {tidy(float(hi))} mm" for a, (lo, hi) in machine["stroke_mm"].items())
+    out = {"Machine": str(machine.get("name", "")), "Chain": str(machine["chain"]), "Strokes": strokes}
+    tool = machine.get("tool_mm")
+    return out if not tool else out | {"Tool": ", ".join(tidy(float(v)) for v in tool) + " mm"}
+
+
+def instruments(runs: Sequence[Doc], campaign: Doc, rules: Rules) -> list[Instrument]:
+    """Instruments that these runs used."""
+    kinds = {"ballbar" if r["test"].startswith("ballbar") else "laser" for r in runs}
+    return [Instrument(NAMES[k], _certificate(k, rules), _known(k, runs, campaign)) for k in NAMES if k in kinds]
+
+
+def _certificate(kind: str, rules: Rules) -> str:
+    if rules.calibrated_until is None:
+        return "not in the data; a machine file (--machine) states it"
+    day = rules.calibrated_until.get(kind)
+    return "none stated in the machine file" if day is None else f"valid to {day.isoformat()}"
+
+
+def _known(kind: str, runs: Sequence[Doc], campaign: Doc) -> str:
+    words = []
+    resolution = ((campaign.get("instruments") or {}).get(kind) or {}).get("resolution_mm")
+    if resolution is not None:
+        words.append(f"resolution {plain(float(resolution) * 1e3, 2)} µm")
+    if kind == "ballbar":
+        bars = {(r["setup"].get("length_calibrated"), r["setup"].get("u_length_mm")) for r in runs if r["test"].startswith("ballbar")}
+        for calibrated, u in sorted(bars, key=repr):
+            if calibrated:
+                words.append("length calibrated" + ("" if u is None else f", standard uncertainty {plain(float(u) * 1e3, 2)} µm"))
+            else:
+                words.append("length not calibrated")
+    return "; ".join(words) or "nothing stated"
+
+
+def conditions(runs: Sequence[Doc], rules: Rules) -> tuple[dict[str, str], list[str]]:
+    """Conditions in words, and what about them the reader has to know."""
+    out, remarks = {}, []
+    for column, name, unit in SENSORS:
+        seen = [float(v) for r in runs for v in r["columns"].get(column) or [] if v is not None and np.isfinite(v)]
+        if seen:
+            out[name[0].upper() + name[1:]] = f"{min(seen):.2f} to {max(seen):.2f} {unit}"
+            if column == "temp_air_C" and rules.temperature_c is not None:
+                low, high = rules.temperature_c
+                out["Allowed"] = f"{low:g} to {high:g} °C"
+                if min(seen) < low or max(seen) > high:
+                    remarks.append(f"the air was outside of the allowed {low:g} to {high:g} °C: the figures cannot be judged")
+    if not any(name.startswith("temp") and r["columns"].get(name) for r in runs for name in r["columns"]):
+        remarks.append("no temperature is on record")
+    feeds = [float(v) for r in runs for v in r["columns"].get("feed_mm_min") or [] if v is not None]
+    if feeds:
+        out["Feed"] = f"{min(feeds):.0f} to {max(feeds):.0f} mm/min" if min(feeds) != max(feeds) else f"{feeds[0]:.0f} mm/min"
+    spans = [float(r["columns"]["t_s"][-1]) - float(r["columns"]["t_s"][0]) for r in runs if r["columns"].get("t_s")]
+    if spans:
+        out["Time in the runs"] = f"{sum(spans) / 60.0:.1f} min in {len(spans)} runs"
+    tables = sorted({f"bank {t['bank']}, CRC {t['crc']:08X}" for r in runs if (t := r.get("table")) and "crc" in t and "bank" in t})
+    if tables:
+        out["Compensation table in force"] = "; ".join(tables)
+    return out, remarks
+
+
+def data_digest(runs: Sequence[Doc]) -> str:
+    """SHA-256 over the runs' digests, by name: one changed reading changes it."""
+    lines = sorted(f"{r['run_id']} {run_digest(r)}" for r in runs)
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def doc_digest(value: Any) -> str:
+    """SHA-256 of a JSON value in its one canonical form."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
+
+
+def provenance(digest: str, made: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Hash of the data and versions: of the program that computed the result (``made``), if it is on record, and of this one.
+
+    No time: a report says when was measured, and the same data give the same report tomorrow.
+    """
+    out = {"Data (SHA-256)": digest}
+    if made:
+        out |= {f"Result computed by {name}": str(v) for name, v in sorted(made.items())}
+    out |= {f"Report by {name}": v for name, v in versions().items()}
+    return out | {"Typesetter of the PDF": f"typst {version('typst')}"}
+
+
+def judged(rows: Mapping[str, tuple[float, float]], rules: Rules, group: str) -> tuple[list[Figure], Verdict | None]:
+    """Figures of a verification (of `figure_rows`) with their limits, and the verdict on all that have one."""
+    figures, verdicts = [], []
+    for key, (value, u) in rows.items():
+        limit = rules.limits_um.get(key)
+        # Without an uncertainty nothing can be stated about a limit.
+        word: Verdict | None = None if limit is None else judge(value, u, limit) if finite(u) else "cannot tell"
+        if word is not None:
+            verdicts.append(word)
+        symbol, name, method = figure_names(key)
+        figures.append(Figure(group, symbol, name, value, u, "µm", method, limit, word or ""))
+    return figures, overall(verdicts) if verdicts else None
+
+
+def figure_names(key: str) -> tuple[str, str, str]:
+    """Symbol, name and method of a figure of a verification."""
+    if key == "helix_rms_um":
+        return "helix rms", "ball-bar on the check helix, rms about its own centre", VERIFICATION
+    if key == "body_diagonal_um":
+        return "diagonal, worst", "largest range of the bidirectional means of a body diagonal", VERIFICATION
+    name = key.removeprefix("diagonal_").removesuffix("_um")
+    return f"diagonal {name}", f"range of the bidirectional means of body diagonal {name}", VERIFICATION
+
+
+def verdict_of(found: Verdict | None, remarks: Sequence[str], otherwise: tuple[Sign, str, str]) -> tuple[Sign, str, str]:
+    """The verdict by limits; figures that were measured outside of the allowed temperature are not judged."""
+    if found is None:
+        return otherwise
+    if any("cannot be judged" in r for r in remarks):
+        found = "cannot tell"
+    sign, word = SIGNS[found]
+    return sign, word, "By the limits of the machine file and the decision rule below."

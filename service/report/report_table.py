@@ -1,0 +1,66 @@
+"""What a report says of the table that its runs were measured with: never verified, verified on another machine, not of this database."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from abbe.service.rendering.document import Sign
+from abbe.service.report.report_parts import Doc
+from abbe.service.storage.store import Store
+from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, Images, images_of
+from abbe.service.tables.table_gate import STRANGE
+from abbe.service.tables.unverified import Known, known_tables
+
+WORD = "Unverified table"
+
+
+@dataclass(frozen=True, slots=True)
+class TableSaid:
+    """``unverified``: why the verdict cannot be what the limits alone say, empty if it can; ``remarks``: what the reader has to know."""
+
+    unverified: str = ""
+    remarks: tuple[str, ...] = ()
+
+    def verdict(self, by_limits: tuple[Sign, str, str]) -> tuple[Sign, str, str]:
+        """The verdict, which no figure gives to a table that nothing has verified."""
+        if not self.unverified:
+            return by_limits
+        _, word, text = by_limits
+        return "bad", WORD, f"{self.unverified[:1].upper()}{self.unverified[1:]}. By the figures alone: {word}. {text}".strip()
+
+
+NOTHING_SAID = TableSaid()
+
+
+def table_said(store: Store, machine: str, runs: Sequence[Doc]) -> TableSaid:
+    """Hold the tables that runs of a machine were measured with against the journals of this database, as they stand now."""
+    used = {int(t["crc"]): t for r in runs if (t := r.get("table")) and t.get("crc") is not None}
+    if not used:
+        return TableSaid()
+    known, images, chain = known_tables(store), images_of(store), store.push_chain(machine)
+    unverified = [
+        f"measured with the table of push {push.push} of machine {push.machine!r} (CRC {crc:08X}), which was never verified"
+        for crc in sorted(used)
+        if (push := known.unverified.get(crc)) is not None
+    ]
+    remarks = [_remark(crc, known, chain) for crc in sorted(used) if crc not in known.unverified and _corrects(crc, used[crc], images)]
+    return TableSaid("; ".join(unverified), (*unverified, *filter(None, remarks)))
+
+
+def _corrects(crc: int, table: Doc, images: Images) -> bool:
+    """As far as is known: by its image, else by what the control said."""
+    image = images(crc)
+    return bool(table.get("acting")) if image is None else int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
+
+
+def _remark(crc: int, known: Known, chain: str) -> str:
+    """Whose table it is and who accepted it for this machine; empty where its own journal says that it is right."""
+    elsewhere, here, push = known.elsewhere(crc, chain), known.fine.get(crc, {}).get(chain), known.pushed.get(crc)
+    if elsewhere is not None:
+        return f"measured with a table (CRC {crc:08X}) that was {elsewhere.not_here}: nobody has accepted it"
+    if here is not None and (here.how != "accepted" or (push is not None and (push.chain or push.machine) == chain)):
+        return ""
+    who = "nobody has accepted it" if here is None else f"accepted by {here.by or 'a person'} at {here.utc}"
+    what = STRANGE if push is None else f"a table of machine {push.machine!r}"
+    return f"measured with {what} (CRC {crc:08X}): {who}"

@@ -1,0 +1,52 @@
+"""A report is of the table that was in force then: what came into force since stands on it, so that no old verdict is taken for today's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+
+from abbe.service.rendering.document import Document
+from abbe.service.storage.store import Store
+from abbe.service.verification.verified_by import VerifiedBy, verified_by
+
+NOT_JUDGED = "Not judged"
+
+
+def of_then(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[dict[str, Any]]) -> Document:
+    """The report, and where its table is not the one in force now, that: as headline if nothing has measured the machine since.
+
+    Parameters
+    ----------
+    machine : str
+        Whose report it is.
+    begun_utc : str
+        When it was measured, or when the push ended.
+    runs : sequence of dict
+        ``abbe-run/1`` objects that it rests on; empty: only the time counts.
+    """
+    known = verified_by(store, machine)
+    if _same(known, begun_utc, runs):
+        return document
+    sign, word, text = document.verdict
+    now = known.text[:1].upper() + known.text[1:]
+    remark = f"this report is of a table that was in force then, not of the one that is in force now: {known.text}"
+    verdict = document.verdict
+    if known.state == "unverified" and word != NOT_JUDGED:
+        verdict = ("open", "Unverified now", f"{now}. When this was measured: {word}. {text}".strip())
+    elif sign != "open":
+        verdict = ("open", f"{word} then", f"{text} Another table is in force now: {known.text}.".strip())
+    return replace(document, verdict=verdict, remarks=[remark, *document.remarks])
+
+
+def _same(known: VerifiedBy, begun_utc: str, runs: Sequence[dict[str, Any]]) -> bool:
+    """Whether what was measured then was measured with the table in force now."""
+    if known.why in ("changed", "open", "journal"):
+        return False
+    tables = {int(r["table"]["crc"]) for r in runs if (r.get("table") or {}).get("crc") is not None}
+    if known.why == "push" and tables == {known.crc}:  # measured on the way, before it was kept
+        return True
+    if known.since is not None and datetime.fromisoformat(begun_utc) < known.since:
+        return False
+    return known.crc is None or tables <= {known.crc}

@@ -1,0 +1,131 @@
+"""Ledger and shelf on top of the store, off the event loop, patient with a database that is locked or restarting for a while."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from datetime import datetime
+from typing import ParamSpec, TypeVar
+
+import structlog
+
+from abbe.service.clock import Clock
+from abbe.service.errors import StoreError
+from abbe.service.scheduler import record
+from abbe.service.scheduler.ports import Doc, OpenSlot
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store_slots import RUNNING
+
+log = structlog.get_logger("abbe.store")
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+PAUSES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+"""A minute altogether. A measurement takes minutes of machine time; it is not thrown away because of a backup run."""
+
+
+class RetryingStore:
+    """Writes, and reads, again and again while the database does not take it."""
+
+    def __init__(self, store: ServiceStore, clock: Clock) -> None:
+        self._store = store
+        self._clock = clock
+
+    async def _write(self, fn: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._again(lambda: self._store.write(fn, *args, **kwargs))
+
+    async def _read(self, fn: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._again(lambda: asyncio.to_thread(fn, *args, **kwargs))
+
+    async def _again(self, once: Callable[[], Awaitable[T]]) -> T:
+        for pause_s in PAUSES_S:
+            try:
+                return await once()
+            except StoreError as trouble:
+                log.warning("store does not take this now; trying again", cause=trouble.detail, pause_s=pause_s)
+                await self._clock.sleep(pause_s)
+        return await once()
+
+
+class StoreLedger(RetryingStore):
+    """Slots in the store. Each key names the machine: one database may serve several services."""
+
+    def __init__(self, store: ServiceStore, clock: Clock, machine: str) -> None:
+        super().__init__(store, clock)
+        self._machine = machine
+
+    async def claim(self, schedule: str, slot_utc: datetime) -> bool:
+        """Return True to exactly one caller, ever, for each (schedule, slot)."""
+        return await self._write(self._store.claim_slot, self._key(schedule), slot_utc)
+
+    async def begin(self, schedule: str, slot_utc: datetime) -> None:
+        """Note that the check of a claimed slot starts: nobody may start it again."""
+        await self._write(self._store.begin_slot, self._key(schedule), slot_utc)
+
+    async def release(self, schedule: str, slot_utc: datetime) -> None:
+        """Give back a claimed slot that was not started."""
+        await self._write(self._store.release_slot, self._key(schedule), slot_utc)
+
+    async def adopt(self, schedule: str) -> list[OpenSlot]:
+        """Take over the open slots whose service is gone, in order of time. Each is given to exactly one caller."""
+        found = await self._write(self._store.adopt_slots, self._key(schedule))
+        return [OpenSlot(datetime.fromisoformat(one.slot_utc), one.state == RUNNING) for one in found]
+
+    async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
+        """Write down what became of a claimed slot: state (30 characters) and the sentence to it."""
+        await self._write(self._store.finish_slot, self._key(schedule), slot_utc, state[:30], reason)
+
+    async def last_claimed(self, schedule: str) -> datetime | None:
+        """Return the latest slot ever claimed for this schedule, or None if it is new."""
+        return await asyncio.to_thread(self._store.last_slot, self._key(schedule))
+
+    def _key(self, schedule: str) -> str:
+        return f"{self._machine}/{schedule}"
+
+
+class StoreShelf(RetryingStore):
+    """Verifications and messages in the store.
+
+    Parameters
+    ----------
+    store : ServiceStore
+        Where to.
+    clock : Clock
+        Pauses while the store is not available.
+    machine : tuple of str and int
+        Name, and number in the store.
+    topics : tuple of str
+        Where verifications and alarms are published; empty if there is no broker in the machine file.
+    posted : callable
+        Told when there is something new to publish.
+    """
+
+    def __init__(
+        self, store: ServiceStore, clock: Clock, machine: tuple[str, int], topics: tuple[str, str] | None, posted: Callable[[], None]
+    ) -> None:
+        super().__init__(store, clock)
+        self._machine, self._machine_id = machine
+        self._topics = topics
+        self._posted = posted
+
+    async def keep(self, doc: Doc) -> int:
+        """Store a verification and queue its messages, together; return its number."""
+        messages: list[tuple[str, Doc]] = []
+        if self._topics is not None:
+            verification_topic, alarm_topic = self._topics
+            messages.append((verification_topic, doc))
+            if doc["cause"] is not None:
+                messages.append((alarm_topic, self._of_machine(record.alarm(doc))))
+        number = await self._write(self._store.keep_verification, self._machine_id, doc, messages)
+        self._posted()
+        return number
+
+    async def alarm(self, doc: Doc) -> None:
+        """Queue an alarm."""
+        if self._topics is not None:
+            await self._write(self._store.put_message, self._topics[1], self._of_machine(doc))
+            self._posted()
+
+    def _of_machine(self, doc: Doc) -> Doc:
+        return {"schema": record.SCHEMA, "machine": self._machine, **doc}

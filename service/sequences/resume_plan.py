@@ -1,0 +1,247 @@
+"""From where a test that was broken off is gone on with, and how the machine gets there. Pure.
+
+A bar must not be moved through its sphere, a mirror not out of its beam: the way back is the way that the test came, to the last
+checkpoint. A path with the ball-bar goes on where it was broken off (abbe.service.sequences.path_resume), or begins again; a run with the
+laser goes on after its last complete point, once that point was read again and says the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from abbe.service.errors import SetupDisturbed
+from abbe.service.runs.pieces import SoFar
+from abbe.service.sequences.approach import cup_of, over_pole
+from abbe.service.sequences.path_resume import Onward, rest_of_path
+from abbe.service.sequences.steps import (
+    ChangeBar,
+    FollowPath,
+    MountBar,
+    MountLaser,
+    MoveTo,
+    Point,
+    ReadBar,
+    ReadLaser,
+    RecordPath,
+    Step,
+    TakeBarOut,
+    TestPlan,
+    Unmount,
+)
+
+BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
+STANDS = MountBar | TakeBarOut | ChangeBar | MountLaser
+"""After these something stands in the machine: a bar hangs in, a cup stands, a mirror is on the spindle."""
+OFF_PATH_MM = 0.05
+"""Farther than this beside the way it came, the machine was moved by somebody else, and what is mounted cannot be relied on."""
+SAME_WAY_MM = 0.005
+"""Two passages of one place are as far apart as chords of a circle are beside it, and positions are rounded."""
+KEEP_FROM = 2
+"""A laser run with fewer complete points begins again: there is nothing that a repeated reading could be compared with."""
+REFERENCE_MM = 0.003
+"""So much the repeated reading may differ: drift of minutes and noise, not a mirror that was knocked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rewind:
+    """How to go on: along ``trail`` (oldest first) back to number ``to``, and forward again to number ``upto``.
+
+    With ``carried`` records the last of them is read again there. Going forward again, every axis comes as it came before, so that lost
+    motion is what it was. ``latest``: where the trail passes a place twice the machine stands on the later passage. An empty trail: nothing
+    is mounted. A trail of one point: it must stand there, and nothing moves.
+    """
+
+    trail: tuple[Point, ...] = ()
+    to: int = 0
+    upto: int = 0
+    feed_mm_min: float = 1000.0
+    latest: bool = False
+    carried: tuple[dict[str, Any], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """Which part of a test is run: ``test`` is its label in the plan, ``offset`` the number of the first step there, ``mounting`` the how
+    manieth of its set-up; ``run_id`` the run in the store."""
+
+    test: str = ""
+    setup: str = ""
+    offset: int = 0
+    mounting: int = 1
+    rewind: Rewind = field(default_factory=Rewind)
+    run_id: int = 0
+    onward: Onward | None = None
+
+
+Rest = tuple[TestPlan, int, Rewind, Onward | None]
+
+
+def rest_of(
+    test: TestPlan, hand: int | None, records: tuple[dict[str, Any], ...], before: Point | None, so_far: SoFar | None = None
+) -> Rest:
+    """What is left of a test, the number of its first step, the way back to there, and how its path goes on if it does.
+
+    Parameters
+    ----------
+    hand : int, optional
+        Last step by hand that was done; None: none was.
+    records : tuple of dict
+        Laser records of complete points of this mounting and zero, oldest first; none for a ball-bar.
+    before : tuple of float, optional
+        Where the test before it ended, if it left mounted what this one uses.
+    so_far : SoFar, optional
+        How far its path was read in this mounting.
+    """
+    first = 0 if hand is None else hand + 1
+    start = before if hand is None else _standing(test.steps[:first])
+    if hand is not None and isinstance(test.steps[hand], TakeBarOut) and start is None:
+        start = before
+    steps = test.steps[first:]
+    if len(records) >= KEEP_FROM and not any(isinstance(s, RecordPath | ReadBar) for s in steps):
+        return _after_point(test, first, records)
+    stands = start is not None and (hand is None or isinstance(test.steps[hand], STANDS))
+    if not stands:
+        return replace(test, steps=steps), first, Rewind(), None
+    if so_far is not None and (found := _along_path(test, first, start, so_far)) is not None:
+        return found
+    return replace(test, steps=steps), first, _to_beginning(_trail(start, _by_itself(steps)), steps), None
+
+
+def _along_path(test: TestPlan, first: int, start: Point | None, so_far: SoFar) -> Rest | None:
+    """The rest from a point of the path on."""
+    steps = _by_itself(test.steps[first:])
+    k = next((k for k, step in enumerate(steps) if isinstance(step, RecordPath)), None)
+    path = None if k is None else steps[k]
+    if k is None or not isinstance(path, RecordPath) or (found := rest_of_path(path, so_far)) is None:
+        return None
+    rest, begin, onward = found
+    trail = _trail(start, steps)
+    to = len(_trail(start, (*steps[:k], replace(path, points_mm=path.points_mm[: begin + 1], measured=None)))) - 1
+    return replace(test, steps=(rest, *test.steps[first + k + 1 :])), first + k, Rewind(trail, to, to, _feed(steps)), onward
+
+
+def _to_beginning(trail: tuple[Point, ...], steps: tuple[Step, ...]) -> Rewind:
+    """Back along the trail to where the first step of what is left begins or, if that is a straight move, ends."""
+    to = 0 if isinstance(steps[0], FollowPath | RecordPath) else min(1, len(trail) - 1)
+    return Rewind(trail, to, to, _feed(steps))
+
+
+def _by_itself(steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """Steps up to the first that a person does: from there on something else is mounted, and the way leads elsewhere."""
+    cut = next((k for k, step in enumerate(steps) if isinstance(step, BY_HAND)), len(steps))
+    return steps[:cut]
+
+
+def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]) -> Rest:
+    reads = [k for k, step in enumerate(test.steps) if k >= first and isinstance(step, ReadLaser)]
+    last = reads[min(len(records), len(reads)) - 1]
+    come = _trail(None, test.steps[: last + 1])
+    ahead = _trail(come[-1], test.steps[last + 1 :])[1:2]
+    upto = len(come) - 1
+    feed = min(s.feed_mm_min for s in test.steps if isinstance(s, MoveTo))
+    rewind = Rewind(come + ahead, _all_axes_from(come), upto, feed, True, records[: len(reads)])
+    return replace(test, steps=test.steps[last + 1 :]), last + 1, rewind, None
+
+
+def _all_axes_from(trail: tuple[Point, ...]) -> int:
+    """From which point on every axis that moves at all makes its last motion to the trail's end."""
+    moved = np.abs(np.diff(np.array(trail), axis=0)) > 0.0
+    return min((int(np.flatnonzero(moved[:, a])[-1]) for a in range(3) if moved[:, a].any()), default=len(trail) - 1)
+
+
+def way_back(rewind: Rewind, position_mm: Point) -> tuple[Point, ...]:
+    """Positions to go through from where the machine stands.
+
+    Raises
+    ------
+    SetupDisturbed
+        It does not stand on the way that it came.
+    """
+    if not rewind.trail:
+        return ()
+    trail, here = np.array(rewind.trail), np.array(position_mm)
+    segment, off_mm = _nearest(trail, here, rewind.to, latest=rewind.latest)
+    if off_mm > OFF_PATH_MM:
+        raise SetupDisturbed(
+            f"the machine stands {off_mm:.3f} mm beside the way that the test came",
+            "it was moved meanwhile: what is mounted is mounted anew",
+        )
+    if len(trail) == 1:
+        return ()
+    points = rewind.trail[rewind.to : segment + 1][::-1] or rewind.trail[segment + 1 : rewind.to + 1]  # it may stand before it, too
+    return tuple(p for k, p in enumerate(points) if k or np.abs(np.array(p) - here).max() > 1e-5)
+
+
+def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
+    """A test of a set-up that is mounted for the n-th time, mounting by itself; ``first`` is the test that mounted it the first time."""
+    named = anew(test, number)
+    if test.mounts:
+        return replace(named, steps=(Unmount(), *test.steps))
+    k = next((k for k, step in enumerate(first.steps) if isinstance(step, MountBar | MountLaser)), None)
+    if k is None:
+        raise SetupDisturbed(
+            f"what test {test.label} uses was mounted by another campaign, and cannot be mounted anew in this one",
+            "clear it away and begin again",
+        )
+    opening: tuple[Step, ...] = (Unmount(), *(s for s in first.steps[: k + 1] if not isinstance(s, Unmount)))
+    if not any(isinstance(step, MountBar) for step in opening):
+        return replace(named, steps=(*opening, *test.steps))
+    return replace(named, steps=(*opening[:-1], MountBar(test.setup["radius_mm"]), *_from_centre(test)))
+
+
+def _from_centre(test: TestPlan) -> tuple[Step, ...]:
+    """A test's steps with its bar hung in anew at the centre: by way of the pole instead of from where the test before ended."""
+    first = next(k for k, step in enumerate(test.steps) if isinstance(step, RecordPath | ReadBar))
+    near = [s for s in test.steps[:first] if isinstance(s, MoveTo)][-2:]  # beside the path's start, and that start
+    start = near[-1]
+    return (*over_pole(cup_of(test.setup), start.target_mm, start.feed_mm_min), *near, *test.steps[first:])
+
+
+def anew(test: TestPlan, number: int) -> TestPlan:
+    """A test under the name of the n-th mounting of its set-up."""
+    if number == 1:
+        return test
+    return replace(test, setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{number}"})
+
+
+def end_of(test: TestPlan) -> Point | None:
+    """Where the machine stands after a test."""
+    return _standing(test.steps)
+
+
+def _standing(steps: tuple[Step, ...]) -> Point | None:
+    trail = _trail(None, steps)
+    return trail[-1] if trail else None
+
+
+def _trail(start: Point | None, steps: tuple[Step, ...]) -> tuple[Point, ...]:
+    points: list[Point] = [] if start is None else [start]
+    for step in steps:
+        if isinstance(step, MoveTo):
+            points.append(step.target_mm)
+        elif isinstance(step, RecordPath | FollowPath):
+            points += step.points_mm
+    return tuple(p for k, p in enumerate(points) if k == 0 or p != points[k - 1])
+
+
+def _feed(steps: tuple[Step, ...]) -> float:
+    """The slowest feed of what is left: the way back is never driven faster than the way there."""
+    return min((s.feed_mm_min for s in steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=1000.0)
+
+
+def _nearest(trail: np.ndarray, here: np.ndarray, to: int, *, latest: bool) -> tuple[int, float]:
+    """Number of the nearest segment's first point, and the distance from it, mm.
+
+    Where the trail passes the place more than once (a circle with feed-in): the passage from which ``to`` is nearest along the trail.
+    """
+    if len(trail) == 1:
+        return 0, float(np.linalg.norm(here - trail[0]))
+    begin, along = trail[:-1], np.diff(trail, axis=0)
+    share = np.clip(((here - begin) * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-18), 0.0, 1.0)
+    off = np.linalg.norm(begin + share[:, None] * along - here, axis=1)
+    near = np.flatnonzero(off <= off.min() + SAME_WAY_MM)
+    k = int(near[-1] if latest else near[np.argmin(np.abs(near - to))])
+    return k, float(off[k])

@@ -1,0 +1,140 @@
+"""The one gate before anything moves or is built on a table: what is in force is verified here, vouched for, or no correction at all."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+
+import numpy as np
+
+from abbe.drivers.api import CompStatus, Controller
+from abbe.service.clock import SystemClock
+from abbe.service.errors import TableMismatch
+from abbe.service.push.book import StoreBook
+from abbe.service.push.entries import Doc
+from abbe.service.push.staging import SEALED
+from abbe.service.push.states import State
+from abbe.service.site import Site
+from abbe.service.storage.store import Store
+from abbe.service.tables.base_table import read_base
+from abbe.service.tables.unverified import Fine, Known, Pushed, known_tables
+
+LOOK = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
+STRANGE = "a table that this database did not push"
+ACCEPT = (
+    "find out who wrote it; if it is right: `abbe accept-table MACHINE.toml --yes`, or --accept-table with the command that is to go on; "
+    "nothing has moved"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class InForceNow:
+    """A table in force as all journals of the database know it.
+
+    ``unverified``: the push that brought it, if nothing has verified it; ``strange``: it corrects something, and no journal has it;
+    ``elsewhere``: it corrects something, and only the journals of other controls say that it is right.
+    """
+
+    status: CompStatus
+    unverified: Pushed | None
+    strange: bool
+    elsewhere: Fine | None
+
+    @property
+    def crc(self) -> int:
+        """CRC-32 of the active bank."""
+        return self.status.bank_crc[self.status.active_bank]
+
+
+async def look(controller: Controller, known: Known, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
+    """Ask the controller which table acts, and the journals which that is. Its content is read only where ``chain``, the journal of this
+    control, does not say that it is right, and once for each CRC where ``corrects`` keeps what was read.
+
+    Raises
+    ------
+    TableMismatch
+        A table that no journal has does not have the CRC that the controller states.
+    """
+    now = await controller.comp_status()
+    crc = now.bank_crc[now.active_bank]
+    unverified, elsewhere = known.unverified.get(crc), known.elsewhere(crc, chain)
+    asked = (crc not in known.seen or elsewhere is not None) and unverified is None
+    read = {} if corrects is None else corrects
+    if asked and crc not in read:
+        read[crc] = await _corrects(controller, now)
+    acts = asked and read[crc]
+    return InForceNow(now, unverified, acts and crc not in known.seen, elsewhere if acts else None)
+
+
+async def _corrects(controller: Controller, now: CompStatus) -> bool:
+    """Whether the active bank holds any correction. What cannot be read is taken for one."""
+    if now.bank_state[now.active_bank] != SEALED:
+        return False
+    base = await read_base(controller)
+    try:
+        tables = base.tables
+    except TableMismatch:
+        return True
+    return tables is not None and any(bool(np.any(curve)) for curve in tables.correction_mm)
+
+
+async def check_in_force(controller: Controller, store: Store, site: Site) -> None:
+    """Refuse a table in force that no measurement has verified and no person has vouched for, under whatever name it was pushed.
+
+    Raises
+    ------
+    TableMismatch
+        Whose table it is, or that this database did not push it; and what to do.
+    """
+    now = await look(controller, *await asyncio.to_thread(_journals, store, site))
+    if now.unverified is not None:
+        whose = await asyncio.to_thread(_whose, store, site, now.unverified)
+        raise TableMismatch(
+            f"the table in force (CRC {now.crc:08X}) is that of {whose}, which was never verified", _remedy(site, now.unverified)
+        )
+    if now.strange:
+        raise TableMismatch(f"{STRANGE} (CRC {now.crc:08X}) is in force", ACCEPT)
+    if now.elsewhere is not None:
+        raise TableMismatch(f"the table in force (CRC {now.crc:08X}) was {now.elsewhere.not_here}", ACCEPT)
+
+
+def _journals(store: Store, site: Site) -> tuple[Known, str]:
+    return known_tables(store), store.push_chain(site.name, site.control)
+
+
+def _whose(store: Store, site: Site, push: Pushed) -> str:
+    if push.chain == store.push_chain(site.name, site.control) and push.machine == site.name:
+        return f"push {push.push}"
+    at = f" at {push.control}" if push.control and push.control != site.control else ""
+    return f"push {push.push} of machine {push.machine!r}{at}"
+
+
+def _remedy(site: Site, push: Pushed) -> str:
+    if push.may_be_active and push.state != State.OPERATOR and push.machine != site.name:
+        return f"start any command with the machine file of {push.machine!r}, which takes it back; or {LOOK}"
+    return LOOK
+
+
+async def accept_strange(controller: Controller, store: Store, site: Site, by: str) -> str | None:
+    """Vouch for the table in force if this database did not push it, or only into other controls; returns what was done.
+
+    A table that a push of this database brought and did not verify is not accepted in passing: that is `abbe accept-table`.
+    """
+    now = await look(controller, *await asyncio.to_thread(_journals, store, site))
+    if not now.strange and now.elsewhere is None:
+        return None
+    await vouch(store, site, now.status, by)
+    what = STRANGE if now.elsewhere is None else f"a table that was {now.elsewhere.not_here}"
+    return f"{what} (CRC {now.crc:08X}) is accepted by {by}"
+
+
+async def vouch(store: Store, site: Site, now: CompStatus, by: str) -> None:
+    """Write a person's word for the table in force into the journal of the control, whose last push has come to its end."""
+    book = await StoreBook.word(store, site.name, SystemClock(), site.control)
+    journal = await book.entries()
+    await book.append(journal, State.ACCEPTED, said(now, by) | ({} if journal else {"machine": site.name, "control": site.control}))
+
+
+def said(now: CompStatus, by: str) -> Doc:
+    """What a journal keeps of a person's word."""
+    return {"accepted_bank": now.active_bank, "accepted_crc": now.bank_crc[now.active_bank], "by": by}

@@ -1,0 +1,1 @@
+"""Figures of checks against limits, ISO 230 figures, trends and alarms."""

@@ -1,0 +1,116 @@
+"""Alarms in the store: looked at after each check, read for pages and commands, acknowledged by a person."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+
+from abbe.models.trend import MOST_CHECKS
+from abbe.service.errors import StoreError
+from abbe.service.push.book import read_entries
+from abbe.service.push.states import State
+from abbe.service.storage.records import AlarmEntryRecord, Doc, VerificationRecord
+from abbe.service.storage.store import Store
+from abbe.service.verification.alarm_signals import Terms, found_in
+from abbe.service.verification.alarm_states import Alarm, Found, Kind, after_check, folded, is_open
+
+READ_CHECKS = 4 * MOST_CHECKS
+"""Checks that are looked at: of several recipes, a multiple of what the trend uses of one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """What a check means for the alarm of its recipe: ``kind`` None: nothing."""
+
+    kind: Kind | None
+    now: Alarm | None
+    found: Found
+
+
+def alarms_of(store: Store, machine: str) -> list[Alarm]:
+    """All alarms of a machine, oldest first."""
+    return folded(store.alarm_entries(machine))
+
+
+def open_alarms(store: Store, machine: str) -> list[Alarm]:
+    """Those that a person should see: active, or not acknowledged; the newest first."""
+    return [one for one in reversed(alarms_of(store, machine)) if is_open(one)]
+
+
+def alarm_doc(one: Alarm) -> Doc:
+    """An alarm as JSON value, for page, MQTT and commands."""
+    return {
+        "alarm": one.number,
+        "state": one.word,
+        "recipe": one.recipe,
+        "schedule": one.schedule,
+        "text": one.text,
+        "signals": list(one.signals),
+        "verification": one.verification,
+        "raised_utc": one.raised_utc,
+        "acknowledged_by": one.acknowledged_by,
+        "acknowledged_utc": one.acknowledged_utc or None,
+        "cleared_utc": one.cleared_utc or None,
+        "outcome": one.outcome,
+        "work": [{"kind": str(s.kind), "utc": s.utc, "text": str(s.doc.get("text", ""))} for s in one.work],
+        "proposal": None if (step := one.last(Kind.PROPOSED)) is None else step.doc.get("proposal"),
+    }
+
+
+def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
+    """Note that a person has seen an alarm.
+
+    Raises
+    ------
+    StoreError
+        There is no such alarm, or somebody has acknowledged it.
+    """
+    one = alarm_numbered(store, machine, number)
+    if one.acknowledged_by:
+        raise StoreError(f"alarm {number} of {machine} was acknowledged by {one.acknowledged_by} at {one.acknowledged_utc}")
+    store.add_alarm_entry(machine, number, one.last_seq + 1, Kind.ACKNOWLEDGED, {"name": name})
+    return alarm_numbered(store, machine, number)
+
+
+def alarm_numbered(store: Store, machine: str, number: int) -> Alarm:
+    """One alarm; StoreError if there is none."""
+    found = next((one for one in alarms_of(store, machine) if one.number == number), None)
+    if found is None:
+        raise StoreError(f"{machine} has no alarm {number}", "abbe alarm list shows those there are")
+    return found
+
+
+def active_alarm(store: Store, machine: str, recipe: str) -> Alarm | None:
+    """The active alarm of a recipe; there is at most one."""
+    return next((one for one in reversed(alarms_of(store, machine)) if one.active and one.recipe == recipe), None)
+
+
+def series_begins(store: Store, machine: str) -> datetime | None:
+    """When the table in force came into force: checks before it are of another machine. None: Abbe has brought none into force.
+
+    A push that came back leaves the series as it is; tables that others have written are not known here.
+    """
+    changed = [e.utc for e in read_entries(store, machine) if e.state in (State.KEEP, State.ACCEPTED)]
+    return datetime.fromisoformat(changed[-1]) if changed else None
+
+
+def look(store: Store, machine: str, recipe: str, records: Sequence[VerificationRecord], warn_days: float) -> Looked:
+    """Hold the latest check of a recipe against those before it and against the alarm that is active. Nothing is written."""
+    begins, now = series_begins(store, machine), active_alarm(store, machine, recipe)
+    compare = None
+    if now is not None and (begins is None or begins < datetime.fromisoformat(now.raised_utc)):
+        compare = {d["figure"]: (d["baseline"], d["baseline_u"]) for d in now.first if d["kind"] == "jump"}
+    found = found_in(records, Terms(recipe, begins, warn_days, compare))
+    return Looked(after_check(now, found), now, found)
+
+
+def check_line(looked: Looked, recipe: str, schedule: str, verification: int) -> Doc:
+    """The document of the line that a check writes."""
+    signals = [asdict(s) for s in looked.found.signals]
+    return {"recipe": recipe, "schedule": schedule, "verification": verification, "signals": signals, "text": looked.found.text}
+
+
+def last_seq(entries: Sequence[AlarmEntryRecord], number: int) -> int:
+    """Number of the last line of an alarm; -1 if there is none."""
+    return max((e.seq for e in entries if e.alarm == number), default=-1)

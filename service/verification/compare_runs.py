@@ -1,0 +1,225 @@
+"""Runs of one kind side by side: may they be compared, their curves on one scale, and is a difference larger than its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import U_WAVELENGTH
+from abbe.models.verification import U_REPEAT_MM, helix_figure
+from abbe.service.rendering.document import Figure
+from abbe.service.rendering.numbers import COVERAGE, finite
+from abbe.service.runs.coverage import not_judged
+from abbe.service.runs.helix_axis import about_axis, helix_axis, path_axis
+
+MOST = 4
+NEAR_RAD = 0.05
+"""Two readings of a ball-bar belong to the same place up to this angle: the deviation of a machine is smooth over it."""
+SAME_PLACE_MM = 0.5
+SAME_FEED = 0.01
+"""Feeds that differ by less than this share are one feed."""
+KIND = ("plane", "axis", "diagonal", "face", "order")
+"""Keys of a set-up that make another test of it, where it has them."""
+PLACE = ("centre_mm", "radius_mm", "start_mm", "end_mm")
+UM = 1e3
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A run to be compared: name of its machine, its ``abbe-run/1`` object, its readings, its figures."""
+
+    label: str
+    machine: str
+    run: dict[str, Any]
+    data: RunData
+    figures: Sequence[Figure]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Deviation along a run, µm, noise, repeatability and calibration as standard uncertainty (NaN: not known).
+
+    ``x``: degrees about the axis of a ball-bar path, mm along a laser line. ``place``: direction of the bar, or ``x`` again, shape (n, k).
+    """
+
+    round: bool
+    x: F1
+    deviation_um: F1
+    u_um: F1
+    place: F2
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Second minus first where both were read: abscissa, µm, standard uncertainty; the largest and the rms."""
+
+    x: F1
+    difference_um: F1
+    u_um: F1
+
+    @property
+    def largest(self) -> int:
+        """Index of the largest."""
+        return int(np.argmax(np.abs(self.difference_um)))
+
+    @property
+    def beyond(self) -> float:
+        """Share of the places where the difference exceeds its U; NaN where no U is known."""
+        known = np.isfinite(self.u_um) & (self.u_um > 0.0)
+        return float((np.abs(self.difference_um) > COVERAGE * self.u_um)[known].mean()) if known.any() else float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class FigureRow:
+    """One figure of all runs, value and standard uncertainty; of the last against the first: difference, u, whether larger than U."""
+
+    symbol: str
+    name: str
+    unit: str
+    values: Sequence[tuple[float | None, float | None]]
+    difference: float | None
+    u: float | None
+    sure: bool | None
+
+
+def against(first: Loaded, other: Loaded) -> str:
+    """Why two runs cannot be compared, in one line; empty if they can."""
+    if first.machine != other.machine:
+        names = f"{other.label} was measured on machine {other.machine}, {first.label} on {first.machine}"
+        return f"{names}: runs of two machines have no difference"
+    if first.run["test"] != other.run["test"]:
+        return f"{other.label} is {other.run['test']}, {first.label} is {first.run['test']}: only runs of one test can be compared"
+    for key in KIND:
+        a, b = (_kind(r, key) for r in (first, other))
+        if a != b:
+            return f"{key} of {other.label} is {b or 'none'}, of {first.label} {a or 'none'}: they ran along different paths"
+    for one in (first, other):
+        if why := not_judged(one.run):
+            return f"{one.label}: {why}; a part of a path has no difference"
+    return ""
+
+
+def _kind(one: Loaded, key: str) -> Any:
+    """What a set-up says under a key; the axis of a helix also where only its path tells it."""
+    setup = one.run["setup"]
+    if key == "axis" and one.run["test"] == "ballbar_helix":
+        axis = helix_axis(setup, one.data.axes_mm)
+        return "" if axis is None else AXES[axis]
+    return setup.get(key) or ""
+
+
+def _feed(mm_min: float) -> str:
+    return f"{mm_min:g} mm/min"
+
+
+def remarks(loaded: Sequence[Loaded], feed: Callable[[float], str] = _feed) -> list[str]:
+    """What the reader has to know: other places, other tables in force, another direction or feed; ``feed`` writes mm/min with its unit."""
+    out = []
+    first = loaded[0]
+    for other in loaded[1:]:
+        apart = [key for key in PLACE if not _same(first.run["setup"].get(key), other.run["setup"].get(key))]
+        if apart:
+            out.append(f"{other.label} was measured elsewhere than {first.label} ({', '.join(apart)}): the difference holds that too")
+        tables = [(r.run.get("table") or {}).get("crc") for r in (first, other)]
+        if tables[0] != tables[1]:
+            out.append(f"{other.label} was measured with another compensation table in force than {first.label}")
+        ways = [set(_column(r, "direction")) for r in (first, other)]
+        if all(ways) and ways[0] != ways[1]:
+            out.append(f"{other.label} was driven in another direction than {first.label}: reversal errors are in the difference")
+        feeds = [float(np.median(f)) if (f := _column(r, "feed_mm_min")) else float("nan") for r in (first, other)]
+        if abs(feeds[1] - feeds[0]) > SAME_FEED * abs(feeds[0]):
+            told = f"{feed(feeds[1])}, {first.label} with {feed(feeds[0])}"
+            out.append(f"{other.label} was driven with {told}: what depends on feed is in the difference")
+    return out
+
+
+def _column(one: Loaded, name: str) -> list[float]:
+    """What a column of a run holds; empty where it has none."""
+    return [float(v) for v in (one.run.get("columns") or {}).get(name) or () if v is not None]
+
+
+def _same(a: Any, b: Any) -> bool:
+    if a is None or b is None:
+        return a is b
+    first, second = np.atleast_1d(np.asarray(a, dtype=np.float64)), np.atleast_1d(np.asarray(b, dtype=np.float64))
+    return first.shape == second.shape and bool(np.abs(first - second).max() <= SAME_PLACE_MM)
+
+
+def curve(one: Loaded) -> Curve:
+    """Deviation along a run as it is compared.
+
+    Of a ball-bar: centre and length of the bar fitted away, noise from second differences, and what mounting it anew changes. Of a laser:
+    mean of all readings of a position, noise from their scatter between out and back about its mean (which is lost motion), the
+    wavelength's share of the length.
+    """
+    return _bar(one) if one.data.kind == "bar" else _laser(one)
+
+
+def _bar(one: Loaded) -> Curve:
+    data = one.data
+    assert data.centre_mm is not None
+    left = helix_figure(data).deviation_mm
+    at = data.axes_mm - data.centre_mm
+    noise = 1.4826 * float(np.median(np.abs(left[2:] - 2 * left[1:-1] + left[:-2]))) / np.sqrt(6.0)
+    angle = np.degrees(about_axis(at, path_axis(one.run, data.axes_mm)))
+    place = at / np.linalg.norm(at, axis=1, keepdims=True)
+    return Curve(True, angle, left * UM, np.full(left.size, np.hypot(noise, U_REPEAT_MM) * UM), place)
+
+
+def _laser(one: Loaded) -> Curve:
+    data = one.data
+    assert data.beam is not None
+    s = np.round((data.axes_mm - data.axes_mm[0]) @ data.beam, 2)
+    order = np.argsort(s, kind="stable")
+    groups = [(p, [data.deviation_mm[i] for i in rows]) for p, rows in groupby(order, key=lambda i: float(s[i]))]
+    x = np.array([p for p, _ in groups])
+    mean = np.array([np.mean(v) for _, v in groups])
+    half = np.array([(v[0] - v[1]) / 2 for _, v in groups if len(v) == 2])
+    scatter = float(np.std(half, ddof=1)) if half.size > 2 else float("nan")
+    return Curve(False, x, mean * UM, np.hypot(scatter, U_WAVELENGTH * np.abs(x)) * UM, x[:, None])
+
+
+def difference(first: Curve, second: Curve) -> Difference | None:
+    """Second minus first at the places of the first that both have read; None where there are fewer than three."""
+    far = NEAR_RAD if first.round else 0.05
+    distance, at = cKDTree(second.place).query(first.place)
+    near = distance <= far
+    if int(near.sum()) < 3:
+        return None
+    at = at[near]
+    apart = second.deviation_um[at] - first.deviation_um[near]
+    return Difference(first.x[near], apart, np.hypot(first.u_um[near], second.u_um[at]))
+
+
+def figure_rows(loaded: Sequence[Loaded]) -> list[FigureRow]:
+    """Figures that every run has with a unit, in the order of the first.
+
+    The uncertainty of a difference counts both as independent: what both share (the same laser, the same bar) makes it smaller, not larger.
+    """
+    tables = [{(f.symbol, f.name): f for f in one.figures if f.unit} for one in loaded]
+    out = []
+    for key, head in tables[0].items():
+        found = [t[key] for t in tables if key in t]
+        if len(found) < len(loaded) or all(f.value is None for f in found):
+            continue
+        values = [(f.value, f.u) for f in found]
+        out.append(FigureRow(head.symbol, head.name, head.unit, values, *_apart(values[0], values[-1])))
+    return out
+
+
+def _apart(a: tuple[float | None, float | None], b: tuple[float | None, float | None]) -> tuple[float | None, float | None, bool | None]:
+    if not (finite(a[0]) and finite(b[0])):
+        return None, None, None
+    apart = b[0] - a[0]
+    if not (finite(a[1]) and finite(b[1])):
+        return apart, None, None
+    u = float(np.hypot(a[1], b[1]))
+    return apart, u, abs(apart) > COVERAGE * u

@@ -1,0 +1,181 @@
+"""Runs as ISO 230 sees them: approaches of positions, diagonals, circles. Which runs belong to one test, and what of each counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.models.evaluation.iso230_2 import Approaches
+from abbe.models.evaluation.iso230_4 import Circle
+from abbe.models.machine import AXES
+from abbe.models.solvers.observations import nominal_reading
+from abbe.service.errors import AbbeError, MeasurementFault
+from abbe.service.runs.observations import run_data
+
+NEAR_MM = 0.05
+"""Positions closer than this are the same one, approached again (the same as for discoveries: `abbe.service.effects.axis_test`)."""
+ALL = 10**9
+
+Run = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class AxisTest:
+    """One bidirectional test along an axis, or along a diagonal. ``runs``: labels; ``notes``: what the reader has to know."""
+
+    name: str
+    setup: str
+    runs: tuple[str, ...]
+    readings: Approaches
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CircleTest:
+    """One path around a circle; ``sense`` +1: from the plane's first axis to its second."""
+
+    run: str
+    plane: str
+    setup: str
+    radius_mm: float
+    sense: int
+    path: Circle
+    u_length_mm: float | None
+
+
+def linear_tests(runs: Sequence[Run], refused: list[str]) -> list[AxisTest]:
+    """Positioning tests of single axes: runs of one axis in one set-up are one test. ``refused`` gets what cannot be one, in words."""
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in _open(runs, "laser_linear"):
+        groups.setdefault((_axis(run), str(run["setup"]["setup_id"])), []).append(run)
+    return [t for (name, setup), group in groups.items() if (t := _test(name, setup, group, refused)) is not None]
+
+
+def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[AxisTest]]:
+    """Plain diagonals by where they belong: ``body`` or a plane. Step diagonals are no test of ISO 230-6."""
+    groups: dict[tuple[str, str, str], list[Run]] = {}
+    for run in _open(runs, "laser_diagonal"):
+        setup = run["setup"]
+        if not setup.get("order"):
+            face = setup.get("face")
+            name = str(setup["diagonal"])
+            if face:
+                name = "".join(name["XYZ".index(a)] for a in face)
+            groups.setdefault((str(face or "body"), name, str(setup["setup_id"])), []).append(run)
+    out: dict[str, list[AxisTest]] = {}
+    for (where, name, setup_id), group in groups.items():
+        test = _test(name, setup_id, group, refused)
+        if test is not None and name not in {t.name for t in out.get(where, [])}:  # measured again: the first one counts
+            out.setdefault(where, []).append(test)
+    return out
+
+
+def circle_tests(runs: Sequence[Run], refused: list[str]) -> list[CircleTest]:
+    """Ball-bar circles, each path of its own."""
+    out = []
+    for run in _open(runs, "ballbar_circle"):
+        try:
+            out.append(_circle(run))
+        except (AbbeError, ValueError) as error:
+            refused.append(f"circle {run['run_id']}: {_said(error)}")
+    return out
+
+
+def _circle(run: Run) -> CircleTest:
+    plane = str(run["setup"]["plane"])
+    data = run_data(run, blocks=ALL)
+    assert data.centre_mm is not None
+    a, b = ("XYZ".index(c) for c in plane)
+    at = data.axes_mm - data.centre_mm
+    angle = np.unwrap(np.arctan2(at[:, b], at[:, a]))
+    path = Circle(angle, data.deviation_mm - nominal_reading(data))
+    sense = 1 if angle[-1] >= angle[0] else -1
+    u = run["setup"].get("u_length_mm") if run["setup"].get("length_calibrated") else None
+    return CircleTest(run["run_id"], plane, data.setup, float(run["setup"]["radius_mm"]), sense, path, u)
+
+
+def _said(error: Exception) -> str:
+    return error.detail if isinstance(error, AbbeError) else str(error)
+
+
+def _open(runs: Sequence[Run], test: str) -> list[Run]:
+    """Runs of a kind whose readings are there."""
+    return [r for r in runs if r["test"] == test and r["columns"].get("deviation_mm") is not None]
+
+
+def _axis(run: Run) -> str:
+    named = run["setup"].get("axis")
+    return str(named) if named else AXES[int(np.argmax(np.abs(_way(run))))]
+
+
+def _way(run: Run) -> F1:
+    return np.asarray(np.subtract(run["setup"]["end_mm"], run["setup"]["start_mm"]), dtype=np.float64)
+
+
+def _test(name: str, setup: str, group: list[Run], refused: list[str]) -> AxisTest | None:
+    """Readings by position, side and cycle; None, and why, where they are no test from both sides."""
+    runs = tuple(r["run_id"] for r in group)
+    try:
+        readings = _approaches(name, group)
+    except (AbbeError, ValueError) as error:
+        refused.append(f"{name} ({', '.join(runs)}): {_said(error)}")
+        return None
+    return AxisTest(name, setup, runs, readings, tuple(_notes(group)))
+
+
+def _approaches(name: str, group: list[Run]) -> Approaches:
+    cells: dict[tuple[float, int], list[float]] = {}
+    for run in group:
+        position, sign, value = _readings(run, name)
+        for p, s, v in zip(position, sign, value, strict=True):
+            cells.setdefault((float(p), int(s)), []).append(float(v))
+    turns = {p for run in group for p in _turning_points(run, name)}
+    places = sorted({p for p, s in cells if (p, -s) in cells} - turns)
+    cycles = max((len(cells[p, s]) for p in places for s in (1, -1)), default=0)
+    sides = [np.array([cells[p, s] + [np.nan] * (cycles - len(cells[p, s])) for p in places]) for s in (1, -1)]
+    return Approaches(np.array(places), *sides)
+
+
+def _readings(run: Run, name: str) -> tuple[F1, F1, F1]:
+    """Position along the test, direction and deviation of the readings that count, mm; along the axis' positive sense."""
+    columns = run["columns"]
+    axes = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
+    keep = np.asarray(columns.get("valid", np.ones(len(axes)))).astype(bool)
+    if len(name) == 1:
+        along, turned = axes[:, "XYZ".index(name)], float(np.sign(_way(run)["XYZ".index(name)]))
+    else:
+        way = _way(run)
+        along, turned = (axes - np.asarray(run["setup"]["start_mm"])) @ (way / np.linalg.norm(way)), 1.0
+    deviation = np.asarray(columns["deviation_mm"], dtype=np.float64)
+    if turned == 0.0 or not np.isfinite(deviation[keep]).all():
+        raise MeasurementFault(f"run {run['run_id']}: it is no test along {name}, or a deviation is no number", "leave it out")
+    sign = np.asarray(columns["direction"], dtype=np.float64) * turned
+    return _place(along)[keep], sign[keep], (deviation * turned)[keep]
+
+
+def _place(along: F1) -> F1:
+    return np.asarray((np.round(along / NEAR_MM) * NEAR_MM).round(6))
+
+
+def _turning_points(run: Run, name: str) -> list[float]:
+    """Places beyond the positions where the machine turns: they are read, but are no targets (recipes with an overrun)."""
+    setup = run["setup"]
+    if not setup.get("overrun_mm"):
+        return []
+    ends = np.array([setup["start_mm"], setup["end_mm"]], dtype=np.float64)
+    if len(name) == 1:
+        return [float(v) for v in _place(ends[:, "XYZ".index(name)])]
+    return [0.0, float(_place(np.array([np.linalg.norm(ends[1] - ends[0])]))[0])]
+
+
+def _notes(group: list[Run]) -> list[str]:
+    out = []
+    if not any(r["setup"].get("overrun_mm") for r in group):
+        out.append("the end positions have no overrun on record: there the two sides may be one approach read twice, and B shows nothing")
+    if len(group) > 1 and all(r["columns"]["deviation_mm"][0] == 0.0 for r in group):
+        out.append("every run was zeroed at its first reading: what that reading scatters is in R and A of all other positions")
+    return out

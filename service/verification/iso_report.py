@@ -1,0 +1,213 @@
+"""ISO 230-2, 230-4 and 230-6 of some runs as figures and pictures of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from abbe.models.evaluation.iso230_2 import Positioning, ScaleBudget, Value, positioning
+from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circular
+from abbe.models.evaluation.iso230_6 import BODY, FACE, diagonals
+from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.verification import U_REPEAT_MM
+from abbe.service.rendering.document import Figure, Picture
+from abbe.service.rendering.model import PolarTrace
+from abbe.service.rendering.numbers import plain
+from abbe.service.rendering.plots.polar import polar_plot
+from abbe.service.rendering.plots.positioning import PositioningCurves, positioning_plot
+from abbe.service.runs.coverage import not_judged
+from abbe.service.verification.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
+
+UM = 1e3
+POLAR_POINTS = 720
+LASER_STATEMENT = (
+    "U of ISO 230-2 and 230-6 figures holds the scatter of the cycles, as far as repeats show it, the wavelength ({wave:g} µm/m), the "
+    "temperature of the scales (known to {kelvin:g} K at {expansion:g} µm/m/K) and the resolution, propagated through the figure's own "
+    "formula (idea of ISO/TR 230-9). Deviations are as measured, not reduced to 20 °C. Where there is one cycle, "
+    "the scatter is that of the reversals about their mean."
+)
+BAR_STATEMENT = (
+    "U of ISO 230-4 figures holds the noise of a reading, {repeat:g} µm for a bar that is hung in again (an assumption) and, for F alone, "
+    "the length of the bar. G takes extremes of single readings: noise makes it larger, never smaller."
+)
+
+
+@dataclass
+class Evaluated:
+    """What the standards say of some runs; ``statements`` are part of the uncertainty statement."""
+
+    figures: list[Figure] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    not_observable: list[str] = field(default_factory=list)
+    statements: list[str] = field(default_factory=list)
+
+
+def evaluate(runs: Sequence[dict[str, Any]], instruments: dict[str, Any] | None = None) -> Evaluated:
+    """Evaluate every run that is a test of ISO 230-2, 230-4 or 230-6.
+
+    Parameters
+    ----------
+    runs : sequence of dict
+        ``abbe-run/1`` objects.
+    instruments : dict, optional
+        ``instruments`` of the campaign (run-format.md 4): resolutions.
+    """
+    out = Evaluated()
+    budget = scale_budget(instruments or {})
+    refused = [f"run {run['run_id']}: {why}" for run in runs if (why := not_judged(run))]
+    runs = [run for run in runs if not not_judged(run)]
+    linear, along, circles = linear_tests(runs, refused), diagonal_tests(runs, refused), circle_tests(runs, refused)
+    out.not_observable += [f"figures by ISO 230 of {line}" for line in refused]
+    for test in linear:
+        _axis(out, test, budget)
+    for where, tests in along.items():
+        _diagonals(out, where, tests, budget)
+    if linear or along:
+        known = Inputs()
+        numbers = {"wave": known.u_wavelength * 1e6, "kelvin": known.u_scale_temperature_k, "expansion": known.scale_expansion_per_k * 1e6}
+        out.statements.append(LASER_STATEMENT.format(**numbers))
+    if circles:
+        _circles(out, circles)
+        out.statements.append(BAR_STATEMENT.format(repeat=U_REPEAT_MM * UM))
+    return out
+
+
+def scale_budget(instruments: dict[str, Any]) -> ScaleBudget:
+    """What repeats do not show, from the budget's stated inputs and the instrument's resolution."""
+    known = Inputs()
+    scale = float(np.hypot(known.u_wavelength, known.u_scale_temperature_k * known.scale_expansion_per_k))
+    return ScaleBudget(scale, float((instruments.get("laser") or {}).get("resolution_mm", 0.0)) / np.sqrt(12.0))
+
+
+def _axis(out: Evaluated, test: AxisTest, budget: ScaleBudget) -> None:
+    found = positioning(test.readings, budget)
+    group = f"Axis {test.name}, set-up {test.setup}: positioning, ISO 230-2"
+    out.figures += [_figure(group, *row, "ISO 230-2") for row in _rows(found)]
+    out.pictures.append(_positioning(f"{test.name} {test.setup}", f"position of {test.name} in mm", found))
+    runs = ", ".join(test.runs)
+    if found.lowest != found.most:
+        out.remarks.append(f"axis {test.name} ({runs}): positions have {found.lowest} to {found.most} approaches from one side")
+    out.remarks += [f"axis {test.name} ({runs}): {note}" for note in (*found.departures(), *test.notes)]
+    if found.R is None:
+        out.not_observable.append(f"repeatability and accuracy of axis {test.name}: every position was approached once from each side")
+
+
+def _rows(p: Positioning) -> list[tuple[str, str, Value | None]]:
+    return [
+        ("A", "accuracy of positioning, both directions", p.A),
+        ("A+", "accuracy of positioning, moving in +", p.A_forward),
+        ("A-", "accuracy of positioning, moving in -", p.A_backward),
+        ("E", "systematic deviation, both directions", p.E),
+        ("E+", "systematic deviation, moving in +", p.E_forward),
+        ("E-", "systematic deviation, moving in -", p.E_backward),
+        ("M", "range of the mean bidirectional deviations", p.M),
+        ("B", "reversal, largest", p.B),
+        ("B mean", "reversal, mean over the positions (signed)", p.B_mean),
+        ("R", "repeatability, both directions", p.R),
+        ("R+", "repeatability, moving in +", p.R_forward),
+        ("R-", "repeatability, moving in -", p.R_backward),
+    ]
+
+
+def _figure(group: str, symbol: str, name: str, value: Value | None, method: str) -> Figure:
+    if value is None:
+        return Figure(group, symbol, name, None, None, "µm", method)
+    return Figure(group, symbol, name, value.value_mm * UM, value.u_mm * UM, "µm", method)
+
+
+def _positioning(label: str, x_label: str, p: Positioning) -> Picture:
+    s = [None if v is None else v * UM for v in (p.s_forward_mm, p.s_backward_mm)]
+    curves = PositioningCurves(label, x_label, p.position_mm, p.mean_forward_mm * UM, p.mean_backward_mm * UM, *s)
+    words = ", ".join(f"{n} {plain(v.value_mm * UM)} µm" for n, v in (("E", p.E), ("B", p.B), ("R", p.R), ("A", p.A)) if v is not None)
+    bars = "; bars are two standard deviations to both sides" if p.s_forward_mm is not None else ""
+    caption = f"{label}: mean deviation of both directions{bars}. {words}."
+    return Picture(caption, positioning_plot(curves, key=f"positioning-{label}", figures=words), wide=True)
+
+
+def _diagonals(out: Evaluated, where: str, tests: list[AxisTest], budget: ScaleBudget) -> None:
+    found = diagonals({t.name: t.readings for t in tests}, BODY if where == "body" else FACE, budget)
+    what = "Body diagonals" if where == "body" else f"Face diagonals {where}"
+    group = f"{what}: ISO 230-6"
+    rows = [
+        ("E_d", "systematic deviation, both directions, of diagonal {}", found.E_d),
+        ("M_d", "range of the mean bidirectional deviations, of diagonal {}", found.M_d),
+        ("B_d", "reversal, of diagonal {}", found.B_d),
+    ] + ([("R_d", "repeatability, of diagonal {}", found.R_d)] if found.R_d is not None else [])
+    out.figures += [_figure(group, symbol, words.format(name), value, "ISO 230-6") for symbol, words, (name, value) in rows]
+    out.figures += [_figure(group, f"E {n}", f"systematic deviation of diagonal {n}", p.E, "ISO 230-6") for n, p in found.each.items()]
+    out.pictures += [_positioning(f"diagonal {n}", "along the diagonal in mm", p) for n, p in found.each.items()]
+    if found.missing:
+        out.not_observable.append(f"{what}: {', '.join(found.missing)} not measured, so the figures are lower bounds")
+    first = next(iter(found.each.values()))
+    out.remarks += [f"{what.lower()}: {note}" for note in dict.fromkeys((*first.departures(), *tests[0].notes))]
+
+
+def _circles(out: Evaluated, tests: list[CircleTest]) -> None:
+    key = lambda t: (t.plane, t.setup, t.radius_mm)  # noqa: E731 - a key and its sort belong together
+    for (plane, setup, radius), several in groupby(sorted(tests, key=key), key):
+        same = list(several)
+        group = f"Plane {plane}, radius {radius:g} mm, set-up {setup}: circles, ISO 230-4"
+        for test in same:
+            _circle(out, group, test)
+        pair = [next((t for t in same if t.sense == s), None) for s in (1, -1)]
+        if pair[0] is not None and pair[1] is not None:
+            _pair(out, group, pair[0], pair[1])
+        else:
+            out.not_observable.append(f"G(b) and H of plane {plane}, set-up {setup}: the circle was driven in one sense only")
+        traces = [_trace(t) for t in same]
+        caption = f"Plane {plane}, set-up {setup}: radial deviation about the least squares centre."
+        out.pictures.append(Picture(caption, polar_plot(traces, key=f"polar-{plane}-{setup}", heading=f"Circle {plane}")))
+
+
+def _sense(test: CircleTest) -> str:
+    """The path as ISO 230-4 writes it: the axis at the start first, XY from X to Y."""
+    return test.plane if test.sense > 0 else test.plane[::-1]
+
+
+def _circle(out: Evaluated, group: str, test: CircleTest) -> None:
+    one = circular(test.path)
+    u = _u(one)
+    u_f = None if test.u_length_mm is None else float(np.hypot(u, test.u_length_mm))
+    sub = _sense(test)
+    rows: list[tuple[str, str, float, float | None]] = [
+        (f"G_{sub}", f"circular deviation, run {test.run}", one.G_mm, np.sqrt(2.0) * u),
+        (f"G_{sub} (zone)", f"the same by the minimum zone, run {test.run}", one.G_zone_mm, np.sqrt(2.0) * u),
+        (f"F_{sub},max", f"radial deviation about the set-up's centre, largest, run {test.run}", one.F_max_mm, u_f),
+        (f"F_{sub},min", f"radial deviation about the set-up's centre, smallest, run {test.run}", one.F_min_mm, u_f),
+        (f"F_{sub},max (LSC)", f"about the least squares centre, largest, run {test.run}", one.F_max_centred_mm, u_f),
+        (f"F_{sub},min (LSC)", f"about the least squares centre, smallest, run {test.run}", one.F_min_centred_mm, u_f),
+    ]
+    out.figures += [Figure(group, s, n, v * UM, None if w is None else float(w) * UM, "µm", "ISO 230-4") for s, n, v, w in rows]
+    if not one.is_whole:
+        out.remarks.append(
+            f"circle {test.run}: an arc of {np.degrees(one.covered_rad):.0f}°, no whole circle: its centre is less well known"
+        )
+    if test.u_length_mm is None:
+        out.not_observable.append(f"U of F of run {test.run}: the length of the bar has no certificate in the data")
+
+
+def _pair(out: Evaluated, group: str, forward: CircleTest, backward: CircleTest) -> None:
+    both = both_ways(forward.path, backward.path)
+    u = float(np.sqrt(2.0) * max(_u(circular(t.path)) for t in (forward, backward)))
+    runs = f"runs {forward.run} and {backward.run}"
+    out.figures.append(
+        Figure(group, f"G(b)_{forward.plane}", f"bidirectional circular deviation, {runs}", both.G_b_mm * UM, u * UM, "µm", "ISO 230-4")
+    )
+    name = f"circular hysteresis, at {np.degrees(both.at_rad):.0f}°, {runs}"
+    out.figures.append(Figure(group, f"H_{forward.plane}", name, both.H_mm * UM, u * UM, "µm", "ISO 230-4"))
+
+
+def _u(one: OnePath) -> float:
+    """Of one reading of the shape, mm."""
+    return float(np.hypot(one.noise_mm, U_REPEAT_MM))
+
+
+def _trace(test: CircleTest) -> PolarTrace:
+    y = centred(test.path) * UM
+    step = max(1, y.size // POLAR_POINTS)
+    return PolarTrace(f"{test.run} ({_sense(test)})", np.degrees(test.path.angle_rad)[::step], y[::step])

@@ -1,0 +1,227 @@
+"""Which measurement stands behind the table in force: a check, the push that brought it, or none since the table was changed.
+
+A verdict belongs to the table that was in force while its runs were measured. Whatever brought another table into force since (a rollback,
+a push, a person's word, a stranger) leaves it behind. Every display asks here: home page, fleet, trends, reports, MQTT, OPC UA, MTConnect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+from abbe.service.errors import StoreError
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import Entry, JournalBroken, check_chain, facts
+from abbe.service.push.states import State
+from abbe.service.storage.records import Doc, VerificationRecord
+from abbe.service.storage.store import Store
+from abbe.service.tables.push_history import KIND, wanted_by
+
+LOOKED = 20
+"""So many of the latest checks are looked at for one that measured something."""
+STRANGE = "CMP-010"
+"""Code of the alarm that somebody else has changed the table in force."""
+
+_CHANGES = (State.KEEP, State.ACCEPTED)
+"""States of a push that bring a table into force. One that was taken back leaves things as they were."""
+
+Word = Literal["verified", "unverified", "unknown"]
+Why = Literal["check", "push", "rollback", "accepted", "changed", "other", "open", "never", "journal"]
+
+_WORDS: dict[str, str] = {
+    "check": "checked with the table in force: check {number} of {when}",
+    "push": "verified by push {number} of {when}, which measured before and after; not checked since",
+    "rollback": "unverified since the rollback of {when} (push {number})",
+    "accepted": "unverified since a person accepted the table, {when}",
+    "changed": "unverified since somebody else changed the table in force",
+    "other": "unverified: check {number} of {when} was measured with another table than the one in force",
+    "open": "unverified: push {number} of {when} is not finished",
+    "never": "not checked yet",
+    "journal": "unknown: the push journal is not what was written",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class VerifiedBy:
+    """What is known of a machine with the table in force.
+
+    Parameters
+    ----------
+    state : "verified", "unverified" or "unknown"
+        Whether a measurement stands behind the table in force. Verified by a check says that it was measured, not that it passed.
+    why : str
+        ``check``, ``push``: what measured it. ``rollback``, ``accepted``, ``changed``, ``other``, ``open``: since what it is unverified.
+        ``never``, ``journal``: why it is unknown.
+    number : int
+        Of the check or of the push; 0 for none.
+    utc : str
+        When that was; empty for never.
+    crc : int or None
+        CRC-32 of the table in force by the push journal; None where there was no push, or nobody knows.
+    since : datetime or None
+        When that table came into force by the journal; None where no push brought one. Checks before it are of another table.
+    changes : tuple of datetime
+        Whenever a table came into force.
+    """
+
+    state: Word
+    why: Why
+    number: int = 0
+    utc: str = ""
+    crc: int | None = None
+    since: datetime | None = None
+    changes: tuple[datetime, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether a verdict of a check can be shown as that of the machine."""
+        return self.why in ("check", "never")
+
+    @property
+    def text(self) -> str:
+        """One line for people: ``unverified since the rollback of 2026-11-23 02:10 UTC (push 3)``."""
+        return _WORDS[self.why].format(number=self.number, when=minute(self.utc))
+
+    def as_doc(self) -> Doc:
+        """As JSON value."""
+        crc = None if self.crc is None else f"{self.crc:08X}"
+        return {"state": self.state, "why": self.why, "number": self.number, "utc": self.utc or None, "table_crc": crc, "text": self.text}
+
+    def verdict(self, verdict: str) -> str:
+        """The word to show for the last verdict: itself where it holds, else where the machine stands."""
+        return verdict if self.holds else self.state
+
+
+def measure_now(machine_file: str = "MACHINE.toml") -> str:
+    """What to do about an unverified machine."""
+    return f"abbe measure {machine_file} --recipe quick-check"
+
+
+def minute(utc: str) -> str:
+    """A moment to the minute, as lines for people have it."""
+    return f"{datetime.fromisoformat(utc):%Y-%m-%d %H:%M} UTC" if utc else ""
+
+
+def strange_table(attention: Sequence[str]) -> bool:
+    """Whether what needs a person now is that somebody else has changed the table in force."""
+    return any(text.startswith(f"{STRANGE}:") for text in attention)
+
+
+def verified_by(store: Store, machine: str, *, control: str = "", strange: bool = False) -> VerifiedBy:
+    """Where a machine stands, by its push journal and its last checks.
+
+    Parameters
+    ----------
+    store : Store
+        The database.
+    machine : str
+        Name of the machine.
+    control : str
+        Identity of its control; empty: not known, the journal is that which this name was last used in.
+    strange : bool
+        The controller holds a table that the journal does not expect (`strange_table`); what the machine's service said last counts, too.
+
+    Raises
+    ------
+    StoreError
+        The database does not answer. A journal that was changed is a standing, not an error.
+    """
+    entries = read_entries(store, machine, control)
+    try:
+        check_chain(entries)
+    except JournalBroken:
+        return VerifiedBy("unknown", "journal")
+    checks = store.verifications_of(machine, LOOKED)
+    return of_journal(store, entries, checks, strange=strange or _said_strange(store, machine, entries, checks))
+
+
+def _said_strange(store: Store, machine: str, entries: Sequence[Entry], checks: Sequence[VerificationRecord]) -> bool:
+    """Whether the machine's service saw a strange table when it was heard last, and neither a table came into force since nor a check found
+    the journal's one in force.
+    """
+    said = store.stations().get(machine)
+    if said is None or not strange_table(said.doc.get("attention") or []):
+        return False
+    seen = datetime.fromisoformat(said.seen_utc)
+    last = _last_measured(checks)
+    if last is not None and _with(store, last, wanted_by(list(entries))[0], seen):
+        return False
+    return all(datetime.fromisoformat(e.utc) <= seen for e in entries if e.state in _CHANGES)
+
+
+def of_journal(store: Store, entries: Sequence[Entry], checks: Sequence[VerificationRecord], *, strange: bool = False) -> VerifiedBy:
+    """The same of a journal that was read and checks, newest first."""
+    crc, settled = wanted_by(list(entries))
+    changed = [e for e in entries if e.state in _CHANGES]
+    changes = tuple(datetime.fromisoformat(e.utc) for e in changed)
+    known: dict[str, Any] = {"crc": crc, "since": changes[-1] if changes else None, "changes": changes}
+    if not settled:
+        return VerifiedBy("unverified", "open", entries[-1].push, entries[-1].utc, **known)
+    last = _last_measured(checks)
+    if strange:
+        return VerifiedBy("unverified", "changed", 0, "", **known)
+    if last is not None and (not changes or started(last) > changes[-1] or _with(store, last, crc, changes[-1])):
+        table = table_of(store, last)
+        other = crc is not None and table is not None and table != crc
+        return VerifiedBy("unverified" if other else "verified", "other" if other else "check", last.id, started(last).isoformat(), **known)
+    if changed:
+        return _since(store, entries, changed[-1], known)
+    return VerifiedBy("unknown", "never", **known)
+
+
+def _since(store: Store, entries: Sequence[Entry], change: Entry, known: dict[str, Any]) -> VerifiedBy:
+    """No check was measured since a table came into force: what brought it says whether a measurement stands behind it."""
+    if change.state is State.ACCEPTED:
+        return VerifiedBy("unverified", "accepted", change.push, change.utc, **known)
+    number = facts(tuple(e for e in entries if e.push == change.push)).get("table")
+    if number and _kind(store, int(number)) == KIND:
+        return VerifiedBy("unverified", "rollback", change.push, change.utc, **known)
+    return VerifiedBy("verified", "push", change.push, change.utc, **known)
+
+
+def _kind(store: Store, table: int) -> str:
+    try:
+        return str(store.table(table).doc.get("kind", "push"))
+    except StoreError:  # without its document it counts as one that nothing has measured
+        return KIND
+
+
+def measured(record: VerificationRecord) -> bool:
+    """Whether a stored verification is a check that measured the machine: not one of a push, nor one that could not be completed."""
+    return not record.doc.get("push") and bool(record.doc.get("values"))
+
+
+def of_push_taken_back(record: VerificationRecord) -> bool:
+    """Whether it is the verification of a push that was not kept: of a table that is not in force."""
+    return bool(record.doc.get("push")) and record.verdict != "pass"
+
+
+def _last_measured(checks: Sequence[VerificationRecord]) -> VerificationRecord | None:
+    return next((one for one in checks if measured(one)), None)
+
+
+def _with(store: Store, record: VerificationRecord, crc: int | None, since: datetime) -> bool:
+    """Whether a check began after a moment, and the table in force was this one."""
+    return crc is not None and began(store, record) > since and table_of(store, record) == crc
+
+
+def began(store: Store, record: VerificationRecord) -> datetime:
+    """When a check's campaign began, after a word for the table that was given with the command; without a campaign: the check itself."""
+    if record.campaign_id is None:
+        return started(record)
+    return datetime.fromisoformat(store.campaign(record.campaign_id).created_utc)
+
+
+def started(record: VerificationRecord) -> datetime:
+    """When a check began; its table was read then."""
+    return datetime.fromisoformat(record.doc.get("started_utc") or record.utc)
+
+
+def table_of(store: Store, record: VerificationRecord) -> int | None:
+    """CRC-32 of the table that was in force while a check was measured; None where nobody wrote it down."""
+    crc = record.doc.get("table_crc")
+    if crc is None and record.campaign_id is not None:
+        crc = store.campaign(record.campaign_id).doc.get("table_crc")
+    return None if crc is None else int(crc)

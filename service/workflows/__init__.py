@@ -1,1 +1,0 @@
-"""The jobs: measure, solve, compensate, verify, and the demonstration that strings them together."""
