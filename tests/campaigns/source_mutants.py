@@ -80,9 +80,9 @@ MUTANTS = (
     Mutant("lost lease does not end the measurement", ADAPTER, "                except Refused:\n                    lost.set()\n                    return\n", "                except Refused:\n                    return\n", (AROUND + "::test_a_measurement_ends_when_another_takes_the_lease_and_its_table_is_not_kept",)),
     Mutant("active bank after ACTIVATE not asked (driver)", "drivers/cnc/banks.py", "if active != bank:", "if False:", (BANKS + "::test_acknowledged_but_not_active_is_a_fault",)),
     Mutant("active bank after ACTIVATE not asked (push)", MACHINE, '(in_force(f, known.start) != "candidate" or known.start.boot', "(known.start.boot", (SINGLE,)),
-    Mutant("an unverified table in force is not refused", "service/compensation/recover.py", "if crc in unverified:", "if False:", (UNVERIFIED,)),
+    Mutant("an unverified table in force is not refused", "service/tables/table_gate.py", "    if now.unverified is not None:\n        whose", "    if False:\n        whose", (UNVERIFIED,)),
     Mutant("no table is unverified", "service/tables/unverified.py", "if crc not in fine}", "if False}", (UNVERIFIED,)),
     Mutant("a table that once was a base is fine", "service/tables/unverified.py", "            if base not in candidates:\n", "            if True:\n", (UNVERIFIED,)),
-    Mutant("a kept table is unverified", "service/tables/unverified.py", "fine.add(pushed[entry.push])", "fine.discard(pushed[entry.push])", (UNVERIFIED,)),
-    Mutant("a table that a person vouched for is unverified", "service/tables/unverified.py", 'fine.add(int(entry.doc["accepted_crc"]))', 'fine.discard(int(entry.doc["accepted_crc"]))', (UNVERIFIED,)),
+    Mutant("a kept table is unverified", "service/tables/unverified.py", "fine.add(pushed[push])", "fine.discard(pushed[push])", (UNVERIFIED,)),
+    Mutant("a table that a person vouched for is unverified", "service/tables/unverified.py", 'fine.add(int(doc["accepted_crc"]))', 'fine.discard(int(doc["accepted_crc"]))', (UNVERIFIED,)),
 )  # fmt: skip
