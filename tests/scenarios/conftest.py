@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from tests import hardware
+
 ABBE = [sys.executable, "-c", "from abbe.service.cli import main; main()"]
 
 
@@ -56,6 +58,7 @@ def simulated(folder: Path, *args: str, extra: str = "", program: tuple[str, ...
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
     assert process.stdout is not None
+    hardware.first(process.pid)
     try:
         ready = json.loads(process.stdout.readline())
         path = folder / "machine.toml"

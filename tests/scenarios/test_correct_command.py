@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 def identified(tmp_path_factory):
     """A simulated machine and the campaigns `june` (identification) and `start` (verification), measured once for all tests here."""
     folder = tmp_path_factory.mktemp("identified")
-    with simulated(folder, "--speed", "120") as sims:
+    with simulated(folder, "--speed", "60") as sims:
         site = site_of(load_machine(sims.machine_file).machine)
         with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
             asyncio.run(as_if_commissioned_at(sims.ready["cnc"], store, site))

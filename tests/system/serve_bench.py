@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 
+from tests import hardware
+
 HERE = Path(__file__).parent
 PATIENCE_S = 75.0
 
@@ -179,6 +181,7 @@ class Machine:
     def __init__(self, folder: Path, speed: float, *sections: str) -> None:
         self.process = Process(sys.executable, "-m", "abbe.simulators", "--speed", str(speed), "--ballbar", "tcp", "--link-dir", folder)
         ready = json.loads(self.process.expect('"ready"'))
+        hardware.first(self.process.pid)
         machine = ready["machine"]
         lines = ['name = "mill-7"', f"chain = {json.dumps(machine['chain'])}", f"tool_mm = {json.dumps(machine['tool_mm'])}"]
         for table in ("stroke_mm", "pivots_mm"):
