@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.storage.store import Store
+from tests import hardware
 from tests.scenarios.world import interrupt, simulators_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
@@ -36,7 +37,9 @@ def bar_run_under_way(folder: Path, chunks: int = 1, name: str = "identify") -> 
 
 def test_the_machine_becomes_better_and_the_archive_is_loss_free(abbe, tmp_path):
     folder = tmp_path / "kept"
-    process = abbe("demo", "--seed", "2", "--speed", "120", "--json", "--keep", str(folder))
+    process = abbe("demo", "--seed", "2", "--speed", "60", "--json", "--keep", str(folder))
+    for pid in wait_for(lambda: simulators_of(folder), 60, "the simulated machine"):
+        hardware.first(pid)
     out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
     found = json.loads(out)
