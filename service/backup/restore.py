@@ -117,7 +117,7 @@ def _proved(part: Path, told: Path) -> int:
     """Prove a copied backup; return the number of the audit's records."""
     revision = prove_copy(part / DATABASE)
     if revision not in known_revisions():
-        raise BackupRefused(f"{told} has schema {revision}, which this version of Abbe does not know", "use the newer Abbe that wrote it")
+        raise BackupRefused(f"{told} has schema {revision}, which this version of Abbe does not know", "use the Abbe that wrote it")
     key = part / KEY
     records, found = audit_faults(part / DATABASE, part / HEADS, key if key.exists() else None)
     if records and not key.exists():

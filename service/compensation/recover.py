@@ -9,7 +9,6 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.old_pushes import finish_old_push
 from abbe.service.compensation.pushing import pushes_here
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
 from abbe.service.push import execute
@@ -52,9 +51,9 @@ async def recover(controller: Controller, store: Store, site: Site, *, accept_by
         The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only told.
     """
     # First: whatever is wrong with a segment, no unverified table stays active.
-    pushed = [await finish_old_push(controller, store, site), await finish_push(controller, store, site, accept_by=accept_by)]
+    pushed = await finish_push(controller, store, site, accept_by=accept_by)
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
-    return "; ".join([*filter(None, pushed), *(run.text for run in runs)]) or None
+    return "; ".join([*filter(None, [pushed]), *(run.text for run in runs)]) or None
 
 
 async def finish_push(controller: Controller, store: Store, site: Site, clock: Clock | None = None, *, accept_by: str = "") -> str | None:
@@ -134,7 +133,6 @@ async def accept(controller: Controller, store: Store, site: Site, by: str = "a 
         Another process is in the middle of a push on this machine.
     """
     clock = SystemClock()
-    await finish_old_push(controller, store, site, accepted=True)
     book = await StoreBook.last(store, site.name, clock, site.control)
     journal: Journal = () if book is None else await book.entries()
     if book is not None and journal[-1].state not in TERMINAL and await is_own(controller, site, journal):

@@ -17,6 +17,7 @@ from abbe.service.storage.private import private_file
 if TYPE_CHECKING:
     from alembic.config import Config
 
+_SCRIPTS = "abbe.service.storage:migrations"
 _VERSIONS = "abbe.service.storage.migrations.versions"
 _TABLE = "alembic_version"
 _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after the other
@@ -75,7 +76,7 @@ def upgrade(engine: Engine, target: str = "head") -> None:
     Raises
     ------
     StoreError
-        If the database was written by a newer version of Abbe.
+        If the database was written by a newer version of Abbe, or by one from before the first release.
     """
     before = current_revision(engine)
     if before == head_revision() and target == "head":
@@ -111,7 +112,7 @@ def _config(connection: Connection | None = None) -> Config:
     from alembic.config import Config
 
     config = Config()
-    config.set_main_option("script_location", "abbe.service.storage:migrations")
+    config.set_main_option("script_location", _SCRIPTS)
     config.set_main_option("path_separator", "os")
     config.attributes["connection"] = connection
     return config
@@ -121,7 +122,7 @@ def _require_known(engine: Engine, revision: str | None) -> None:
     if revision is not None and revision not in known_revisions():
         raise StoreError(
             f"database {mask_secrets(str(engine.url))} has schema {revision}, which this version of Abbe does not know",
-            "use the newer Abbe that wrote it, or another database",
+            "use the Abbe that wrote it, or another database",
         )
 
 

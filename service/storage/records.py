@@ -158,19 +158,6 @@ class TableRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class PushRecord:
-    """Journal of one table's way into the controller."""
-
-    id: int
-    machine_id: int
-    table_id: int
-    state: str
-    doc: Doc
-    created_utc: str
-    updated_utc: str
-
-
-@dataclass(frozen=True, slots=True)
 class VerificationRecord:
     """Result of a check of the machine."""
 

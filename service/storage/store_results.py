@@ -1,18 +1,18 @@
-"""Store methods for what was computed and done: solutions, compensation tables, pushes, verifications."""
+"""Store methods for what was computed and done: solutions, compensation tables, verifications."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import insert, select, update
+from sqlalchemy import insert, select
 from sqlalchemy.sql import Select
 
 from abbe.service.errors import NotStored
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import Doc, PushRecord, SolutionRecord, TableRecord, VerificationRecord
+from abbe.service.storage.records import Doc, SolutionRecord, TableRecord, VerificationRecord
 from abbe.service.storage.store_campaigns import new_id
-from abbe.service.storage.tables import comp_tables, machines, pushes, solutions, verifications
+from abbe.service.storage.tables import comp_tables, machines, solutions, verifications
 
 
 class ResultStore(StoreBase):
@@ -90,57 +90,6 @@ class ResultStore(StoreBase):
         if machine_id is not None:
             query = query.where(comp_tables.c.machine_id == machine_id)
         return [TableRecord(*row) for row in self._all(query)]
-
-    def add_push(self, machine_id: int, table_id: int, state: str, doc: Doc) -> int:
-        """Open the journal of a push. On return it is on disk, so the action it permits may follow.
-
-        Parameters
-        ----------
-        machine_id : int
-            Into which machine.
-        table_id : int
-            Which table.
-        state : str
-            First state.
-        doc : dict
-            What is needed to finish or to take back the push after a crash.
-
-        Returns
-        -------
-        int
-            Id.
-        """
-        now = self._now()
-        values = {"machine_id": machine_id, "table_id": table_id, "state": state, "doc": doc, "created_utc": now, "updated_utc": now}
-        return self._write(lambda connection: new_id(connection, insert(pushes).values(values)))
-
-    def update_push(self, push_id: int, state: str, doc: Doc) -> None:
-        """Write the next state of a push. On return it is on disk.
-
-        Parameters
-        ----------
-        push_id : int
-            Which.
-        state : str
-            New state.
-        doc : dict
-            Replaces the journal's document.
-
-        Raises
-        ------
-        NotStored
-            If there is no such push.
-        """
-        statement = update(pushes).where(pushes.c.id == push_id).values(state=state, doc=doc, updated_utc=self._now())
-        if self._write(lambda connection: connection.execute(statement).rowcount) != 1:
-            raise NotStored(f"no push {push_id} in {self.url}")
-
-    def pushes(self, machine_id: int | None = None) -> list[PushRecord]:
-        """List pushes (into one machine), oldest first."""
-        query = select(pushes).order_by(pushes.c.id)
-        if machine_id is not None:
-            query = query.where(pushes.c.machine_id == machine_id)
-        return [PushRecord(*row) for row in self._all(query)]
 
     def add_verification(self, machine_id: int, campaign_id: int | None, verdict: str, doc: Doc) -> int:
         """Store the result of a check.

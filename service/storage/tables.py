@@ -98,19 +98,6 @@ comp_tables = Table(
     Index(None, "machine_id"),
 )
 
-pushes = Table(
-    "pushes",
-    metadata,
-    Column("id", Integer, primary_key=True),
-    Column("machine_id", ForeignKey("machines.id"), nullable=False),
-    Column("table_id", ForeignKey("tables.id"), nullable=False),
-    Column("state", String(30), nullable=False),
-    Column("doc", JSON, nullable=False),
-    Column("created_utc", String(32), nullable=False),
-    Column("updated_utc", String(32), nullable=False),
-    Index(None, "machine_id"),
-)
-
 verifications = Table(
     "verifications",
     metadata,

@@ -25,7 +25,7 @@ Row = tuple[Hashable, str, Doc]
 class Pushed:
     """A push as all journals tell it: under which machine's name, into which control (empty: not noted), and where it stands.
 
-    ``chain``: name of its journal, empty for one of before decision 0017.
+    ``chain``: name of its journal.
     """
 
     chain: str
@@ -86,7 +86,7 @@ class Known:
 
 def known_tables(store: Store) -> Known:
     """Read the journals of all machines, without the images in them."""
-    marks = [*_old_marks(store), *store.push_marks()]
+    marks = store.push_marks()
     unverified = _unverified([((m.machine, m.push), m.state, m.doc) for m in marks])
     last: dict[Hashable, Pushed] = {}
     crc: dict[Hashable, int] = {}
@@ -95,7 +95,7 @@ def known_tables(store: Store) -> Known:
     for mark in marks:
         key, doc = (mark.machine, mark.push), mark.doc
         named = (last[key].machine, last[key].control) if key in last else (doc.get("machine", mark.machine), doc.get("control", ""))
-        last[key] = Pushed(mark.machine if mark.prev else "", mark.push, mark.state, str(named[0]), str(named[1]))
+        last[key] = Pushed(mark.machine, mark.push, mark.state, str(named[0]), str(named[1]))
         seen.update(int(doc[name]) for name in ("base_crc", "crc", "accepted_crc") if name in doc)
         if mark.state == State.SNAPSHOT and "crc" in doc:
             base = int(doc["base_crc"])
@@ -113,7 +113,7 @@ def known_tables(store: Store) -> Known:
 def _add(fine: dict[int, dict[str, Fine]], crc: int, how: How, push: Pushed, mark: PushEntryRecord) -> None:
     """Note why a table is right in a journal; that a later push found it in force says less than what is there."""
     one = Fine(how, push.machine, push.push, mark.utc, str(mark.doc.get("by", "")) if how == "accepted" else "")
-    where, chain = fine.setdefault(crc, {}), push.chain or push.machine
+    where, chain = fine.setdefault(crc, {}), push.chain
     if how != "found in force" or chain not in where:
         where[chain] = one
 
@@ -141,21 +141,3 @@ def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
         elif state == State.ACCEPTED and "accepted_crc" in doc:
             fine.add(int(doc["accepted_crc"]))
     return {crc: push for crc, push in candidates.items() if crc not in fine}
-
-
-def _old_marks(store: Store) -> list[PushEntryRecord]:
-    """Pushes of before decision 0017: one row each, read as its beginning and its end."""
-    found = []
-    names = {m.id: m.name for m in store.machines()}
-    for push in store.pushes():
-        name = names.get(push.machine_id, "")
-        doc = {key: value for key, value in push.doc.items() if key in ("base_crc", "crc", "accepted_crc")}
-        if {"base_crc", "crc"} <= doc.keys():
-            begun, ended = (
-                {"machine": name, "base_crc": doc["base_crc"], "crc": doc["crc"]},
-                {k: doc[k] for k in doc if k == "accepted_crc"},
-            )
-            old = f"{name} (decision 0008)"
-            found.append(PushEntryRecord(0, old, push.id, 0, State.SNAPSHOT, begun, push.created_utc, "", ""))
-            found.append(PushEntryRecord(0, old, push.id, 1, push.state, ended, push.updated_utc, "", ""))
-    return found

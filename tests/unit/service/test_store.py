@@ -165,12 +165,6 @@ def test_results_come_back(store: Store, campaign_id: int) -> None:
     read_back = store.add_table(1, None, b"", 0, {})
     assert (store.table(table).image, store.table(table).crc, store.table(read_back).solution_id) == (b"\xab\xbe", 2**32 - 1, None)
     assert [one.id for one in store.tables(1)] == [table, read_back]
-    push = store.add_push(1, table, "STAGED", {"bank": 1})
-    store.update_push(push, "ACTIVE", {"bank": 1, "gen": 7})
-    assert [(one.id, one.state, one.doc) for one in store.pushes(1)] == [(push, "ACTIVE", {"bank": 1, "gen": 7})]
-    assert store.pushes(2) == []
-    with pytest.raises(StoreError, match="no push 99"):
-        store.update_push(99, "ACTIVE", {})
     first = store.add_verification(1, campaign_id, "pass", {})
     second = store.add_verification(1, None, "fail", {})
     assert [one.id for one in store.verifications()] == [second, first]

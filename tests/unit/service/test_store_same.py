@@ -106,7 +106,6 @@ def found(ask: Any) -> None:
         ask.tables(),
         ask.tables(2),
     )
-    ask.add_push(1, 1, "STAGED", DOC), ask.update_push(1, "KEEP", DOC), ask.update_push(77, "KEEP", DOC), ask.pushes(), ask.pushes(2)
     entry = PushEntryRecord(0, "mill-7", 1, 0, "SNAPSHOT", DOC, "then", "", "1" * 64)
     ask.add_push_entry(entry), ask.add_push_entry(entry), ask.add_push_entry(replace(entry, seq=1, prev="1" * 64, digest="2" * 64))
     ask.push_entries("mill-7"), ask.push_entries("MILL-7"), ask.last_push("mill-7"), ask.last_push("none")
@@ -207,7 +206,7 @@ def refused(ask: Any) -> None:
     for _ in range(2):
         ask.append_chunk(open_run, "bar", 0, 1, "raw", b"", 0.0, 0.0, 0, 0)
     ask.import_campaign(("mill-7", DOC), ("old", DOC), []), ask.add_solution(77, "joint", [], DOC), ask.add_table(77, None, b"", 0, DOC)
-    ask.add_discovery_step(1, 0, "BEGUN", DOC), ask.add_model(NewVersion("mill-7", None, DOC)), ask.add_push(1, 77, "STAGED", DOC)
+    ask.add_discovery_step(1, 0, "BEGUN", DOC), ask.add_model(NewVersion("mill-7", None, DOC))
     ask.add_alarm_entry("mill-7", 1, 1, "held", DOC), ask.add_verification(77, None, "pass", DOC), ask.add_checkpoint(77, "begun", DOC)
     ask.add_approval(ApprovalRecord(0, 77, "Anna", "anna", "d" * 64, "then", "")), ask.add_discovery(77, "ab" * 32, DOC)
 

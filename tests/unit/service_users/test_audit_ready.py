@@ -22,9 +22,9 @@ from abbe.service.cli import run
 from abbe.service.cli.audited import record_all
 from abbe.service.cli.common import print_table
 from abbe.service.errors import AuditBroken, StoreError
-from abbe.service.storage.migrate import downgrade, upgrade
 from abbe.service.storage.private import private_file, seen_by_others
 from abbe.service.storage.store import Store
+from tests.migration import next_revision
 from tests.unit.service_users.conftest import World
 
 URL = "sqlite:///abbe.sqlite3"
@@ -266,9 +266,8 @@ def test_emptying_the_table_is_refused_by_postgresql(
             with pytest.raises(StoreError, match="the audit only grows"):
                 store._write(lambda connection, change=change: connection.exec_driver_sql(change))
         assert book.verify() == []
-        downgrade(store._engine, "0008")
-        store._write(lambda connection: connection.exec_driver_sql("TRUNCATE audit"))
-        upgrade(store._engine)
+        for change in ("DROP TRIGGER audit_not_emptied ON audit", "TRUNCATE audit"):
+            store._write(lambda connection, change=change: connection.exec_driver_sql(change))
         assert "the audit ended with record 1 at least" in book.verify()[0]
         read_only = f"ALTER DATABASE {url.rpartition('/')[2]} SET default_transaction_read_only = on"
         store._write(lambda connection: connection.exec_driver_sql(read_only))
@@ -277,17 +276,19 @@ def test_emptying_the_table_is_refused_by_postgresql(
             book.ready()
 
 
-def test_the_database_its_copy_and_its_journal_are_the_owners_only(tmp_path: Path) -> None:
+def test_the_database_its_copy_and_its_journal_are_the_owners_only(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, old = tmp_path / "abbe.sqlite3", os.umask(0)
     try:
         with Store.open(f"sqlite:///{path}") as store:
             AuditBook(store, f"sqlite:///{path}").write(event(1))
-            downgrade(store._engine, "0008")
+        newest = next_revision.install(tmp_path_factory.mktemp("next"), monkeypatch)
         Store.open(f"sqlite:///{path}").close()
     finally:
         os.umask(old)
     rights = {p.name: stat.S_IMODE(p.stat().st_mode) for p in tmp_path.iterdir()}
-    assert {"abbe.sqlite3", "abbe.sqlite3.before-0008", "abbe.sqlite3.audit-key", "abbe.sqlite3.audit-head"} <= rights.keys()
+    assert {"abbe.sqlite3", f"abbe.sqlite3.before-{newest}", "abbe.sqlite3.audit-key", "abbe.sqlite3.audit-head"} <= rights.keys()
     assert set(rights.values()) == {0o600}, rights
     assert any("journal" in name or "wal" in name for name in rights)
     assert seen_by_others(path) == ""
