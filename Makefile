@@ -62,21 +62,21 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) \
 	|| { rm -rf $(VENV); echo "'$(PYTHON) -m venv' failed (see above); on Debian and Ubuntu it needs the package python3-venv."; exit 1; }
 
-$(RUN_READY): requirements.lock | $(BIN)/python
+$(RUN_READY): requirements.lock pyproject.toml | $(BIN)/python
 	@echo "setting up .venv from requirements.lock, about a minute"
 	@$(PIP) --require-hashes -r requirements.lock
 	@$(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
 
 # The developers' lock holds everything of the users' lock (a test sees to it), so the second stamp is due as well.
-$(DEV_READY): requirements-dev.lock requirements.lock | $(BIN)/python
+$(DEV_READY): requirements-dev.lock requirements.lock pyproject.toml | $(BIN)/python
 	@echo "setting up .venv from requirements-dev.lock, about a minute"
 	@$(PIP) --require-hashes -r requirements-dev.lock
 	@$(PIP) --no-deps --no-build-isolation -e .
 	@touch $(RUN_READY) $@
 
 # The libraries that we compare with are no business of the product's environment.
-$(BENCH_READY): requirements-bench.lock | $(BIN)/python
+$(BENCH_READY): requirements-bench.lock pyproject.toml | $(BIN)/python
 	@echo "setting up $(BENCH_VENV) from requirements-bench.lock, about a minute"
 	@$(BIN)/python -m venv $(BENCH_VENV)
 	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements-bench.lock

@@ -119,7 +119,7 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
             store = stack.enter_context(open_store(url))
             found = from_store(store, name)
         except StoreError as exc:
-            raise StoreError(
+            raise type(exc)(
                 f"{name} is neither a folder with campaign.json nor a campaign of the database ({exc.detail})", exc.remedy
             ) from exc
         yield store, found

@@ -29,7 +29,7 @@ class BackOrder:
 
 
 async def bring_back(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> Outcome:
-    """Take the table back. What is returned is what was heard; which table is in force says the journal (`push_word.ordered`).
+    """Take the table back. What is returned is what was heard; which table is in force says the journal (`push_outcome.ordered`).
 
     A refusal is an outcome, not an error: another process has the machine, the controller holds what the journal does not know, or the
     journal moved on since the order was given.

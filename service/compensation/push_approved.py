@@ -94,7 +94,7 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
 async def push_approved(site: Site, store: Store, order: Order, *, clock: Clock, rate_hz: int = 100) -> Outcome:
     """Verify with the table in force, push, prove, verify again; keep or go back. A refusal is an outcome, not an error.
 
-    What is returned is what was heard; which table is in force says the journal (`push_word.by_journal`).
+    What is returned is what was heard; which table is in force says the journal (`push_outcome.by_journal`).
 
     Raises
     ------

@@ -50,10 +50,11 @@ async def recover(controller: Controller, store: Store, site: Site, *, accept_by
     StoreError, CaptureFault
         The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only told.
     """
+    await store.write(store.add_machine, site.name, site.doc)  # the machine as it is described now
     # First: whatever is wrong with a segment, no unverified table stays active.
     pushed = await finish_push(controller, store, site, accept_by=accept_by)
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
-    return "; ".join([*filter(None, [pushed]), *(run.text for run in runs)]) or None
+    return "; ".join([*([pushed] if pushed else []), *(run.text for run in runs)]) or None
 
 
 async def finish_push(controller: Controller, store: Store, site: Site, clock: Clock | None = None, *, accept_by: str = "") -> str | None:
@@ -133,6 +134,7 @@ async def accept(controller: Controller, store: Store, site: Site, by: str = "a 
         Another process is in the middle of a push on this machine.
     """
     clock = SystemClock()
+    await store.write(store.add_machine, site.name, site.doc)
     book = await StoreBook.last(store, site.name, clock, site.control)
     journal: Journal = () if book is None else await book.entries()
     if book is not None and journal[-1].state not in TERMINAL and await is_own(controller, site, journal):
@@ -175,7 +177,7 @@ async def _accepted(controller: Controller, store: Store, site: Site, by: str) -
 def _open_with(crc: int, known: Known) -> set[str]:
     """Journal of the last push that brought this table, if it is still open: under another name or address it would be taken back."""
     push = known.pushed.get(crc)
-    return {push.chain} if push is not None and push.chain and push.may_be_active else set()
+    return {push.chain} if push is not None and push.may_be_active else set()
 
 
 async def _given_to_a_person(store: Store, site: Site, chain: str) -> StoreBook:

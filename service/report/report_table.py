@@ -59,7 +59,7 @@ def _remark(crc: int, known: Known, chain: str) -> str:
     elsewhere, here, push = known.elsewhere(crc, chain), known.fine.get(crc, {}).get(chain), known.pushed.get(crc)
     if elsewhere is not None:
         return f"measured with a table (CRC {crc:08X}) that was {elsewhere.not_here}: nobody has accepted it"
-    if here is not None and (here.how != "accepted" or (push is not None and (push.chain or push.machine) == chain)):
+    if here is not None and (here.how != "accepted" or (push is not None and push.chain == chain)):
         return ""
     who = "nobody has accepted it" if here is None else f"accepted by {here.by or 'a person'} at {here.utc}"
     what = STRANGE if push is None else f"a table of machine {push.machine!r}"

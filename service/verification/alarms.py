@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 
 from abbe.models.trend import MOST_CHECKS
-from abbe.service.errors import StoreError
+from abbe.service.errors import NotStored, StoreError
 from abbe.service.push.book import read_entries
 from abbe.service.push.states import State
 from abbe.service.storage.records import AlarmEntryRecord, Doc, VerificationRecord
@@ -63,8 +63,10 @@ def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
 
     Raises
     ------
+    NotStored
+        There is no such alarm.
     StoreError
-        There is no such alarm, or somebody has acknowledged it.
+        Somebody has acknowledged it.
     """
     one = alarm_numbered(store, machine, number)
     if one.acknowledged_by:
@@ -74,10 +76,10 @@ def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
 
 
 def alarm_numbered(store: Store, machine: str, number: int) -> Alarm:
-    """One alarm; StoreError if there is none."""
+    """One alarm; NotStored if there is none."""
     found = next((one for one in alarms_of(store, machine) if one.number == number), None)
     if found is None:
-        raise StoreError(f"{machine} has no alarm {number}", "abbe alarm list shows those there are")
+        raise NotStored(f"{machine} has no alarm {number}", "abbe alarm list shows those there are")
     return found
 
 

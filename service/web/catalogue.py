@@ -43,6 +43,7 @@ class Entry:
 
 STATUS: dict[type[AbbeError], int] = {
     errors.NotStored: 404,
+    errors.JournalChanged: 409,
     errors.StoreError: 503,
     errors.AuditBroken: 503,
     errors.CoreSilent: 503,

@@ -15,7 +15,7 @@ from tests import hardware
 from tests.scenarios.world import interrupt, simulators_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
-LOST_S = 0.100 if os.environ.get("ABBE_TEST_LONG") else 1.0
+LOST_S = 0.100 if os.environ.get("ABBE_TEST_LONG") else 0.400
 """The promise holds on a computer at rest, as in the long run. Beside other tests the writer itself may wait for a core."""
 
 

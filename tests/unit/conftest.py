@@ -45,10 +45,12 @@ def _schema_built_once() -> Iterator[None]:
 def _copying() -> Callable[[Any, str], None]:
     from alembic import command
 
+    from abbe.service.storage.migrate import head_revision
+
     migrate = command.upgrade
 
     @cache
-    def statements() -> tuple[str, ...]:
+    def statements(_head: str) -> tuple[str, ...]:
         from abbe.service.storage.migrate import _config
 
         engine = create_engine("sqlite://")
@@ -65,7 +67,7 @@ def _copying() -> Callable[[Any, str], None]:
         if revision != "head" or not isinstance(connection, Connection) or connection.dialect.name != "sqlite" or _has_content(connection):
             migrate(config, revision)
             return
-        for statement in statements():
+        for statement in statements(head_revision()):
             own = f"VALUES(1,'{uuid4().hex}')" if statement.startswith('INSERT INTO "identity"') else ""  # each is a database of its own
             connection.exec_driver_sql(re.sub(r"VALUES\(1,'[0-9a-f]{32}'\)", own, statement) if own else statement)
 

@@ -12,6 +12,7 @@ FAST = [mutant for mutant in MUTANTS if mutant.fast]
 
 def test_every_mistake_is_one_line_of_a_table_with_a_test_that_exists() -> None:
     assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS)
+    assert [mutant.name for mutant in MUTANTS if stale(mutant)] == []
     for mutant in MUTANTS:
         assert mutant.old != mutant.new
         assert mutant.tests

@@ -103,6 +103,8 @@ def as_stored() -> Iterator[None]:
 
     Raises
     ------
+    NotStored
+        Something that is asked for, or that the data name, is not there.
     Unusable
         The data cannot be used.
     """

@@ -13,7 +13,7 @@ from abbe.service.compensation.proposal_checks import reject as work_reject
 from abbe.service.compensation.proposal_diff import ACTIVE, compare, diff_json
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.compensation.proposal_states import Standing, check_waiting, standing, standing_of
-from abbe.service.errors import Unusable
+from abbe.service.errors import NotStored, Unusable
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import Entry
 from abbe.service.storage.base import utc_text
@@ -125,7 +125,7 @@ def _standings(sources: Sources, rows: list[Doc]) -> list[s.Proposal]:
                     journals[machine] = read_entries(store, machine, sources.control_of(machine))
                 decided = (store.approvals(number), journals[machine], tables, now_s, store.rejections(number))
                 now = standing_of(number, proposed, *decided)
-        except Unusable as error:  # one bad row must not hide the others
+        except (Unusable, NotStored) as error:  # one bad row must not hide the others
             now = Standing("changed", error.detail)
         found.append(_proposal(row, now))
     return found

@@ -1,0 +1,14 @@
+"""Here migrations are what is tested: other folders may replace Alembic's upgrade by a copy of what it makes, this one never does."""
+
+from __future__ import annotations
+
+import pytest
+from alembic import command
+
+UPGRADE = command.upgrade
+"""Taken when tests are collected, before any of them runs."""
+
+
+@pytest.fixture(autouse=True)
+def _migrated_in_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("alembic.command.upgrade", UPGRADE)
