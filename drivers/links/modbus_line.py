@@ -11,6 +11,8 @@ from abbe.drivers.links.words import CANARY_WORDS
 
 _BABBLE_LIMIT = 5
 _PROOFS = 5
+_CONNECT = 3
+"""A TCP connection may take so many reply timeouts: a lost first packet is sent again after a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,7 @@ class Line:
     async def open(self) -> None:
         """Make a new connection; errors as of ``Wire.open``."""
         self._known = None
-        await self._wire.open(self._timeout_s)
+        await self._wire.open(self._timeout_s if self._wire.rtu else _CONNECT * self._timeout_s)
 
     async def ready(self) -> None:
         """Come to a state in which the next answer can be believed.

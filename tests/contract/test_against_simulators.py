@@ -22,6 +22,7 @@ from abbe.drivers.errors import DeviceFault, LinkDown, Rebooted, Refused
 from abbe.drivers.fixture.driver import RemoteFixture
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.registry import open_ballbar, open_controller, open_fixture, open_laser
+from tests.patience import within
 
 OWNER = 0xABBE0001
 CENTRE = (300.0, 250.0, 200.0)
@@ -62,7 +63,7 @@ async def world(request: pytest.FixtureRequest, tmp_path) -> AsyncIterator[World
     async with AsyncExitStack() as stack:
         stack.push_async_callback(process.wait)
         stack.callback(process.stdin.close)
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(within(20)):
             ready = json.loads(await process.stdout.readline())
         opened = World(
             ready,
@@ -141,7 +142,7 @@ async def test_estop_during_a_move(world):
 
 
 async def until(world, wanted):
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(within(20)):
         while True:
             status = await world.cnc.status()
             if wanted(status):

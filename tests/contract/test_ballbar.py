@@ -15,6 +15,7 @@ from abbe.drivers.errors import BadFrame, LinkDown, LossyLine, Rebooted, Refused
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import SocketUrl, parse_url
 from abbe.drivers.registry import open_ballbar
+from tests.patience import within
 
 STOP, START, IDENTIFY = 0x83, 0x82, 0x81
 
@@ -187,7 +188,7 @@ async def test_a_slow_consumer_hears_what_it_missed(bar_peer, bar, monkeypatch):
 
     bar_peer.on_start = send_many
     async with bar.stream(1000) as batches:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(within(5)):
             while bar.counters.overflow < 800:  # noqa: ASYNC110 - nothing to wait for: this consumer is the slow one
                 await asyncio.sleep(0.01)
         first = await anext(batches)  # makes room: cut into pieces, the samples may have filled the buffer to its brim

@@ -12,6 +12,7 @@ from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.urls import parse_url
 from abbe.drivers.registry import open_laser
+from tests.patience import within
 
 ZEROED = 1 << 2
 
@@ -224,7 +225,7 @@ async def test_cancel_during_a_command(laser, meter):
 
     meter.peer.tricks = [honest, honest, late]
     task = asyncio.create_task(laser.zero())
-    async with asyncio.timeout(2):
+    async with asyncio.timeout(within(2)):
         while len(meter.peer.requests) < 3:
             meter.peer.asked.clear()
             await meter.peer.asked.wait()

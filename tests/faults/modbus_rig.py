@@ -29,6 +29,7 @@ from abbe.simulators.modbus_wire import ModbusTcp, RegisterMap
 from abbe.simulators.scenario import Scenario
 from abbe.simulators.world import World
 from tests.faults.contract import Observed, Record, told_of
+from tests.patience import within
 
 SPEED = 60.0
 TIMEOUT_S = 0.6  # a busy computer must not look like a silent device
@@ -257,7 +258,7 @@ async def observe(rig: Rig, row: str, case: str, kind: Kind, disturb: Callable[[
 
 async def _goes_on(rig: Rig, kind: Kind) -> bool:
     """Whether the same request has a right answer now; a machine in feed hold is set free first, as a person would."""
-    until_s = asyncio.get_running_loop().time() + 10.0
+    until_s = asyncio.get_running_loop().time() + within(10.0)
     while True:
         with contextlib.suppress(DriverError):
             if kind.device == "cnc" and int(rig.world.controller.hold):  # held, or an abort that was not finished

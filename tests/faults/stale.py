@@ -18,6 +18,7 @@ from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.campaigns.late_replies import AddressMap, _tcp_device
 from tests.faults.contract import Observed, told_of
 from tests.faults.modbus_rig import records_of
+from tests.patience import within
 
 COUNT = 4
 TIMEOUT_S = 0.2
@@ -81,7 +82,7 @@ async def _do(link: ModbusLink, device: AddressMap, operation: str, address: int
 
 
 async def _again(link: ModbusLink, device: AddressMap) -> bool:
-    until_s = asyncio.get_running_loop().time() + 10.0
+    until_s = asyncio.get_running_loop().time() + within(10.0)
     while asyncio.get_running_loop().time() < until_s:
         with contextlib.suppress(DriverError):
             return await _do(link, device, "read", 4000)

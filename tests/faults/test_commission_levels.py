@@ -25,6 +25,7 @@ from abbe.service.tables.base_table import read_base
 from abbe.simulators.cnc import bank
 from abbe.simulators.cnc.compensation import BankState, Compensation, CompResult
 from tests.faults.sequencer_world import bench
+from tests.patience import within
 
 STAGED, STAGED_RESULT = 3, 8
 SPEED = 6.0
@@ -334,7 +335,7 @@ async def test_broken_off_while_the_axis_moves_it_stops_and_gives_the_lease_back
     b, store = place
     before, active = in_force(b), b.sim.world.controller.comp.active
     work = asyncio.ensure_future(commission_levels(b.session.controller, store, b.site))
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(within(20)):
         while not b.sim.world.controller.moving:  # noqa: ASYNC110 - the simulator tells nobody
             await asyncio.sleep(0.002)
     work.cancel()

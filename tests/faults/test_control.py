@@ -21,6 +21,7 @@ from abbe.service.sequences.steps import CampaignPlan, FollowPath, ReadBar, Reco
 from abbe.service.storage.store import Store
 from abbe.simulators.cnc.log import Command
 from tests.faults.sequencer_world import AtStep, Bench, bench, kinds, small, step_numbers
+from tests.patience import within
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 SPEED = 200.0
@@ -82,7 +83,7 @@ async def run(b: Bench, store: Store, plan: TestPlan, control: Control) -> tuple
     error: BaseException | None = None
     name = f"c{len(store.campaigns())}"
     try:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(within(30)):
             await measure(b.session, store, b.site, CampaignPlan(name, (plan,)), manner=Manner(control))
     except (Stopped, Aborted) as ended:
         error = ended

@@ -40,6 +40,7 @@ from abbe.service.sequences.steps import FollowPath, MoveTo, ReadBar, ReadLaser,
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
 from abbe.simulators.faults.scenario import Fault, FaultScenario
 from tests.faults.sequencer_world import AtStep, Bench, Keeps, bench, kinds, rng, small, step_numbers
+from tests.patience import within
 
 LIMIT_S = 0.100
 MOST_LAG_S = 0.100
@@ -163,7 +164,7 @@ async def one(b: Bench, case: Case, *, at_once: bool = False, again: int = 5) ->
     control.place = arrive  # type: ignore[method-assign]
     error: BaseException | None = None
     try:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(within(20)):
             await Runner(b.session, control).run(plan, Keeps(), lambda *_: None)
     except (AbbeError, DriverError) as caught:
         error = caught

@@ -19,6 +19,7 @@ import pytest
 from abbe.service.storage.store import Store
 from tests.faults.measuring_child import plan
 from tests.faults.on_sphere import words
+from tests.patience import within
 from tests.scenarios.conftest import Sims, simulated
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
@@ -57,7 +58,7 @@ class Zygote:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.close()
-        self.process.wait(timeout=20)
+        self.process.wait(timeout=within(20))
         self.process.stdout.close()
         self._log.close()
 

@@ -19,6 +19,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.runs.codec import decode_bar
 from abbe.service.storage.store import Store
 from tests.faults.serial_rig import Stage, Tap, stage
+from tests.patience import within
 from tests.unit.service_capture.capture_bench import new_run
 
 SENT = 400
@@ -34,7 +35,7 @@ class SlowTap(Tap):
 
     def take(self, batch: BarBatch) -> None:
         self.reached.set()
-        self.may.wait(30.0)
+        self.may.wait(within(30.0))
         super().take(batch)
         if self._inner is not None:
             self._inner.take(batch)  # type: ignore[attr-defined]
@@ -46,7 +47,7 @@ async def sent_and_pulled(on: Stage, tap: SlowTap) -> None:
     await asyncio.to_thread(tap.reached.wait, 10.0)
     await on.box.run(SENT)
     ring = on.bar._framing.ring
-    async with asyncio.timeout(10.0):
+    async with asyncio.timeout(within(10.0)):
         while ring._bytes < SENT * 24:  # noqa: ASYNC110 - what waits in the ring is what is tested
             await asyncio.sleep(0.001)
     taken = ring.take

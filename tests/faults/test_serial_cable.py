@@ -13,6 +13,7 @@ from abbe.simulators.ballbar.wire import IDENTIFY, START, STOP
 from abbe.simulators.faults.serial_box import FaultyBox
 from tests.faults.rows_serial import S1_MOMENTS, S1_REPLUG
 from tests.faults.serial_rig import Stage, be_patient, stage, together
+from tests.patience import within
 
 NOT_DETECTED = "the line was being closed: nobody misses it, so there is nothing to detect"
 
@@ -45,7 +46,7 @@ async def opening(on: Stage) -> None:
 async def idle(on: Stage) -> None:
     await on.bar.identify()
     on.box.line.pull()
-    async with asyncio.timeout(1.0):  # noticed by itself within a second, though nobody asks for anything
+    async with asyncio.timeout(within(1.0)):  # noticed by itself within a second, though nobody asks for anything
         while on.bar.incidents.open is None:  # noqa: ASYNC110 - the account is what is tested
             await asyncio.sleep(0.001)
     on.error = on.bar.incidents.open

@@ -36,6 +36,7 @@ from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, RecordPa
 from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import AtStep, Bench, InTest, bench, number, small
 from tests.faults.test_going_on import SUSPENDING, broken_off, going_on, statuses, step_of
+from tests.patience import within
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 CUP = (300.0, 250.0, 100.0)
@@ -85,7 +86,7 @@ async def test_ctrl_c_ends_a_question():
         return True
 
     asyncio.get_running_loop().call_soon(control.stop)
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(within(5)):
         with pytest.raises(Stopped):
             await control.unless_stopped(question())
 
@@ -246,13 +247,13 @@ async def test_a_locked_database_delays_the_journal_and_nothing_else(tmp_path):
             other = sqlite3.connect(path)
             other.execute("BEGIN IMMEDIATE")
             locked.set()
-            free.wait(30)
+            free.wait(within(30))
             other.rollback()
             other.close()
 
         thread = threading.Thread(target=lock)
         thread.start()
-        locked.wait(10)
+        locked.wait(within(10))
         asyncio.get_running_loop().call_later(5.5, free.set)  # longer than the database itself waits
         await StoreJournal(store, campaign).add("point", n=1)
         thread.join()
@@ -292,7 +293,7 @@ async def test_a_test_that_is_suspended_again_and_again_ends(place, monkeypatch)
 
     site = replace(b.site, watching=Watching(None, Suspending(frozenset({"door"}), 10.0, 0.05), unknown_s=5.0))
     with pytest.raises(DoorOpen, match="3 times in a row without a new point"):
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(within(30)):
             await measure(b.session, store, site, plan, manner=Manner(Always()))
     assert len(store.runs()) == 3
 

@@ -13,6 +13,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from tests.patience import within
+
 Point = tuple[float, float, float]
 ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "deploy" / "linuxcnc"
@@ -113,7 +115,7 @@ class Instance:
         if self._process is not None and self._process.returncode is None:
             await (await asyncio.create_subprocess_exec(*self._inside("pkill", "-TERM", "-f", "display.py"))).wait()
             with suppress(TimeoutError):
-                async with asyncio.timeout(20):
+                async with asyncio.timeout(within(20)):
                     await self._process.wait()
         await self.kill()
 

@@ -27,6 +27,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from tests.linuxcnc.instance import Instance
 from tests.mbpoll import poll_table
+from tests.patience import within
 from tests.physics.truth import MACHINE
 
 OWNER = 0xABBE0001
@@ -44,7 +45,7 @@ async def controller(machine: Instance) -> AsyncIterator[ModbusController]:
 
 
 async def until(cnc: ModbusController, true) -> None:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(within(20)):
         while not true(await cnc.status()):  # noqa: ASYNC110 - another process is asked
             await asyncio.sleep(0.01)
 
@@ -139,7 +140,7 @@ async def test_hold_abort_door_and_emergency_stop(machine):
             await move
         await until(cnc, lambda s: s.bits & Bit.FEED_HOLD and s.bits & Bit.MOVING)
         before = None
-        async with asyncio.timeout(10):  # it brakes, far from its target
+        async with asyncio.timeout(within(10)):  # it brakes, far from its target
             while before != (before := await machine.drives()):  # noqa: ASYNC110 - another process is asked
                 await asyncio.sleep(0.02)
         assert before[0] < 400

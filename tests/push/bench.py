@@ -10,6 +10,7 @@ from typing import Any
 
 from abbe.drivers.cnc.tables import encode
 from abbe.service.tables.nine_tables import table_image
+from tests.patience import within
 from tests.push.pushing_child import tables
 
 FIRST, OTHER = 40, 60
@@ -32,7 +33,7 @@ class Zygote:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.close()
-        self.process.wait(timeout=20)
+        self.process.wait(timeout=within(20))
         self.process.stdout.close()
         self._log.close()
 

@@ -19,6 +19,7 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from tests.faults.sequencer_world import Bench, bench
+from tests.patience import within
 from tests.push.test_bad_tables_on_the_wire import counted, tables
 
 
@@ -56,7 +57,7 @@ async def brought(b: Bench, store: Store, control: Control) -> tuple[Pushed, lis
 
 
 async def held(control: Control) -> None:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(within(20)):
         async for now in control.watch():
             if now.state == State.PAUSED:
                 return

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from tests import hardware
+from tests.patience import within
 
 ABBE = [sys.executable, "-c", "from abbe.service.cli import main; main()"]
 
@@ -66,7 +67,7 @@ def simulated(folder: Path, *args: str, extra: str = "", program: tuple[str, ...
         yield Sims(ready, process, path)
     finally:
         process.stdin.close()
-        process.wait(timeout=10)
+        process.wait(timeout=within(10))
         process.stdout.close()
 
 

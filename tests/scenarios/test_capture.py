@@ -20,6 +20,7 @@ from abbe.service.sequences.recipes import Helix
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
+from tests.patience import within
 from tests.scenarios.world import axes_at_rest, bar_chunks, interrupt, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
@@ -82,7 +83,7 @@ class HangingDisk(RealFileIO):
     def sync(self, handle: int) -> None:
         self.syncs += 1
         if self.hang.is_set():
-            self.again.wait(60.0)
+            self.again.wait(within(60.0))
         super().sync(handle)
 
 

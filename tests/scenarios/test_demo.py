@@ -12,6 +12,7 @@ import pytest
 
 from abbe.service.storage.store import Store
 from tests import hardware
+from tests.patience import within
 from tests.scenarios.world import interrupt, simulators_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
@@ -65,7 +66,7 @@ def archive_round_trip(abbe, tmp_path: Path, folder: Path) -> None:
     db, other = f"sqlite:///{folder / 'abbe.sqlite3'}", f"sqlite:///{tmp_path / 'other.sqlite3'}"
     for words in (["export", "identify", "a", "--db", db], ["import", "a", "--db", other], ["export", "identify", "b", "--db", other]):
         process = abbe(*words)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=within(60))
         assert process.returncode == 0, err
     first = {p.name: p.read_bytes() for p in (tmp_path / "a").iterdir()}
     second = {p.name: p.read_bytes() for p in (tmp_path / "b").iterdir()}
@@ -105,7 +106,7 @@ def test_sigkill_loses_the_last_instant_only_and_damages_nothing_else(abbe, tmp_
         # 1 kHz without a gap, from the first chunk to the last
         assert chunks[-1].last_device_us - chunks[0].first_device_us == (sum(c.n for c in chunks) - 1) * 1000
     listing = abbe("runs", "--db", f"sqlite:///{folder / 'abbe.sqlite3'}", "--json")
-    out, err = listing.communicate(timeout=30)
+    out, err = listing.communicate(timeout=within(30))
     assert listing.returncode == 0, err
     row = next(r for r in json.loads(out) if r["run_id"] == label)
     assert row["status"] == "incomplete"
@@ -117,7 +118,7 @@ def test_a_folder_that_holds_a_demonstration_is_not_overwritten(abbe, tmp_path):
     with Store.open(f"sqlite:///{kept}") as store:
         store.add_machine("precious", {"name": "precious"})
     process = abbe("demo", "--keep", str(tmp_path / "kept"))
-    _, err = process.communicate(timeout=30)
+    _, err = process.communicate(timeout=within(30))
     assert process.returncode == 2
     assert len(err.strip().splitlines()) == 1
     assert "already holds a demonstration" in err

@@ -6,6 +6,7 @@ import signal
 
 import pytest
 
+from tests.patience import within
 from tests.scenarios.conftest import ABBE
 from tests.scenarios.world import axes_at_rest, bar_chunks, interrupt, runs_of, wait_for
 
@@ -33,7 +34,7 @@ def test_ctrl_c_stops_at_a_safe_place_and_the_same_campaign_goes_on(abbe, start_
     (run,) = runs_of(sims.machine_file.parent)
     assert (run.label, run.status) == ("helix", "stopped")
     again = abbe("measure", str(sims.machine_file), "--resume", "june")
-    out, err = again.communicate(timeout=60)
+    out, err = again.communicate(timeout=within(60))
     assert again.returncode == 0, err
     assert out == "measured: campaign 'june', 1 runs\n"
     assert "set-up B1 is still mounted: helix begins again" in err
@@ -48,7 +49,7 @@ def test_sigusr1_pauses_and_lets_go_on(abbe, start_sims):
     wait_for(lambda: [r.status for r in runs_of(sims.machine_file.parent)] == ["aborted"], 20, "the run in hand is closed as evidence")
     assert axes_at_rest(sims)
     process.send_signal(signal.SIGUSR1)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=within(60))
     assert process.returncode == 0, err
     assert [(r.label, r.status) for r in runs_of(sims.machine_file.parent)] == [("helix", "aborted"), ("helix-2", "complete")]
 
@@ -60,7 +61,7 @@ def test_another_recipe_is_refused_in_one_line(abbe, start_sims):
     interrupt(process, signal.SIGINT)
     for change in (("--helix", "300,250,100,140"), ("--recipe", "quick-check")):
         again = abbe("measure", str(sims.machine_file), "--resume", "june", *change)
-        _, err = again.communicate(timeout=60)
+        _, err = again.communicate(timeout=within(60))
         assert again.returncode == 2
         (line,) = err.splitlines()
         assert line.startswith("error SEQ-007: campaign 'june' was begun with another recipe")

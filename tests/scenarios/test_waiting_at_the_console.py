@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.storage.store import Store
+from tests.patience import within
 from tests.scenarios.conftest import ABBE, Sims
 from tests.scenarios.test_correct_command import table
 from tests.scenarios.world import wait_for
@@ -71,7 +72,7 @@ def test_the_command_waits_for_the_machine_and_takes_the_table_back(stopped, tmp
     wait_for(lambda: "the controller has an alarm" in command.said("err"), 10, "what is waited for now")
     assert table(sims) == active
     sims.ask("reset")
-    assert command.process.wait(timeout=10) == 1
+    assert command.process.wait(timeout=within(10)) == 1
     assert "rolled back: push" in command.said("err")
     assert "the old table was made active again" in command.said("err")
     assert (last_state(tmp_path), table(sims) == active) == ("ROLLED_BACK", False)
@@ -81,6 +82,6 @@ def test_the_command_waits_for_the_machine_and_takes_the_table_back(stopped, tmp
 def test_ctrl_c_ends_the_waiting_and_the_table_waits_for_the_next_command(stopped, tmp_path):
     command, _ = stopped
     command.process.send_signal(signal.SIGINT)
-    assert command.process.wait(timeout=10) == 130
+    assert command.process.wait(timeout=within(10)) == 130
     assert "STILL ACTIVE; the next abbe command takes it back" in command.said("err")
     assert last_state(tmp_path) == "ROLLBACK_PENDING"

@@ -19,6 +19,7 @@ import pytest
 
 from abbe.service.storage.records import RunRecord
 from abbe.service.storage.store import Store
+from tests.patience import within
 
 
 def wait_for(condition: Callable[[], Any], seconds: float, what: str) -> Any:
@@ -50,7 +51,7 @@ def simulators_of(folder: Path) -> list[int]:
 def interrupt(process: subprocess.Popen[str], number: signal.Signals) -> tuple[str, str]:
     """Send a signal and wait for the end; returns stdout and stderr."""
     process.send_signal(number)
-    return process.communicate(timeout=20)
+    return process.communicate(timeout=within(20))
 
 
 def registers(sims: Any, address: int, count: int) -> tuple[int, ...]:

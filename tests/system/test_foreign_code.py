@@ -14,6 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.patience import within
 from tests.scenarios.world import wait_for
 from tests.system.serve_bench import free_port
 from tests.system.test_serve_users import MACHINE
@@ -67,7 +68,7 @@ def abbe(folder: Path, *words: str | Path) -> Iterator[subprocess.Popen[str]]:
     finally:
         process.send_signal(signal.SIGINT)
         with suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=20)
+            process.wait(timeout=within(20))
         process.kill()
         process.wait()
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.registry import open_ballbar
+from tests.patience import within
 from tests.scenarios.world import simulators_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
@@ -27,7 +28,7 @@ def ready(tmp_path: Path):
     assert process.stdout is not None
     yield json.loads(process.stdout.readline())
     process.stdin.close()
-    process.wait(timeout=10)
+    process.wait(timeout=within(10))
     process.stdout.close()
 
 
@@ -59,7 +60,7 @@ def test_mbpoll_reads_a_running_demonstration(require, tmp_path):
             assert demo.poll() is None
         finally:
             demo.terminate()
-            _, err = demo.communicate(timeout=20)
+            _, err = demo.communicate(timeout=within(20))
     assert demo.returncode == 143, err
     assert "Traceback" not in err
     assert simulators_of(folder) == []
@@ -79,7 +80,7 @@ async def test_socat_between_driver_and_pty_shows_the_documented_frames(ready, r
         words = ["socat", "-v", "-x", f"pty,raw,echo=0,link={ours}", f"open:{device},raw,echo=0"]
         bridge = subprocess.Popen(words, stderr=err)  # noqa: ASYNC220 - starting it blocks for a millisecond only
         try:
-            end = time.monotonic() + 10
+            end = time.monotonic() + within(10)
             while not ours.exists() and time.monotonic() < end:
                 select.select([], [], [], 0.02)
             bar = await open_ballbar(f"serial://{ours}?baud=460800")
@@ -95,7 +96,7 @@ async def test_socat_between_driver_and_pty_shows_the_documented_frames(ready, r
                 await bar.close()
         finally:
             bridge.terminate()
-            bridge.wait(timeout=10)
+            bridge.wait(timeout=within(10))
     seen = " ".join(re.findall(r"^ ((?:[0-9a-f]{2} ?)+)", log.read_text(errors="replace"), flags=re.MULTILINE)).replace("  ", " ")
     assert info.serial_no
     assert re.search(r"a5 5a 81 02 .. .. .. ..", seen)  # IDENTIFY with a tag

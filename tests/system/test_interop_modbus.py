@@ -36,6 +36,7 @@ from abbe.simulators.truth.machine import Geometry
 from abbe.simulators.world import World
 from tests.faults.sequencer_world import bench
 from tests.mbpoll import poll_table
+from tests.patience import within
 
 pytestmark = pytest.mark.timeout(60)
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,7 +48,7 @@ SOURCE = Path(__file__).with_name("libmodbus_server.c")
 
 
 def wait_for(condition: Callable[[], object], what: str) -> None:
-    end = time.monotonic() + 10
+    end = time.monotonic() + within(10)
     while not condition():
         assert time.monotonic() < end, f"not within 10 s: {what}"
         select.select([], [], [], 0.01)
@@ -61,7 +62,7 @@ def running(*words: str, log: Path | None = None) -> Iterator[subprocess.Popen[s
             yield process
         finally:
             process.terminate()
-            process.wait(timeout=10)
+            process.wait(timeout=within(10))
             assert process.stdout is not None
             process.stdout.close()
 
@@ -98,7 +99,7 @@ def traffic(log: Path) -> str:
 
 async def mbpoll(*words: str) -> str:
     process = await asyncio.create_subprocess_exec("mbpoll", *words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(within(20)):
         out, _ = await process.communicate()
     return out.decode()
 

@@ -20,6 +20,7 @@ from abbe.service.mqtt.publisher import Publisher
 from abbe.service.mqtt.topics import Topics
 from abbe.service.scheduler.store import ServiceStore
 from tests.certificates import authority, issued
+from tests.patience import within
 from tests.system.serve_bench import Broker, Process, free_port, payload, service
 
 OUTAGE_S = 60.0 if os.environ.get("ABBE_TEST_LONG") == "1" else 3.0
@@ -50,7 +51,7 @@ class Sender:
         self.publisher = Publisher(replace(parse(url), **broker), TOPICS, outbox, clock, self.changes.put_nowait, self.dropped.put_nowait)
 
     async def until(self, connected: bool) -> None:
-        async with asyncio.timeout(40):
+        async with asyncio.timeout(within(40)):
             while await self.changes.get() is not connected:
                 pass
 
@@ -89,7 +90,7 @@ async def test_mosquitto_killed_and_everything_comes_afterwards_in_order(tmp_pat
     async with running(sender):
         await sender.until(True)
         await asyncio.to_thread(receiver.expect, '"n":29')
-        async with asyncio.timeout(40):
+        async with asyncio.timeout(within(40)):
             while store.waiting_messages():  # noqa: ASYNC110 - until the last acknowledgement has come, too
                 await asyncio.sleep(0.02)
         # Nothing under way in the broker's file either: what it keeps as not acknowledged it would rightly deliver a second time.
@@ -148,7 +149,7 @@ async def test_a_broker_away_for_weeks_costs_old_alarms_and_no_result(tmp_path: 
     sender = Sender(broker.url, store, most=50, down_to=40)
     with capture_logs() as logs:
         async with running(sender):
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(within(20)):
                 assert await sender.dropped.get() == 60
             await asyncio.to_thread(broker.start)
             told = payload(await asyncio.to_thread(receiver.expect, "MQT-001"))

@@ -9,6 +9,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.patience import within
+
 pytest.importorskip("asyncua", reason="the extra [opcua] is not installed")
 
 from asyncua import Client, Node
@@ -36,7 +38,7 @@ async def test_results_arrive_and_the_service_stops_in_time(tmp_path: Path) -> N
             subscription = await client.create_subscription(100, numbers)
             await subscription.subscribe_data_change(client.get_node("ns=2;s=mill-7/LastResult/Number"))
             seen: list[int] = []
-            async with asyncio.timeout(60):
+            async with asyncio.timeout(within(60)):
                 while len(set(seen)) < 3:
                     number = await numbers.told.get()
                     seen += [number] if number is not None else []

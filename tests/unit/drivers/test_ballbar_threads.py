@@ -18,6 +18,7 @@ from abbe.drivers.links import reading
 from abbe.drivers.links.reading import ReadingThread, Ring
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import SerialUrl
+from tests.patience import within
 
 
 @pytest.mark.parametrize("call", ["dup", "pipe"])
@@ -54,7 +55,7 @@ def test_a_defect_in_the_reading_thread_is_told_as_the_loss_of_the_line() -> Non
     ring.on_mark = defect
     thread = ReadingThread(reader, ring, lambda error: (told.append(error), gone.set()), "test")
     os.write(writer, b"12345678")
-    assert gone.wait(10)
+    assert gone.wait(within(10))
     assert "could not go on: ValueError" in str(told[0])
     assert ring.take(1.0) is not None
     assert ring.take(1.0) is None
@@ -75,7 +76,7 @@ class SlowTap:
         self.now += 1
         self.most = max(self.most, self.now)
         self.inside.set()
-        self.go.wait(20)
+        self.go.wait(within(20))
         self.seqs += [one.seq for one in batch.samples]
         self.now -= 1
 

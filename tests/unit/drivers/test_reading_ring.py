@@ -20,6 +20,7 @@ from abbe.drivers.links.reading import ReadingThread, Ring
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import parse_url
 from tests.contract.conftest import bar_peer as bar_peer  # fixture
+from tests.patience import within
 
 
 def test_a_ring_tells_its_marks_once_and_counts_what_found_no_room() -> None:
@@ -76,7 +77,7 @@ def test_the_thread_tells_that_the_device_has_gone() -> None:
     ring, gone = Ring(1 << 20), threading.Event()
     thread = ReadingThread(slave, ring, lambda error: gone.set(), "pty")
     os.close(master)
-    assert gone.wait(5.0)
+    assert gone.wait(within(5.0))
     assert ring.take(1.0) is None
     thread.stop()
     os.close(slave)
@@ -93,7 +94,7 @@ class SlowTap:
 
     def take(self, batch: BarBatch) -> None:
         self.entered.set()
-        self.free.wait(20.0)
+        self.free.wait(within(20.0))
         self.taken.append(batch)
 
     def warn(self, text: str) -> None:
@@ -113,7 +114,7 @@ async def short_bar(bar_peer) -> AsyncIterator[SerialBallBar]:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(within(10)):
         while not condition():  # noqa: ASYNC110 - it comes true in a thread
             await asyncio.sleep(0.005)
 
@@ -136,7 +137,7 @@ async def test_a_disk_that_hangs_stops_the_machine_at_80_percent_and_costs_nothi
     async with short_bar.stream(1000, tap) as batches:
         await hang(bar_peer, tap)
         pouring = asyncio.create_task(pour(bar_peer, 4000, 1))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(within(10)):
             with pytest.raises(Backpressure, match="80% full") as caught:
                 await anext(batches)
         assert caught.value.code == "DRV-009"

@@ -17,6 +17,7 @@ from abbe.drivers.links.adapters import Adapter, adapter_at, path_to_open
 from abbe.drivers.links.reading import ReadingThread, Ring
 from abbe.drivers.links.serial_link import ByteLink, plugged_in
 from abbe.drivers.links.urls import SerialUrl
+from tests.patience import within
 
 MINE, OTHER = Adapter("/dev/ttyUSB0", "0403:6001", "A5XK3RJT"), Adapter("/dev/ttyUSB0", "0403:6001", "B7")
 
@@ -100,7 +101,7 @@ async def gone(descriptor: int, hang_up) -> OSError | None:
     ring = Ring(1000)
     thread = ReadingThread(descriptor, ring, lambda error: loop.call_soon_threadsafe(told.set_result, error), "bar")
     hang_up()
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(within(5)):
         error = await told
     thread.stop()
     assert ring.take(0.0) is None, "the ring has ended with the line"

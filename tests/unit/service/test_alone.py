@@ -14,6 +14,7 @@ import pytest
 from abbe.service.devices import machine_lock as module
 from abbe.service.devices.machine_lock import alone, lock_folder
 from abbe.service.errors import MachineInUse, UnsafeToMove
+from tests.patience import within
 
 URL = "modbus+tcp://127.0.0.1:1"
 NOBODY = 65534
@@ -115,7 +116,7 @@ def test_a_killed_process_gives_it_back_and_a_removed_file_keeps_nobody_out_or_i
     child, said = _holder()
     assert said.startswith("has it")
     child.kill()
-    child.communicate(timeout=20)
+    child.communicate(timeout=within(20))
     with alone(URL):
         (lock,) = folder.iterdir()
     lock.unlink()

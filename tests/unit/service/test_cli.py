@@ -16,6 +16,7 @@ from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.service import cli
 from abbe.service.storage.engine import wal_is_safe
 from abbe.service.storage.store import Store
+from tests.patience import within
 
 pytestmark = pytest.mark.usefixtures("clean_environment")
 
@@ -240,7 +241,7 @@ def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signa
     assert process.stdout is not None
     assert process.stdout.readline() == "['a.toml', '--help', '--speed=3', '--watch-stdin']\n"
     process.send_signal(number)
-    assert process.wait(timeout=20) == code
+    assert process.wait(timeout=within(20)) == code
     process.stdout.close()
 
 

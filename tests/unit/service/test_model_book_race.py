@@ -24,6 +24,7 @@ from abbe.service.errors import ModelMovedOn
 from abbe.service.events import ignore_progress
 from abbe.service.storage.records import Doc, NewVersion
 from abbe.service.storage.store import Store
+from tests.patience import within
 from tests.unit.service.discovery_bench import Search, write_case
 
 NAME = "VMC-1"
@@ -171,7 +172,7 @@ def test_two_processes_race_twenty_times(url: str) -> None:
         assert racer.stdin is not None
         racer.stdin.write("go\n")
         racer.stdin.flush()
-    said = [racer.communicate(timeout=60) for racer in racers]
+    said = [racer.communicate(timeout=within(60)) for racer in racers]
     ends = [out.split() for out, _ in said]
     assert [len(e) for e in ends] == [20, 20], said
     with Store.open(url) as store:

@@ -29,6 +29,7 @@ from abbe.service.runs.codec import decode_bar
 from abbe.service.storage import store_chunks
 from abbe.service.storage.records import ChunkRecord
 from abbe.service.storage.store import Store
+from tests.patience import within
 from tests.unit.service_capture.capture_bench import abandon, batch, new_run
 
 SETTINGS = CaptureSettings(reserve_bytes=65536)
@@ -111,7 +112,7 @@ class Hanging(RealFileIO):
 
     def sync(self, handle: int) -> None:
         if self.hang.is_set():
-            self.again.wait(30.0)
+            self.again.wait(within(30.0))
         super().sync(handle)
 
 
@@ -198,7 +199,7 @@ async def test_cancelled_while_opening_closes_what_comes_back(store: Store) -> N
     class Slow(RealFileIO):
         def create(self, path: Path) -> int:
             begun.set()
-            go.wait(20)
+            go.wait(within(20))
             return super().create(path)
 
     async def enter() -> None:
@@ -282,7 +283,7 @@ async def test_a_database_that_never_comes_back_is_not_waited_for(store: Store, 
     monkeypatch.setattr(recorder_module, "CATCH_UP_S", 0.1)
     monkeypatch.setattr(ingest_module, "END_S", 0.1)
     go = threading.Event()
-    monkeypatch.setattr(ingest_module.Ingest, "_give", lambda self, records: go.wait(20))
+    monkeypatch.setattr(ingest_module.Ingest, "_give", lambda self, records: go.wait(within(20)))
     began_s = time.monotonic()
     failure = await measured(store, run_id := new_run(store), give)
     assert time.monotonic() - began_s < 10

@@ -22,6 +22,7 @@ from abbe.service.errors import CaptureConflict, CaptureFault, ConfigError, Disk
 from abbe.service.runs.codec import decode_bar, decode_json
 from abbe.service.storage.records import ChunkRecord
 from abbe.service.storage.store import Store
+from tests.patience import within
 from tests.unit.service_capture.capture_bench import BrokenDisk, JumpingClock, SmallDisk, assert_true, batch, new_run
 
 KEEP = CaptureSettings(reserve_bytes=65536, keep=True)
@@ -129,7 +130,7 @@ async def test_a_locked_database_delays_nothing_but_itself(store: Store, tmp_pat
         tap = recorder.tap()
         for first in range(0, 2000, 20):
             tap.take(batch(first, 20))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(within(10)):
             await recorder.flush()
         assert recorder.durable_seq == 1999
         assert recorder.ingest.ingested < 20  # what came before the lock
@@ -144,7 +145,7 @@ async def test_the_database_gets_many_chunks_in_one_transaction_and_the_end_wait
     given = []
     monkeypatch.setattr(store, "ingest_chunks", lambda chunks, give=store.ingest_chunks: (given.append(len(chunks)), give(chunks)))
     run_id = new_run(store)
-    async with asyncio.timeout(60), recording(store, run_id, KEEP, SystemClock()) as recorder:
+    async with asyncio.timeout(within(60)), recording(store, run_id, KEEP, SystemClock()) as recorder:
         tap = recorder.tap()
         for first in range(0, 200, 20):
             tap.take(batch(first, 20))
@@ -260,7 +261,7 @@ async def test_a_stuck_disk_holds_the_tap_and_nobody_else(store: Store) -> None:
         def sync(self, handle: int) -> None:
             self.syncs += 1
             if self.syncs > 1:
-                self.go.wait(20)
+                self.go.wait(within(20))
             super().sync(handle)
 
     disk = Stuck()

@@ -15,6 +15,7 @@ from abbe.service.capture.settings import CaptureSettings, segment_path
 from abbe.service.compensation import recover as recover_module
 from abbe.service.errors import CaptureFault, StoreError
 from abbe.service.storage.store import Store
+from tests.patience import within
 from tests.unit.service_capture.capture_bench import batch
 from tests.unit.service_capture.test_recovery import crashed
 
@@ -57,7 +58,7 @@ async def test_a_listened_run_whose_samples_the_database_lacks_stays_open(store:
     go = threading.Event()
     monkeypatch.setattr(recorder_module, "CATCH_UP_S", 0.1)
     monkeypatch.setattr(ingest_module, "END_S", 0.1)
-    monkeypatch.setattr(ingest_module.Ingest, "_give", lambda self, records: go.wait(20))
+    monkeypatch.setattr(ingest_module.Ingest, "_give", lambda self, records: go.wait(within(20)))
 
     async def begin(*words: object) -> tuple[int, int]:
         return store.add_campaign(store.add_machine("VMC-1", {}), "c", {}), 0

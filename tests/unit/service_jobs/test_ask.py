@@ -11,6 +11,7 @@ import pytest
 
 from abbe.service.cli.ask import console_ask
 from abbe.service.errors import ConfigError
+from tests.patience import within
 
 
 @pytest.fixture
@@ -46,26 +47,26 @@ async def test_what_was_typed_before_the_question_confirms_nothing(terminal, ear
     task = await asked()
     assert not task.done()
     os.write(terminal, b"\n")
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(within(5)):
         await task
 
 
 async def test_one_answer_does_not_answer_the_next_question(terminal):
     task = await asked("first")
     os.write(terminal, b"\n\n")
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(within(5)):
         await task
     task = await asked("second")
     assert not task.done()
     os.write(terminal, b"\n")
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(within(5)):
         await task
 
 
 async def test_end_of_input_is_no_confirmation(terminal):
     task = await asked()
     os.write(terminal, b"\x04")  # Ctrl-D
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(within(5)):
         with pytest.raises(ConfigError, match="standard input was closed"):
             await task
 

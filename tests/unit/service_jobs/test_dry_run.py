@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from abbe.service.cli.app import app
+from tests.patience import within
 
 MACHINE_TOML = 'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0.0, 600.0]\nY = [0.0, 500.0]\nZ = [0.0, 450.0]\n'
 DEVICES = """[devices]
@@ -186,6 +187,6 @@ def on_a_terminal(columns: int, words: list[str]) -> str:
                 seen += chunk
         except OSError:  # the last one has closed it
             pass
-        assert process.wait(60) == 0, seen
+        assert process.wait(within(60)) == 0, seen
     os.close(ours)
     return seen.decode()

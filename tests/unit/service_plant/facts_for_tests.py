@@ -9,6 +9,7 @@ from typing import Any
 
 from abbe.service.errors import StoreError
 from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce
+from tests.patience import within
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
 RUNNING = Running("weekly", "quick-check", NOON, "helix", "revolution 3 of 10", 30.0, 42.0)
@@ -47,7 +48,7 @@ class Source:
         """Wait until the facts were asked for so often from now on."""
         while not self._questions.empty():
             self._questions.get_nowait()
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(within(30)):
             for _ in range(times):
                 await self._questions.get()
 

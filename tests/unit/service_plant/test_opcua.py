@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import within
+
 pytest.importorskip("asyncua", reason="the extra [opcua] is not installed")
 
 from asyncua import Client, Node, ua
@@ -39,7 +41,7 @@ async def running(setup: OpcUaSetup, source: Source) -> AsyncIterator[OpcUaServe
     task = asyncio.create_task(part.run(stop))
     heard = asyncio.create_task(part.listening.wait())
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(within(60)):
             await asyncio.wait({task, heard}, return_when=asyncio.FIRST_COMPLETED)
         if task.done():
             await task
@@ -47,7 +49,7 @@ async def running(setup: OpcUaSetup, source: Source) -> AsyncIterator[OpcUaServe
     finally:
         heard.cancel()
         stop.set()
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(within(5)):
             await task
         assert part.port == 0
 
@@ -110,7 +112,7 @@ class Turned:
         self.values.put_nowait(val)
 
     async def until(self, wanted: object) -> None:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(within(20)):
             while await self.values.get() != wanted:
                 pass
 
@@ -360,11 +362,11 @@ async def test_a_port_that_somebody_has_is_tried_again(source: Source) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         part = OpcUaServer(OpcUaSetup(port=int(taken.getsockname()[1])), source, clock, "mill-7", "0.1.0")
         task = asyncio.create_task(part.run(stop))
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(within(30)):
             assert [await clock.pauses.get(), await clock.pauses.get()] == [served.AGAIN_S, served.AGAIN_S]
         assert not task.done()
         assert not part.listening.is_set()
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(within(30)):
         await part.listening.wait()
     stop.set()
     await task

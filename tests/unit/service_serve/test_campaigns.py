@@ -28,6 +28,7 @@ from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.prompts import Prompts
 from abbe.service.web.board import Board
+from tests.patience import within
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
 LED = Led("proposed", "proposal 4 waits for approval", 7, 4)
@@ -87,7 +88,7 @@ class Bench:
 
     async def until(self, what: Any) -> None:
         """Look again whenever a job begins, asks or ends."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(within(10)):
             while not what():
                 self.news.clear()
                 await self.news.wait()

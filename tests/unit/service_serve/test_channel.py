@@ -25,6 +25,7 @@ from abbe.service.errors import ChannelBroken, CoreSilent
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web import import_guard
 from abbe.service.web.core_line import QUEUE, SILENT_S, CoreLine
+from tests.patience import within
 from tests.unit.service_serve.fakes import FakeClock, settle, utc
 
 NOW = utc(2026, 11, 22, 6)
@@ -311,7 +312,7 @@ async def test_a_web_process_that_hangs_or_dies_is_replaced(tmp_path: Any, monke
         running = asyncio.create_task(web.run())
         pids = []
         for number in (9, 19, 0):  # SIGKILL, SIGSTOP
-            async with asyncio.timeout(40):
+            async with asyncio.timeout(within(40)):
                 await up.wait()
             up.clear()
             child = web._child
@@ -324,6 +325,6 @@ async def test_a_web_process_that_hangs_or_dies_is_replaced(tmp_path: Any, monke
                 child.send_signal(number)
         assert (len(set(pids)), web.restarts) == (3, 2)
         web.stop()
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(within(10)):
             await running
         assert child.returncode == 0

@@ -37,6 +37,7 @@ from abbe.service.storage.records import AlarmEntryRecord
 from abbe.service.tables.push_outcome import Outcome, by_journal, open_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Kind
 from abbe.service.verification.alarms import alarms_of
+from tests.patience import within
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, utc
 
 NOON = utc(2026, 6, 1, 12)
@@ -95,7 +96,7 @@ class Bench:
 
     async def until(self, what: Callable[[], Any]) -> Any:
         """The store works in threads: turn after turn of the loop, and of the scheduler, until it is so."""
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(within(20)):
             while not (found := what()):
                 await self.clock.pass_time(30.0)
                 await asyncio.sleep(0.001)
@@ -433,7 +434,7 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
         control.stop()  # before the way back begins
         order = Order(4, cast("Any", None), lambda now: None, control)
         task = asyncio.create_task(push_approved._back(push_approved._Bench(nothing, nothing, bench.store, bench.clock, 100), order, told))
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(within(20)):
             await begun.wait()
             ask(control)
             return await task

@@ -13,11 +13,12 @@ from abbe.service.channel.messages import LivePath, LiveSamples, from_core
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.core.live import show_live
+from tests.patience import within
 from tests.unit.service_capture.test_live import QUARTER, SETUP, batch
 
 
 async def hear(wire: Wire) -> LivePath | LiveSamples:
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(within(30)):
         body = await wire.receive()
     assert body is not None
     told = from_core(body)

@@ -33,6 +33,7 @@ from abbe.service.tables.table_history import story
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.users.roles import Permission, Role
+from tests.patience import within
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
@@ -90,7 +91,7 @@ class Bench:
     async def ended(self) -> JobSeen:
         """The newest job, once it has ended."""
         self.may_end.set()
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(within(10)):
             while self.book.seen()[0].ended_utc is None:
                 self.news.clear()
                 await self.news.wait()
@@ -197,7 +198,7 @@ async def test_an_end_of_the_service_says_where_it_stands(bench: Bench) -> None:
     await bench.push({}, OLD, NEW, KEPT)
     bench.states = UP_TO_ACTIVE
     assert (await bench.ask()).outcome == "done"
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(within(10)):
         await bench.written.wait()
     await bench.book.close()
     assert bench.book.seen()[0].state == "interrupted"

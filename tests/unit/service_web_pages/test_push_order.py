@@ -22,6 +22,7 @@ from abbe.service.scheduler.store import ServiceStore
 from abbe.service.tables.push_outcome import Outcome
 from abbe.service.web.pages.proposals import approve_as
 from tests.pages_world import Filled, Served
+from tests.patience import within
 from tests.pretended_push import TAKEN_BACK, as_if_pushed
 from tests.unit.service_serve.fakes import FakeLedger, FakeShelf
 
@@ -63,7 +64,7 @@ class Bench:
         return await self.orders.push(PushNow("push", 1, number, key, who))
 
     async def ended(self) -> JobSeen:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(within(10)):
             while self.book.seen()[0].ended_utc is None:
                 self.news.clear()
                 await self.news.wait()

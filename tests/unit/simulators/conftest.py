@@ -12,6 +12,7 @@ import pytest
 
 from abbe.simulators.scenario import Scenario, from_dict
 from abbe.simulators.world import World
+from tests.patience import within
 
 QUIET = {
     "scale_sd_um_per_m": 0.0,
@@ -74,7 +75,7 @@ def running(*arguments: str) -> Iterator[Running]:
     finally:
         process.stdin.close()
         process.stdout.close()
-        process.wait(5)
+        process.wait(within(5))
 
 
 @pytest.fixture

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from tests.patience import within
+
 IDENTIFY = bytes.fromhex("A55A810201001D72")
 START_1000 = bytes.fromhex("A55A82040200E803669C")
 STOP = bytes.fromhex("A55A8302030017F9")
@@ -270,7 +272,7 @@ def test_signals_end_it_cleanly(start, tmp_path: Path, number: int) -> None:
             line.read_until(lambda d: len(d) > 100)
             begin = time.monotonic()
             sim.process.send_signal(number)
-            assert sim.process.wait(5) == 0
+            assert sim.process.wait(within(5)) == 0
             assert time.monotonic() - begin < 1.0
         assert list(tmp_path.iterdir()) == []
 
@@ -278,7 +280,7 @@ def test_signals_end_it_cleanly(start, tmp_path: Path, number: int) -> None:
 def test_ends_with_its_parent(start) -> None:
     with start() as sim:
         sim.process.stdin.close()
-        assert sim.process.wait(5) == 0
+        assert sim.process.wait(within(5)) == 0
 
 
 def refused(*arguments: str) -> str:
