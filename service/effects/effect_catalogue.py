@@ -97,18 +97,40 @@ def _load(entry: EntryPoint) -> list[Effect]:
     return found
 
 
+def checked(effects: tuple[Effect, ...], taken: Iterable[str]) -> tuple[Effect, ...]:
+    """Effects that somebody gives by hand, after the self-test that plug-ins have to pass.
+
+    Raises
+    ------
+    EffectPluginBroken
+        One breaks a rule, or has a name that is taken.
+    """
+    fault = _fault(list(effects), set(taken))
+    if fault:
+        raise EffectPluginBroken(f"effect left out: {fault}", "docs/how-to/own-effect.md says what an effect must hold")
+    return effects
+
+
 def _check(entry: EntryPoint, found: list[Effect], taken: set[str]) -> None:
+    fault = _fault(found, taken)
+    if fault:
+        raise _left_out(entry, fault)
+
+
+def _fault(found: list[Effect], taken: set[str]) -> str:
+    """The first rule that an effect breaks; empty: none."""
     names = [e.name for e in found]
     for effect in found:
         if effect.name in taken or names.count(effect.name) > 1:
-            raise _left_out(entry, f"the name {effect.name!r} is taken")
+            return f"the name {effect.name!r} is taken"
         try:
             with np.errstate(all="ignore"):
                 faults = declaration_faults(effect) or signal_faults(effect, probe_paths())
-        except Exception as fault:  # its own code runs here
-            raise _left_out(entry, f"{effect.name}: {type(fault).__name__}: {fault}") from fault
+        except Exception as error:  # noqa: BLE001 - its own code runs here
+            return f"{effect.name}: {type(error).__name__}: {error}"
         if faults:
-            raise _left_out(entry, f"{effect.name}: {faults[0]}" + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""))
+            return f"{effect.name}: {faults[0]}" + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else "")
+    return ""
 
 
 def _left_out(entry: EntryPoint, why: str) -> EffectPluginBroken:

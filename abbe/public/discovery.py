@@ -1,0 +1,91 @@
+"""Find what the simulation of a machine lacks, and prove it on runs that were not fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from abbe.models.effects.effect import Effect
+from abbe.public.estimates import Estimate
+from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.discovery.discover import Job, Journal, prepare
+from abbe.service.discovery.discover import discover as run_discovery
+from abbe.service.discovery.discovery_engine import search
+from abbe.service.discovery.discovery_words import UNITS
+from abbe.service.effects.effect_catalogue import catalogue, checked
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.rendering.discovery_page import render_discovery
+from abbe.service.rendering.page_file import write_page
+from abbe.service.report.discovery_pages import discovery_page, page_facts
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a discovery found. Made by `discover`.
+
+    Attributes
+    ----------
+    verdict : str
+        ``"named"``, ``"none"`` (measurement and simulation agree), or ``"unknown"`` (something is missing that the catalogue does not
+        explain).
+    effects : dict
+        Label, e.g. ``"backlash:X"``, and its signed strength with standard uncertainty.
+    gap : dict
+        Role of runs (``"identify"``, ``"holdout"``): rms of measured minus simulated ``before_um`` and ``after_um`` the effects, and
+        ``floor_um``, the noise that no model takes out.
+    next_measurement : dict or None
+        The measurement that would tell more.
+    """
+
+    verdict: str
+    effects: dict[str, Estimate]
+    gap: dict[str, dict[str, float]]
+    next_measurement: dict[str, Any] | None
+    _job: Job
+    _journal: Journal
+    _finding: dict[str, Any]
+
+    def report(self, target: str | Path) -> None:
+        """Write the page that ``abbe discover --report`` writes.
+
+        Raises
+        ------
+        FileFormatError
+            The file cannot be written.
+        """
+        facts, texts = page_facts(self._job, self._journal, datetime.now(UTC).isoformat(timespec="seconds"))
+        write_page(render_discovery(discovery_page(self._finding, self._job.runs, facts, texts)), Path(target))
+
+    def __repr__(self) -> str:
+        return f"<abbe.Answer: {self.verdict}, {', '.join(self.effects) or 'no effect'}>"
+
+
+def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: ProgressSink | None = None) -> Answer:
+    """Find where measurement and simulation disagree, and name the missing effect.
+
+    Parameters
+    ----------
+    effects : tuple of Effect
+        One's own, looked for beside the catalogue; each has to pass the self-test.
+    progress : callable, optional
+        Gets a share of the work, from 0 to 1, with a line of text.
+
+    Raises
+    ------
+    EffectPluginBroken
+        One of ``effects`` breaks a rule of the self-test, or has a name that the catalogue uses.
+    NotObservable, CampaignRefused
+        There is no run to identify from, or a run cannot be what it says.
+    """
+    known = catalogue()
+    job = prepare(campaign, (*known, *checked(effects, {e.name for e in known})))
+    journal = Journal()
+    finding = run_discovery(job, journal, search, progress or _silent)
+    found = {e["label"]: Estimate(e["strength"], e["u_strength"], UNITS.get(e["unit"], e["unit"]), "observed") for e in finding["effects"]}
+    return Answer(finding["verdict"], found, finding["gaps"], finding["next_test"], job, journal, finding)
+
+
+def _silent(_: Progress) -> None:
+    return None

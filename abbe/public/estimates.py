@@ -1,0 +1,20 @@
+"""A value with its standard uncertainty."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Estimate(NamedTuple):
+    """A value, its standard uncertainty (GUM, k = 1), both in ``unit``, and whether the runs show it by themselves.
+
+    ``status``: "observed", "weak" or "not observable": the value of the last holds only together with the others.
+    """
+
+    value: float
+    u: float
+    unit: str
+    status: str
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} ± {2.0 * self.u:.2g} {self.unit} (k = 2, {self.status})"

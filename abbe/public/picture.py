@@ -1,0 +1,30 @@
+"""A drawing that a notebook shows and a file keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from abbe.service.rendering.page_file import write_page
+from abbe.service.rendering.palette import style_rules
+from abbe.service.rendering.plots.signed import signed_rules
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One or more ``<svg>`` elements; a notebook draws it by itself."""
+
+    svg: str
+
+    def _repr_html_(self) -> str:
+        return f"<div><style>{style_rules()}{signed_rules()}</style>{self.svg}</div>"
+
+    def save(self, target: str | Path) -> None:
+        """Write it as an HTML page.
+
+        Raises
+        ------
+        FileFormatError
+            The file cannot be written.
+        """
+        write_page(f"<!doctype html><meta charset='utf-8'><title>Abbe</title>{self._repr_html_()}\n", Path(target))

@@ -1,0 +1,164 @@
+"""Solve a campaign: error motions with uncertainty, deviation anywhere in the volume, tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from abbe.models.arrays import F2
+from abbe.models.compensation.tables import NineTables, nine_tables, quantise
+from abbe.public.estimates import Estimate
+from abbe.public.picture import Picture
+from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.errors import TableRefused
+from abbe.service.identification.solve import Say, solve_runs
+from abbe.service.identification.solve_report import Account, account, judged, solution_doc
+from abbe.service.rendering.page_file import write_page
+from abbe.service.rendering.plots.bands import motion_bands
+from abbe.service.rendering.solution_model import MotionCurve
+from abbe.service.rendering.solution_page import render_solution
+from abbe.service.report.solve_pages import motion_curves, parameter_rows, solution_page
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """Where the tool is relative to where it should be, in mm; best-fit rigid motion over the strokes removed.
+
+    Attributes
+    ----------
+    value_mm : array, shape (n, 3)
+        Tool relative to the workpiece, mean of both directions of motion.
+    U_mm : array, shape (n, 3)
+        Expanded uncertainty of each component at 95 %.
+    """
+
+    value_mm: F2
+    U_mm: F2
+
+
+class Solution:
+    """What the runs of a campaign say about the machine. Made by `solve`."""
+
+    def __init__(self, campaign: Campaign, found: Account) -> None:
+        self.campaign = campaign
+        self._found = found
+
+    @property
+    def model(self) -> str:
+        """``"rigid6"`` or ``"rigid21"``."""
+        return self._found.joint.model
+
+    @property
+    def verdict(self) -> str:
+        """One line: how far this solution can be trusted, and why not further."""
+        told = judged(self._found)
+        return f"{told.word}: {told.text}"
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What is odd about single runs; an open flag forbids tables."""
+        return tuple(f.line for f in self._found.solved.flags)
+
+    @property
+    def not_observable(self) -> tuple[str, ...]:
+        """What these runs cannot tell, and what would."""
+        return tuple(g.text for g in self._found.observability.hidden)
+
+    @cached_property
+    def parameters(self) -> dict[str, Estimate]:
+        """Scales (``"EXX"``, µm/m) and squareness (``"C0Y"``, µrad), means over the volume; lost motion, cups, bars and mirrors."""
+        status = {m.name: m.status for m in self._found.observability.motions}
+        return {
+            row.name: Estimate(row.value, row.u, row.unit, status.get(row.name, "observed"))
+            for row in parameter_rows(self._found.joint)
+            if row.value is not None and row.u is not None
+        }
+
+    @cached_property
+    def motions(self) -> dict[str, MotionCurve]:
+        """Error motions (ISO 230-1 names) over their strokes: ``position_mm``, ``value``, ``u`` (k = 1), ``unit``, ``status``."""
+        return {curve.name: curve for curve in motion_curves(self._found)}
+
+    def deviation(self, points_mm: ArrayLike) -> Deviation:
+        """Predict the deviation at commanded positions, shape (n, 3) or (3,).
+
+        Raises
+        ------
+        ValueError
+            The shape is another one, or a number is not finite.
+        """
+        points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise ValueError(f"points_mm: finite numbers of shape (n, 3) expected, got shape {np.shape(points_mm)}")
+        predicted = self._found.predict(points)
+        return Deviation(predicted.deviation_mm, predicted.expanded_mm)
+
+    def tables(self, counts: tuple[int, int, int], *, unit_mm: float = 1e-4) -> NineTables:
+        """Nine compensation tables (corrections in mm), rounded to the control's unit. Nothing is written to any machine.
+
+        Parameters
+        ----------
+        counts : (int, int, int)
+            Grid points of X, Y and Z.
+        unit_mm : float
+            The control's smallest step.
+
+        Raises
+        ------
+        TableRefused
+            A flag is open, or the solution is not good enough for a table.
+        """
+        told = judged(self._found)
+        if self.flags:
+            raise TableRefused(f"no tables from a solution with open flags: {self.flags[0]}", "look at that run first; nothing was written")
+        if told.sign == "bad":
+            raise TableRefused(f"no tables from a solution that is {told.word}: {told.reasons[0]}", "measure more; nothing was written")
+        return quantise(nine_tables(self._found.joint, counts, sources=self._found.sources), unit_mm)
+
+    def plot(self) -> Picture:
+        """The error motions over their strokes with bands of U (k = 2)."""
+        curves = list(self.motions.values())
+        units = dict.fromkeys(c.unit for c in curves)
+        return Picture("".join(motion_bands([c for c in curves if c.unit == unit], key=f"motions{i}") for i, unit in enumerate(units)))
+
+    def report(self, target: str | Path) -> None:
+        """Write the page that ``abbe solve --report`` writes.
+
+        Raises
+        ------
+        FileFormatError
+            The file cannot be written.
+        """
+        doc = {"campaign": self.campaign.name} | solution_doc(self._found)
+        page = solution_page(self._found, doc, self.campaign.site, datetime.now(UTC).isoformat(timespec="seconds"))
+        write_page(render_solution(page), Path(target))
+
+    def __repr__(self) -> str:
+        return f"<abbe.Solution of {self.campaign.name}: {self.model}, {self.verdict}>"
+
+
+def solve(campaign: Campaign, *, model: Literal["rigid6", "rigid21", "auto"] | None = None, progress: Say | None = None) -> Solution:
+    """Solve the runs of a campaign that have the role ``identify``, after checks that each can be what it says.
+
+    Parameters
+    ----------
+    model : str, optional
+        ``"rigid6"``: three scales and three squareness; ``"rigid21"``: 21 error motions; ``"auto"``: what held-out runs ask for. None:
+        rigid21, or rigid6 with a flag where there are too few readings.
+    progress : callable, optional
+        Gets one line a stage.
+
+    Raises
+    ------
+    NotObservable
+        There is no run to identify from.
+    CampaignRefused, InstrumentsDisagree
+        A run, bar or mirror cannot be what it says; the message says which and what to do.
+    """
+    return Solution(campaign, account(solve_runs(campaign.site, campaign.runs, model=model, say=progress)))
