@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from abbe.public.solution import solve as solve
     from abbe.service.campaign_data.campaign_folder import Campaign as Campaign
     from abbe.service.errors import AbbeError as AbbeError
-    from abbe.service.sequences.bar_recipes import Circle as Circle
-    from abbe.service.sequences.bar_recipes import Helix as Helix
-    from abbe.service.sequences.campaigns import identification as identification
-    from abbe.service.sequences.campaigns import verification as verification
-    from abbe.service.sequences.discovery_campaign import discovery_campaign as discovery_campaign
-    from abbe.service.sequences.laser_recipes import Diagonal as Diagonal
-    from abbe.service.sequences.laser_recipes import Linear as Linear
+    from abbe.service.sequences.recipes.bar_recipes import Circle as Circle
+    from abbe.service.sequences.recipes.bar_recipes import Helix as Helix
+    from abbe.service.sequences.recipes.campaigns import identification as identification
+    from abbe.service.sequences.recipes.campaigns import verification as verification
+    from abbe.service.sequences.recipes.discovery_campaign import discovery_campaign as discovery_campaign
+    from abbe.service.sequences.recipes.laser_recipes import Diagonal as Diagonal
+    from abbe.service.sequences.recipes.laser_recipes import Linear as Linear
     from abbe.service.sequences.steps import CampaignPlan as CampaignPlan
 
 _WHERE = {
@@ -53,17 +53,17 @@ _WHERE = {
     "Answer": "abbe.public.discovery",
     "Campaign": "abbe.service.campaign_data.campaign_folder",
     "CampaignPlan": "abbe.service.sequences.steps",
-    "Circle": "abbe.service.sequences.bar_recipes",
+    "Circle": "abbe.service.sequences.recipes.bar_recipes",
     "Deviation": "abbe.public.solution",
-    "Diagonal": "abbe.service.sequences.laser_recipes",
+    "Diagonal": "abbe.service.sequences.recipes.laser_recipes",
     "Effect": "abbe.models.effects.effect",
     "ErrorMotions": "abbe.models.functions.motions",
     "Estimate": "abbe.public.estimates",
     "Form": "abbe.models.effects.effect",
-    "Helix": "abbe.service.sequences.bar_recipes",
+    "Helix": "abbe.service.sequences.recipes.bar_recipes",
     "Instruments": "abbe.public.simulation",
     "Legendre": "abbe.models.functions.legendre",
-    "Linear": "abbe.service.sequences.laser_recipes",
+    "Linear": "abbe.service.sequences.recipes.laser_recipes",
     "Machine": "abbe.models.machine",
     "NineTables": "abbe.models.compensation.tables",
     "Parameter": "abbe.models.effects.effect",
@@ -74,13 +74,13 @@ _WHERE = {
     "Solution": "abbe.public.solution",
     "Table": "abbe.models.functions.table",
     "discover": "abbe.public.discovery",
-    "discovery_campaign": "abbe.service.sequences.discovery_campaign",
-    "identification": "abbe.service.sequences.campaigns",
+    "discovery_campaign": "abbe.service.sequences.recipes.discovery_campaign",
+    "identification": "abbe.service.sequences.recipes.campaigns",
     "read_campaign": "abbe.public.campaign",
     "read_errors": "abbe.public.campaign",
     "simulate": "abbe.public.simulation",
     "solve": "abbe.public.solution",
-    "verification": "abbe.service.sequences.campaigns",
+    "verification": "abbe.service.sequences.recipes.campaigns",
 }
 """Module of each public name; imported at first use, so that a command does not pay for what it does not need."""
 

@@ -55,7 +55,7 @@ from abbe.service.storage.private import database_seen_by_others
 from abbe.service.tables.push_outcome import open_push
 from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 from abbe.service.web.listening import bind, check_certificate, check_exposure
 from abbe.service.web.view import View
 

@@ -45,12 +45,12 @@ from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.auth_middleware import CSRF_HEADER
-from abbe.service.web.authentication import COOKIE, Door, csrf_token
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
+from abbe.service.web.core_link.logtail import LogTail
 from abbe.service.web.listening import bind
-from abbe.service.web.logtail import LogTail
-from abbe.service.web.server import make_server
+from abbe.service.web.login.auth_middleware import CSRF_HEADER
+from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
+from abbe.service.web.process.server import make_server
 from abbe.service.web.view import View
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.scenarios.campaign_files import measured

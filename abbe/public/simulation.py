@@ -22,7 +22,7 @@ from abbe.service.effects.effect_catalogue import catalogue, checked
 from abbe.service.errors import EffectUnknown, Unusable
 from abbe.service.runs.cases import path_of
 from abbe.service.runs.formats import ASSUMED_MODEL, CAMPAIGN_FORMAT, RUN_FORMAT
-from abbe.service.sequences.recipes import Recipe
+from abbe.service.sequences.recipes.recipe import Recipe
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
 from abbe.service.site import Site, machine_doc
 

@@ -24,9 +24,9 @@ from abbe.models.geometry.bases import term_values
 from abbe.models.geometry.chain import design, deviation_mm
 from abbe.models.geometry.jacobian import squareness_motions
 from abbe.models.machine import Machine
+from abbe.models.solvers.assessment import motions_of
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.observability import motions_of
-from abbe.models.solvers.observability_parameters import observable_motions
+from abbe.models.solvers.observability.parameters import observable_motions
 from abbe.models.uncertainty.combined import variances
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 from abbe.models.volumetric import rigid_design, volume_grid

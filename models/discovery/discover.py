@@ -15,7 +15,7 @@ from abbe.models.discovery.prediction import predictions, solve
 from abbe.models.discovery.rivals import Rival, rivals_of
 from abbe.models.discovery.scatter import scattered, without
 from abbe.models.discovery.selection import Contest, Found, dropped, selected, weighed
-from abbe.models.discovery.variance import VarianceFinding
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.discovery.whitened_problem import Scene, linearised, quieted, scene_of
 from abbe.models.effects.effect import Effect
 

@@ -11,9 +11,9 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.agreement import agreements
 from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict, Where
-from abbe.models.discovery.experiment_design import Suspect, propose
-from abbe.models.discovery.experiment_unnamed import propose_unnamed
-from abbe.models.discovery.generic import is_unnamed
+from abbe.models.discovery.experiment.design import Suspect, propose
+from abbe.models.discovery.experiment.unnamed import propose_unnamed
+from abbe.models.discovery.generic.unnamed_structures import is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
 from abbe.models.discovery.localization import locate
 from abbe.models.discovery.prediction import Solved, left_over, predictions
@@ -24,7 +24,7 @@ from abbe.models.discovery.signal_localization import where_of_signal
 from abbe.models.discovery.strength import as_plain, shape_of, strength_of, true_to_form
 from abbe.models.discovery.unnamed import Structure, lacking, structures, told_of
 from abbe.models.discovery.unseen import unseen
-from abbe.models.discovery.variance import VarianceFinding
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.probability import chi2_above
 

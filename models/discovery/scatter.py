@@ -11,7 +11,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.candidates import Pick
 from abbe.models.discovery.noise import unscaled
 from abbe.models.discovery.prediction import solve
-from abbe.models.discovery.variance import VarianceFinding, extra_variance
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extra_variance
 from abbe.models.discovery.whitened_problem import Scene, Tangent, taken_out
 
 GATE = 1.3

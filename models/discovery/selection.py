@@ -10,7 +10,7 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.discovery.candidates import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of
-from abbe.models.discovery.generic import generic_rivals
+from abbe.models.discovery.generic.unnamed_structures import generic_rivals
 from abbe.models.discovery.refine import refined
 from abbe.models.discovery.whitened_problem import Scene
 from abbe.models.effects.effect import Effect
@@ -30,7 +30,7 @@ NEARLY = 0.93
 HOPELESS = 0.5
 """A start that gains less than this share of the best name so far is not refined."""
 UNNAMED_LABELS = 40
-"""So many kinds of structure without a name are tried (`abbe.models.discovery.generic`)."""
+"""So many kinds of structure without a name are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
 """A freedom of form of an effect already there pays this share of the price of its parameters, and this on top."""
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from abbe.models.discovery.answer import Where
 from abbe.models.discovery.case import Case
-from abbe.models.discovery.generic import PREFIX, is_unnamed, where_of
+from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed, where_of
 from abbe.models.discovery.selection import Found
-from abbe.models.discovery.variance import VarianceFinding
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 
 TITLES = {"unnamed_burst": "short disturbance of the reading", "unnamed_place": "readings of the laser off near one place"}
 """Of the structures of the scatter."""

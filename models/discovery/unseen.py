@@ -7,7 +7,7 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Unseen
 from abbe.models.discovery.case import Case
-from abbe.models.discovery.experiment_candidates import one_feed, one_radius, one_way
+from abbe.models.discovery.experiment.candidates import one_feed, one_radius, one_way
 from abbe.models.effects.path import Path
 
 LATE_S = 3600.0

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-from abbe.models.effects import (
-    air_refraction,
-    angular_error,
-    axis_thermal_growth,
+from abbe.models.effects.drives import (
     backlash,
     backlash_position_dependent,
-    bar_length_error,
-    bar_thermal,
-    beam_outliers,
     contour_lag,
     cyclic_error,
-    dead_path,
-    laser_cosine,
-    lateral_play,
-    mirror_tilt,
-    nonrigid_bed,
-    positioning_nonlinear,
-    ram_sag,
     reversal_spike,
     servo_mismatch,
-    setup_centre_offset,
-    spindle_thermal_drift,
-    squareness_thermal,
     stick_slip,
-    straightness,
     vibration,
 )
 from abbe.models.effects.effect import Effect
+from abbe.models.effects.geometry import angular_error, positioning_nonlinear, straightness
+from abbe.models.effects.instruments import (
+    air_refraction,
+    bar_length_error,
+    bar_thermal,
+    beam_outliers,
+    dead_path,
+    laser_cosine,
+    mirror_tilt,
+    setup_centre_offset,
+)
+from abbe.models.effects.structure import lateral_play, nonrigid_bed, ram_sag
+from abbe.models.effects.thermal import axis_thermal_growth, spindle_thermal_drift, squareness_thermal
 
 CATALOGUE: tuple[Effect, ...] = (
     backlash.EFFECT,

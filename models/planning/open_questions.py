@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from abbe.models.planning.information import Problem
-from abbe.models.solvers.observability import observability
+from abbe.models.solvers.assessment import observability
 from abbe.models.solvers.observations import RunData
 
 

@@ -20,8 +20,8 @@ from abbe.models.solvers.engine import Fit, Problem, Progress, build, expected_n
 from abbe.models.solvers.identifiability import Identifiability, combinations_of, taking_part
 from abbe.models.solvers.information import KINDS, total
 from abbe.models.solvers.least_squares import Estimate
-from abbe.models.solvers.observability_free import hidden_free
-from abbe.models.solvers.observability_rank import campaign_columns, compressed, stated_knowledge, what_is_seen
+from abbe.models.solvers.observability.free import hidden_free
+from abbe.models.solvers.observability.rank import campaign_columns, compressed, stated_knowledge, what_is_seen
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import Setup, with_tool
 from abbe.models.solvers.order import RIGID6, OrderChoice, choose, term_levels
@@ -62,7 +62,7 @@ class JointSolution:
     information : array, shape (p, p)
         What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
-        Of the terms up to ``order`` only, by the rule of the whole report (`abbe.models.solvers.observability_rank.stated_knowledge`); its
+        Of the terms up to ``order`` only, by the rule of the whole report (`abbe.models.solvers.observability.rank.stated_knowledge`); its
         ``involved`` also names lost motion and free set-up unknowns that the readings leave open.
     prior_root : array, shape (p, p)
         Factor of the prior covariance of the unknowns, root root^T: orders of one motion are alike, so ``prior_sd`` alone is not all of it.

@@ -16,8 +16,8 @@ from abbe.service.audit.files import append_line, can_append, can_create, create
 from abbe.service.errors import AuditBroken
 from abbe.service.secrets import mask_secrets, visible
 from abbe.service.storage.engine import parse_url
+from abbe.service.storage.repositories.audit import AuditRecord
 from abbe.service.storage.store import Store
-from abbe.service.storage.store_audit import AuditRecord
 
 ENVIRONMENT = "ABBE_AUDIT_FOLDER"
 KEY_BYTES = 32

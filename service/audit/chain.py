@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from abbe.service.push.entries import GENESIS, Doc, canonical
-from abbe.service.storage.store_audit import AuditRecord
+from abbe.service.storage.repositories.audit import AuditRecord
 
 
 @dataclass(frozen=True, slots=True)

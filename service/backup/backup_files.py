@@ -14,7 +14,7 @@ from abbe.service.audit.chain import faults
 from abbe.service.errors import BackupRefused
 from abbe.service.files import is_plain, read_plain
 from abbe.service.storage.copying import rows_of
-from abbe.service.storage.store_audit import AuditRecord
+from abbe.service.storage.repositories.audit import AuditRecord
 
 FORMAT = "abbe-backup/1"
 LIST = "backup.json"

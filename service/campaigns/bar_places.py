@@ -16,10 +16,10 @@ from abbe.service.devices.session import Session
 from abbe.service.errors import AbbeError, MeasurementFault, PushNotBegun, TableRefused
 from abbe.service.events import ProgressSink
 from abbe.service.runs.columns import load_run
-from abbe.service.sequences.bar_recipes import HelixPoints
-from abbe.service.sequences.campaigns import hemisphere
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control
+from abbe.service.sequences.recipes.bar_recipes import HelixPoints
+from abbe.service.sequences.recipes.campaigns import hemisphere
 from abbe.service.sequences.steps import CampaignPlan, Point
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -9,8 +9,8 @@ from typing import Protocol
 
 from abbe.models.machine import Machine
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.campaigns import identification, quick_check, verification
-from abbe.service.sequences.recipe_file import read_recipe
+from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification
+from abbe.service.sequences.recipes.recipe_file import read_recipe
 from abbe.service.sequences.steps import CampaignPlan
 
 IDENTIFICATION = "identification"

@@ -19,9 +19,9 @@ from abbe.service.events import Progress, ProgressSink, ignore_progress
 from abbe.service.rendering.plan_page import PlanPage, render_plan
 from abbe.service.rendering.plots.setups import SetupPath, setups_picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
-from abbe.service.sequences.recipe_file import recipe_text
-from abbe.service.sequences.recipes import Diagonal, Helix, Linear, Recipe
-from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe
+from abbe.service.sequences.recipes.recipe_file import recipe_text
+from abbe.service.sequences.recipes.setups import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 

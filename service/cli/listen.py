@@ -26,7 +26,7 @@ def listen(
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.sequences.check import paced
-    from abbe.service.sequences.recipe_file import read_recipe
+    from abbe.service.sequences.recipes.recipe_file import read_recipe
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store

@@ -165,7 +165,7 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
 
 def _source(recipe: str, helix: str, rate_hz: int) -> dict[str, Any]:
     """What a plan is made of; a recipe file's text with it, so that nobody needs the file to go on."""
-    from abbe.service.sequences.recipe_file import recipe_source
+    from abbe.service.sequences.recipes.recipe_file import recipe_source
 
     text = recipe_source(Path(recipe)) if recipe.endswith(".toml") else None
     return {"recipe": recipe or "quick-check", "helix": helix, "rate_hz": rate_hz, "text": text}
@@ -237,8 +237,8 @@ async def verification_before(session: Session, store: Store, site: Site, campai
     from abbe.service.campaigns.measure import measure as work_measure
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposals import load_runs
-    from abbe.service.sequences.campaigns import verification
     from abbe.service.sequences.check import paced
+    from abbe.service.sequences.recipes.campaigns import verification
 
     if campaign:
         ids = [r.id for r in store.runs(campaign) if r.visible_status == "complete"]
@@ -289,9 +289,9 @@ def warn_of_open_push(url: str, site: Site) -> None:
 def _plan(machine: Machine, source: dict[str, Any]) -> CampaignPlan:
     """The campaign, named after its recipe."""
     from abbe.service.errors import ConfigError
-    from abbe.service.sequences.campaigns import identification, quick_check, verification
-    from abbe.service.sequences.recipe_file import parse_recipe, recipe_text
-    from abbe.service.sequences.recipes import Helix
+    from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification
+    from abbe.service.sequences.recipes.recipe import Helix
+    from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_text
     from abbe.service.sequences.steps import CampaignPlan
 
     recipe, helix, rate_hz = str(source["recipe"]), str(source["helix"]), int(source["rate_hz"])

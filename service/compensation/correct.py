@@ -38,11 +38,11 @@ from abbe.service.events import Progress, ProgressSink
 from abbe.service.identification.solve import Solved, helix_misfit
 from abbe.service.identification.table_removal import less, taken
 from abbe.service.push.operations import Verdict
-from abbe.service.sequences.campaigns import verification
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Suspending
 from abbe.service.sequences.needed import check_devices
+from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import check_limits

@@ -20,8 +20,8 @@ from abbe.service.push.validate import content_digest, reasons_against
 from abbe.service.site import Site
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import ApprovalRecord
+from abbe.service.storage.repositories.decisions import RejectionRecord
 from abbe.service.storage.store import Store
-from abbe.service.storage.store_decisions import RejectionRecord
 from abbe.service.tables.base_table import Base, read_base
 
 

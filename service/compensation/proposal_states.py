@@ -13,8 +13,8 @@ from abbe.service.push.book import read_entries
 from abbe.service.push.entries import Entry, Journal, facts
 from abbe.service.push.states import TERMINAL, State
 from abbe.service.storage.records import ApprovalRecord
+from abbe.service.storage.repositories.decisions import RejectionRecord
 from abbe.service.storage.store import Store
-from abbe.service.storage.store_decisions import RejectionRecord
 from abbe.service.tables.push_history import KIND, pushes_of
 
 

@@ -27,9 +27,9 @@ from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import Session
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
 from abbe.service.events import ProgressSink
-from abbe.service.sequences.campaigns import verification
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.records import AlarmEntryRecord
 from abbe.service.storage.store import Store

@@ -12,7 +12,7 @@ from abbe.service.channel.messages import CheckNow, DeviceSeen, DueSlot, Moment
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobBook
 from abbe.service.scheduler.slots import Schedule
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 
 AGAIN = timedelta(minutes=1)
 """The timetable is looked at no more often than this, unless a slot has come: it changes only then."""

@@ -14,7 +14,7 @@ from abbe.service.mqtt.publisher import Publisher
 from abbe.service.scheduler.ports import Doc
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.verification.verified_by import VerifiedBy
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 
 LOOK_S = 5.0
 

@@ -22,7 +22,7 @@ from abbe.service.demo.simulator_process import running_world, sealed_truth
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.push.limits import PushLimits
-from abbe.service.sequences.campaigns import identification, verification
+from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from abbe.models.compensation.tables import NineTables
+from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.observability import observability_of
 from abbe.service.compensation.correct import Correction
 from abbe.service.demo.demo import DemoResult
 from abbe.service.rendering.model import (

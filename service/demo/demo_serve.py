@@ -31,8 +31,8 @@ from abbe.service.errors import AbbeError, StoreError
 from abbe.service.events import ignore_progress
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import solution_doc
-from abbe.service.sequences.campaigns import identification, verification
 from abbe.service.sequences.check import paced
+from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.users.people import People

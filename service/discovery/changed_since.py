@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from abbe.models.compensation.smooth import smooth_of
-from abbe.models.discovery.changed import Change, Changed, changed_since
+from abbe.models.discovery.changed.comparison import Change, Changed, changed_since
 from abbe.models.solvers.in_force import InForce
 from abbe.models.uncertainty.known_field import KnownField
 from abbe.service.campaign_data.campaign_folder import Campaign

@@ -9,8 +9,8 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
+from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.observability import Observability, observability_of
 from abbe.models.solvers.robust import Outlier
 from abbe.models.uncertainty.budget import Budget, BudgetLine, budget_over, worst_point
 from abbe.models.uncertainty.frame import volume_frame

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abbe.models.solvers.observability_volume import GOOD, USABLE, Number
+from abbe.models.solvers.observability.volume import GOOD, USABLE, Number
 from abbe.models.uncertainty.prediction import Prediction
 
 WORDS = ("mostly assumption", "usable with care", "good")

@@ -22,12 +22,12 @@ from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import Session
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.jobs.investigate import NO, Bench, made_of, promise_words
-from abbe.service.sequences.campaigns import identification
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import COMPENSATION_ON
 from abbe.service.sequences.needed import check_devices, needed_by
-from abbe.service.sequences.recipe_file import parse_recipe, recipe_source
+from abbe.service.sequences.recipes.campaigns import identification
+from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_source
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.tables.base_table import read_base
 

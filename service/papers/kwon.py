@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.kwon.geometry import Geometry
-from abbe.models.kwon.kinematics import forward, forward_as_printed, inverse, links, square_commands
+from abbe.models.papers.kwon.geometry import Geometry
+from abbe.models.papers.kwon.kinematics import forward, forward_as_printed, inverse, links, square_commands
 from abbe.service.papers import kwon_printed as paper
 from abbe.service.papers import kwon_tables
 from abbe.service.papers.check import Check

@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.kwon.anova import anova_from_sums, critical_f
-from abbe.models.kwon.forensics import (
+from abbe.models.papers.kwon.anova import anova_from_sums, critical_f
+from abbe.models.papers.kwon.forensics import (
     GridSums,
     ImpliedPlane,
     grid_sums,
@@ -20,8 +20,8 @@ from abbe.models.kwon.forensics import (
     ladder_name,
     square_grid,
 )
-from abbe.models.kwon.layout import layout
-from abbe.models.kwon.terms import CUBIC, IN_PLANE
+from abbe.models.papers.kwon.layout import layout
+from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE
 from abbe.service.papers import kwon_printed as paper
 from abbe.service.papers.compare import Computed, agrees, computed_from
 from abbe.service.papers.printed import Printed, values

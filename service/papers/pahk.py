@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.models.pahk.squareness_only import best_assignment, squareness_diagonals_mm
+from abbe.models.papers.pahk.squareness_only import best_assignment, squareness_diagonals_mm
 from abbe.service.papers import pahk_printed as paper
 from abbe.service.papers.compare import Computed
 from abbe.service.papers.pahk_printed import Cmm

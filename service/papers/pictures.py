@@ -9,9 +9,9 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.geometry.chain import deviation_mm
-from abbe.models.kwon.forensics import square_grid
-from abbe.models.kwon.terms import IN_PLANE, regressors
 from abbe.models.notation.pahk import motions_from_pahk, pahk_machine, pahk_type
+from abbe.models.papers.kwon.forensics import square_grid
+from abbe.models.papers.kwon.terms import IN_PLANE, regressors
 from abbe.service.papers import kwon_printed, pahk_printed, yang_printed
 from abbe.service.papers.kwon_tables import in_plane, plane
 from abbe.service.papers.pahk import machine_inputs

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.probe.calibration import ProbeCalibration, calibrate, master_sphere_pattern, without_absorbed
-from abbe.models.probe.frame import direction
+from abbe.models.papers.probe.calibration import ProbeCalibration, calibrate, master_sphere_pattern, without_absorbed
+from abbe.models.papers.probe.frame import direction
 from abbe.service.papers import pahk_printed as paper
 
 THREE_LOBES_MM, POLE_MM = 0.005, 0.0025

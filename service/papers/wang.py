@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from abbe.models.wang.mirror import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
+from abbe.models.papers.wang.mirror import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
 from abbe.service.papers import wang_printed as paper
 from abbe.service.papers.compare import Computed
 from abbe.service.papers.row import Erratum, Row

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.models.yang.difference import confidence_interval
+from abbe.models.papers.yang.difference import confidence_interval
 from abbe.service.papers import yang_printed as paper
 from abbe.service.papers import yang_simulation, yang_table3
 from abbe.service.papers.check import Check

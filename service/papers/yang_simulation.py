@@ -13,10 +13,10 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.notation.yang import YangErrors, iso_squareness, workpiece_mm
+from abbe.models.papers.yang.ballbar import reading_eq6, second_order_bound_mm
+from abbe.models.papers.yang.complete import delta_exact
 from abbe.models.paths.helix import helix_points
 from abbe.models.solvers.helix import LINEAR, fit_helix, helix_design
-from abbe.models.yang.ballbar import reading_eq6, second_order_bound_mm
-from abbe.models.yang.complete import delta_exact
 from abbe.service.papers import yang_printed as paper
 from abbe.service.papers.check import Check
 

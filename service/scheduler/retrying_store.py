@@ -14,7 +14,7 @@ from abbe.service.errors import StoreError
 from abbe.service.scheduler import record
 from abbe.service.scheduler.ports import Doc, OpenSlot
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.store_slots import RUNNING
+from abbe.service.storage.repositories.slots import RUNNING
 
 log = structlog.get_logger("abbe.store")
 

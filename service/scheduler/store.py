@@ -9,9 +9,9 @@ from datetime import datetime
 from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
 
 from abbe.service.storage.records import Doc, SlotRecord
+from abbe.service.storage.repositories.campaigns import new_id
+from abbe.service.storage.repositories.slots import SLOT_COLUMNS, slot_record
 from abbe.service.storage.store import Store
-from abbe.service.storage.store_campaigns import new_id
-from abbe.service.storage.store_slots import SLOT_COLUMNS, slot_record
 from abbe.service.storage.tables import campaigns, machines, outbox, slots, verifications
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 from abbe.models.machine import AXES, Machine
 from abbe.service.errors import StrokeError
-from abbe.service.sequences.approach import LOW_SHARE, as_point, cup_of
+from abbe.service.sequences.recipes.approach import LOW_SHARE, as_point, cup_of
 from abbe.service.sequences.steps import (
     MAX_PATH_POINTS,
     CampaignPlan,

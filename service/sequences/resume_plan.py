@@ -14,8 +14,8 @@ import numpy as np
 
 from abbe.service.errors import SetupDisturbed
 from abbe.service.runs.pieces import SoFar
-from abbe.service.sequences.approach import cup_of, over_pole
 from abbe.service.sequences.path_resume import Onward, rest_of_path
+from abbe.service.sequences.recipes.approach import cup_of, over_pole
 from abbe.service.sequences.steps import (
     ChangeBar,
     FollowPath,

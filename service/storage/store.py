@@ -7,22 +7,22 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, select
 
 from abbe.service.storage.records import Doc, ImportedRun
-from abbe.service.storage.store_alarms import AlarmStore
-from abbe.service.storage.store_audit import AuditStore
-from abbe.service.storage.store_campaigns import insert_campaign, machine_id_of
-from abbe.service.storage.store_checkpoints import CheckpointStore
-from abbe.service.storage.store_decisions import DecisionStore
-from abbe.service.storage.store_discoveries import DiscoveryStore
-from abbe.service.storage.store_health import HealthStore
-from abbe.service.storage.store_pages import PageStore
-from abbe.service.storage.store_people import PeopleStore
-from abbe.service.storage.store_proposals import ProposalStore
-from abbe.service.storage.store_push import PushStore
-from abbe.service.storage.store_queues import QueueStore
-from abbe.service.storage.store_results import ResultStore
-from abbe.service.storage.store_runs import RunStore, insert_imported
-from abbe.service.storage.store_slots import SlotStore
-from abbe.service.storage.store_stations import StationStore
+from abbe.service.storage.repositories.alarms import AlarmStore
+from abbe.service.storage.repositories.audit import AuditStore
+from abbe.service.storage.repositories.campaigns import insert_campaign, machine_id_of
+from abbe.service.storage.repositories.checkpoints import CheckpointStore
+from abbe.service.storage.repositories.decisions import DecisionStore
+from abbe.service.storage.repositories.discoveries import DiscoveryStore
+from abbe.service.storage.repositories.health import HealthStore
+from abbe.service.storage.repositories.heartbeats import StationStore
+from abbe.service.storage.repositories.pages import PageStore
+from abbe.service.storage.repositories.people import PeopleStore
+from abbe.service.storage.repositories.proposals import ProposalStore
+from abbe.service.storage.repositories.push import PushStore
+from abbe.service.storage.repositories.queues import QueueStore
+from abbe.service.storage.repositories.results import ResultStore
+from abbe.service.storage.repositories.runs import RunStore, insert_imported
+from abbe.service.storage.repositories.slots import SlotStore
 from abbe.service.storage.tables import identity
 
 

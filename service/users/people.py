@@ -12,8 +12,8 @@ from datetime import UTC, datetime, timedelta
 from abbe.service.clock import Clock
 from abbe.service.errors import UserRefused
 from abbe.service.storage.base import utc_text
+from abbe.service.storage.repositories.people import TokenRecord, UserRecord
 from abbe.service.storage.store import Store
-from abbe.service.storage.store_people import TokenRecord, UserRecord
 from abbe.service.users.passwords import Passwords, check_new
 from abbe.service.users.roles import ALLOWED, Permission, Role
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.models.kwon.frames import best_fit_errors, nearest_rotation, three_point_errors, three_point_frame
-from abbe.models.kwon.geometry import PER_LEG, Geometry
-from abbe.models.kwon.kinematics import forward, forward_as_printed, inverse, jacobian, square_commands
-from abbe.models.kwon.sensitivity import parameter_jacobian
+from abbe.models.papers.kwon.frames import best_fit_errors, nearest_rotation, three_point_errors, three_point_frame
+from abbe.models.papers.kwon.geometry import PER_LEG, Geometry
+from abbe.models.papers.kwon.kinematics import forward, forward_as_printed, inverse, jacobian, square_commands
+from abbe.models.papers.kwon.sensitivity import parameter_jacobian
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks
 

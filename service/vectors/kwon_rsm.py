@@ -10,11 +10,18 @@ import re
 
 import numpy as np
 
-from abbe.models.kwon.anova import anova_from_sums, critical_f
-from abbe.models.kwon.forensics import LADDER, coefficients_from_planes, grid_sums, in_plane_coefficients, in_plane_label, square_grid
-from abbe.models.kwon.layout import layout
-from abbe.models.kwon.surface import fit_surface
-from abbe.models.kwon.terms import IN_PLANE
+from abbe.models.papers.kwon.anova import anova_from_sums, critical_f
+from abbe.models.papers.kwon.forensics import (
+    LADDER,
+    coefficients_from_planes,
+    grid_sums,
+    in_plane_coefficients,
+    in_plane_label,
+    square_grid,
+)
+from abbe.models.papers.kwon.layout import layout
+from abbe.models.papers.kwon.surface import fit_surface
+from abbe.models.papers.kwon.terms import IN_PLANE
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import LAYOUT, Case
 from abbe.service.vectors.checks import Checks

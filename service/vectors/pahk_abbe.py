@@ -9,8 +9,8 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.line_fit import straight_line
 from abbe.models.notation.pahk import pahk_type
-from abbe.models.pahk.offset import Setup, as_measured, refer_to_origin
-from abbe.models.pahk.tables import ParameterTables, Triple
+from abbe.models.papers.pahk.offset import Setup, as_measured, refer_to_origin
+from abbe.models.papers.pahk.tables import ParameterTables, Triple
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import LAYOUT, Case
 from abbe.service.vectors.checks import Checks

@@ -6,8 +6,8 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.notation.pahk import pahk_type
-from abbe.models.pahk.diagonals import space_diagonals
-from abbe.models.pahk.tables import ParameterTables, Triple
+from abbe.models.papers.pahk.diagonals import space_diagonals
+from abbe.models.papers.pahk.tables import ParameterTables, Triple
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.pahk_parameters import pair, squareness

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abbe.models.notation.pahk import pahk_type
-from abbe.models.pahk.random_errors import RandomErrors, parameter_jacobian, printed_eq5_mm, quadrature_mm
+from abbe.models.papers.pahk.random_errors import RandomErrors, parameter_jacobian, printed_eq5_mm, quadrature_mm
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.pahk_parameters import pair, squareness

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, pahk_type
-from abbe.models.pahk.volume_map import Form, chain_deviation_mm
+from abbe.models.papers.pahk.volume_map import Form, chain_deviation_mm
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks

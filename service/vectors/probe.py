@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.probe.calibration import calibrate
-from abbe.models.probe.combined import combined_deviation_mm, printed_eq17_mm
-from abbe.models.probe.frame import direction, direction_angles, probe_frame, to_probe
+from abbe.models.papers.probe.calibration import calibrate
+from abbe.models.papers.probe.combined import combined_deviation_mm, printed_eq17_mm
+from abbe.models.papers.probe.frame import direction, direction_angles, probe_frame, to_probe
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.monomials import ErrorArrays, monomials
+from abbe.models.papers.wang.experiments import Plan, distance_errors_mm, interpolated_mm, problem, readings
+from abbe.models.papers.wang.model import exact_positions_mm, monomial_field
 from abbe.models.solvers.designs import shortest_solution
 from abbe.models.solvers.step_diagonal import increments, wang_eq7
 from abbe.models.volumetric import volume_grid
-from abbe.models.wang.experiments import Plan, distance_errors_mm, interpolated_mm, problem, readings
-from abbe.models.wang.model import exact_positions_mm, monomial_field
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks
 

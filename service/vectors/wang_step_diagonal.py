@@ -6,13 +6,13 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.monomials import ErrorArrays
+from abbe.models.papers.wang.experiments import problem
+from abbe.models.papers.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm
+from abbe.models.papers.wang.model import displacement_eq11, exact_positions_mm
+from abbe.models.papers.wang.squareness import AcuteSquareness, diagonal_totals_eq12, squareness_eq13_printed
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.models.solvers.designs import ranks
 from abbe.models.solvers.step_diagonal import closure_mm, demeaned, increments, squareness_contrast, wang_eq7, wang_four
-from abbe.models.wang.experiments import problem
-from abbe.models.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm
-from abbe.models.wang.model import displacement_eq11, exact_positions_mm
-from abbe.models.wang.squareness import AcuteSquareness, diagonal_totals_eq12, squareness_eq13_printed
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import LAYOUT, Case
 from abbe.service.vectors.checks import Checks

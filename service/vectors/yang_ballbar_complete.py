@@ -9,13 +9,13 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.monomials import Kind, Monomial
 from abbe.models.notation.yang import YangErrors, workpiece_mm
+from abbe.models.papers.yang.ballbar import measured_mm
+from abbe.models.papers.yang.complete import delta_exact, monomial_errors, monomial_field
+from abbe.models.papers.yang.conditioning import design_eq9
+from abbe.models.papers.yang.experiments import BAR_POINTS, EXPERIMENTS, Plan, all_helices
 from abbe.models.paths.helix import helix_points
 from abbe.models.solvers.designs import map_noise_gain, shortest_solution
 from abbe.models.volumetric import volume_grid
-from abbe.models.yang.ballbar import measured_mm
-from abbe.models.yang.complete import delta_exact, monomial_errors, monomial_field
-from abbe.models.yang.conditioning import design_eq9
-from abbe.models.yang.experiments import BAR_POINTS, EXPERIMENTS, Plan, all_helices
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import LAYOUT, Case
 from abbe.service.vectors.checks import Checks

@@ -7,8 +7,8 @@ import re
 import numpy as np
 
 from abbe.models.arrays import F2
+from abbe.models.papers.yang.conditioning import common_scale_trace_mm, conditioning, design_eq9, spread, two_radii_design
 from abbe.models.paths.helix import Law, helix_points
-from abbe.models.yang.conditioning import common_scale_trace_mm, conditioning, design_eq9, spread, two_radii_design
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import LAYOUT, Case
 from abbe.service.vectors.checks import Checks

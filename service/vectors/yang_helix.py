@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from abbe.models.arrays import F1, F2
 from abbe.models.notation.yang import workpiece_mm
+from abbe.models.papers.yang.ballbar import reading_eq6, reading_eq8
+from abbe.models.papers.yang.simplified import SixParameters, ZConvention, delta_eq2, fit_eq9
 from abbe.models.paths.helix import Law, helix_points
-from abbe.models.yang.ballbar import reading_eq6, reading_eq8
-from abbe.models.yang.simplified import SixParameters, ZConvention, delta_eq2, fit_eq9
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks

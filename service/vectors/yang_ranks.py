@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.functions.monomials import monomials
+from abbe.models.papers.yang.experiments import EXPERIMENTS, LATERAL_TOOL_MM, LONG_TOOL_MM, MAP_NODES, Experiment, Plan, Problem
+from abbe.models.papers.yang.origins import origin_plan
 from abbe.models.solvers.designs import hidden_combination, ranks
-from abbe.models.yang.experiments import EXPERIMENTS, LATERAL_TOOL_MM, LONG_TOOL_MM, MAP_NODES, Experiment, Plan, Problem
-from abbe.models.yang.origins import origin_plan
 from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import LAYOUT, Case
 from abbe.service.vectors.checks import Checks

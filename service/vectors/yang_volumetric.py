@@ -6,7 +6,7 @@ import numpy as np
 
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
-from abbe.models.yang.complete import delta_eq1, delta_exact
+from abbe.models.papers.yang.complete import delta_eq1, delta_exact
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.checks import Checks
 

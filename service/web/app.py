@@ -19,20 +19,20 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.roles import Permission
 from abbe.service.web import problems
-from abbe.service.web.access import PUBLIC, needs
 from abbe.service.web.api.install import add_api
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.api.table_orders import add_table_orders
-from abbe.service.web.auth_middleware import Guard
-from abbe.service.web.authentication import Door
-from abbe.service.web.core_line import CoreLine
-from abbe.service.web.core_unavailable import add_silence
+from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.core_link.core_unavailable import add_silence
 from abbe.service.web.document import complete
 from abbe.service.web.frame import Framed
 from abbe.service.web.headers import SecurityHeaders
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
-from abbe.service.web.login import add_login
+from abbe.service.web.login.access import PUBLIC, needs
+from abbe.service.web.login.auth_middleware import Guard
+from abbe.service.web.login.authentication import Door
+from abbe.service.web.login.login import add_login
 from abbe.service.web.metrics import add_metrics
 from abbe.service.web.mtconnect import add_mtconnect
 from abbe.service.web.page import HERE, ICON, environment, render

@@ -7,9 +7,9 @@ from typing import Any
 
 from starlette.routing import BaseRoute
 
-from abbe.service.web.access import MUTATING, PUBLIC, Need, cells
-from abbe.service.web.authentication import COOKIE
 from abbe.service.web.catalogue import HTTP
+from abbe.service.web.login.access import MUTATING, PUBLIC, Need, cells
+from abbe.service.web.login.authentication import COOKIE
 from abbe.service.web.problems import MEDIA_TYPE
 from abbe.service.web.schemas import Problem
 

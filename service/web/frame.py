@@ -16,10 +16,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from abbe.service.rendering.numbers import Unit
 from abbe.service.users.roles import Permission
 from abbe.service.web import language, units
-from abbe.service.web.auth_middleware import Visit
-from abbe.service.web.authentication import csrf_token
 from abbe.service.web.language import DEFAULT, NAMES
-from abbe.service.web.origin import is_tls
+from abbe.service.web.login.auth_middleware import Visit
+from abbe.service.web.login.authentication import csrf_token
+from abbe.service.web.login.origin import is_tls
 
 YEAR_S = 31_536_000
 THEMES = ("auto", "light", "dark")

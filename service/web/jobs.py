@@ -13,9 +13,9 @@ from fastapi.responses import JSONResponse, Response
 from abbe.service.campaigns.builtin_recipes import named, parted
 from abbe.service.channel.messages import Answer, How, JobSeen
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
-from abbe.service.web.auth_middleware import Visit
-from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.problems import problem
 from abbe.service.web.schemas import Problem
 from abbe.service.web.schemas_jobs import JobList, JobState, NewJob

@@ -11,9 +11,9 @@ from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 
 from abbe.service.errors import CoreSilent
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
-from abbe.service.web.auth_middleware import Visit
-from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.schemas_jobs import Live
 
 LONGEST_S = 600.0

@@ -17,8 +17,8 @@ from abbe.service.errors import CoreSilent
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
-from abbe.service.web.access import needs
-from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.login.access import needs
 
 VERDICTS = ("pass", "fail", "cannot tell")
 

@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from abbe.service.plant.facts import Facts, FactsSource
 from abbe.service.plant.mtconnect import Agent, Refused
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
+from abbe.service.web.login.access import needs
 
 MEDIA_TYPE = "text/xml"
 

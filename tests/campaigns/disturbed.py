@@ -38,7 +38,7 @@ from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Suspending, Watching
-from abbe.service.sequences.recipe_file import parse_recipe
+from abbe.service.sequences.recipes.recipe_file import parse_recipe
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store

@@ -20,8 +20,8 @@ from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls, open_session
-from abbe.service.sequences.recipes import Circle, Diagonal, Helix, Linear
-from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.recipes.recipe import Circle, Diagonal, Helix, Linear
+from abbe.service.sequences.recipes.setups import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store

@@ -15,7 +15,7 @@ from abbe.service.compensation.correct import correct, push
 from abbe.service.errors import ConfigError
 from abbe.service.events import ignore_progress
 from abbe.service.sequences.needed import needed_by
-from abbe.service.sequences.recipes import HelixPoints
+from abbe.service.sequences.recipes.recipe import HelixPoints
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
 from abbe.simulators.ballbar import device

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import pytest
 
-from abbe.service.sequences.recipes import Diagonal, Helix, Linear
-from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear
+from abbe.service.sequences.recipes.setups import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
 from tests.campaigns.disturbed import MACHINE, both, summary
 

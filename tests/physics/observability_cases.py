@@ -13,9 +13,11 @@ from abbe.models.machine import Machine
 from abbe.models.notation import wang as wang_notation
 from abbe.models.notation import yang as yang_notation
 from abbe.models.notation.yang import workpiece_mm
+from abbe.models.papers.yang.complete import monomial_field
+from abbe.models.papers.yang.origins import origin_plan
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from abbe.models.solvers.observability_rank import (
+from abbe.models.solvers.observability.rank import (
     Knowledge,
     Seen,
     campaign_columns,
@@ -28,8 +30,6 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import perpendicular, setup_unknowns
 from abbe.models.solvers.priors import Priors
 from abbe.models.volumetric import rigid_design, volume_grid
-from abbe.models.yang.complete import monomial_field
-from abbe.models.yang.origins import origin_plan
 
 TRAVEL = np.array([812.8, 495.0, 508.0])
 TOOL = np.array([0.0, 0.0, 150.0])

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from abbe.models.discovery.changed import Changed, changed_since
-from abbe.models.discovery.changed_bench import LINEAR
+from abbe.models.discovery.changed.comparison import Changed, changed_since
+from abbe.models.discovery.changed.search import LINEAR
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.known_field import KnownField
 from tests.physics.truth import MACHINE, Truth

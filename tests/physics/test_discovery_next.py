@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from abbe.models.discovery.experiment_candidates import offers
-from abbe.models.discovery.experiment_design import Suspect, propose, prospects
+from abbe.models.discovery.experiment.candidates import offers
+from abbe.models.discovery.experiment.design import Suspect, propose, prospects
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import bar, campaign, case_of_paths, circle

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.answer import Where
-from abbe.models.discovery.experiment_candidates import offers
-from abbe.models.discovery.experiment_unnamed import propose_unnamed
-from abbe.models.discovery.generic import generic_rivals
+from abbe.models.discovery.experiment.candidates import offers
+from abbe.models.discovery.experiment.unnamed import propose_unnamed
+from abbe.models.discovery.generic.unnamed_structures import generic_rivals
 from abbe.models.discovery.unnamed import Structure
 from abbe.models.discovery.unseen import unseen
 from abbe.models.effects.path import Path

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.variance import VarianceFinding, candidates, extra_variance
-from abbe.models.discovery.variance_mixture import contaminated
+from abbe.models.discovery.variance.mixture import contaminated
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, candidates, extra_variance
 from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import bar, campaign, circle, noise
 

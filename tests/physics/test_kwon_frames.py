@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from abbe.models.kwon.errors import CollinearPoints
-from abbe.models.kwon.frames import (
+from abbe.models.papers.kwon.errors import CollinearPoints
+from abbe.models.papers.kwon.frames import (
     best_fit_errors,
     best_fit_frame,
     from_frame,

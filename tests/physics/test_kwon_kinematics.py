@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abbe.models.kwon.errors import (
+from abbe.models.papers.kwon.errors import (
     CollinearSphereCentres,
     LinksHorizontal,
     NoForwardSolution,
@@ -20,8 +20,8 @@ from abbe.models.kwon.errors import (
     SerialSingularity,
     UnreachableLeg,
 )
-from abbe.models.kwon.geometry import PER_LEG, Geometry
-from abbe.models.kwon.kinematics import (
+from abbe.models.papers.kwon.geometry import PER_LEG, Geometry
+from abbe.models.papers.kwon.kinematics import (
     forward,
     forward_as_printed,
     inverse,
@@ -31,7 +31,7 @@ from abbe.models.kwon.kinematics import (
     links,
     square_commands,
 )
-from abbe.models.kwon.sensitivity import parameter_design, parameter_jacobian, parameter_names
+from abbe.models.papers.kwon.sensitivity import parameter_design, parameter_jacobian, parameter_names
 
 NOMINAL = Geometry(100.0, 30.0, 101.26, 8.0, 8.0, np.radians(35.0), 20.0)  # type: ignore[arg-type]
 

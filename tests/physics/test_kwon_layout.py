@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from abbe.models.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
-from abbe.models.kwon.forensics import square_grid
-from abbe.models.kwon.geometry import Geometry
-from abbe.models.kwon.kinematics import forward, inverse
-from abbe.models.kwon.layout import FLATNESS, layout
-from abbe.models.kwon.planes import parallel_planes
-from abbe.models.kwon.surface import fit_surface
-from abbe.models.kwon.terms import CUBIC, IN_PLANE, regressors
+from abbe.models.papers.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
+from abbe.models.papers.kwon.forensics import square_grid
+from abbe.models.papers.kwon.geometry import Geometry
+from abbe.models.papers.kwon.kinematics import forward, inverse
+from abbe.models.papers.kwon.layout import FLATNESS, layout
+from abbe.models.papers.kwon.planes import parallel_planes
+from abbe.models.papers.kwon.surface import fit_surface
+from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, regressors
 
 NOMINAL = Geometry(100.0, 30.0, 101.26, 8.0, 8.0, np.radians(35.0), 20.0)  # type: ignore[arg-type]
 RANK = {1: 10, 2: 16, 3: 19}

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from abbe.models.kwon.anova import anova, anova_from_sums, critical_f
-from abbe.models.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
-from abbe.models.kwon.forensics import (
+from abbe.models.papers.kwon.anova import anova, anova_from_sums, critical_f
+from abbe.models.papers.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
+from abbe.models.papers.kwon.forensics import (
     LADDER,
     coefficients_from_planes,
     grid_sums,
@@ -21,10 +21,10 @@ from abbe.models.kwon.forensics import (
     minimum_norm,
     square_grid,
 )
-from abbe.models.kwon.layout import layout, rank_of
-from abbe.models.kwon.repeatability import repeatability, residual_figures
-from abbe.models.kwon.surface import fit_surface
-from abbe.models.kwon.terms import CUBIC, IN_PLANE, regressors, term_name
+from abbe.models.papers.kwon.layout import layout, rank_of
+from abbe.models.papers.kwon.repeatability import repeatability, residual_figures
+from abbe.models.papers.kwon.surface import fit_surface
+from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, regressors, term_name
 from abbe.service.papers.kwon_printed import RESTORED, TABLE1
 from abbe.service.papers.printed import values
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from abbe.models.paths.lines import diagonal_ends, step_diagonal
-from abbe.models.solvers.observability import observability
-from abbe.models.solvers.observability_additions import additions
-from abbe.models.solvers.observability_present import STEP_ORDERS, present
-from abbe.models.solvers.observability_rank import Knowledge
+from abbe.models.solvers.assessment import observability
+from abbe.models.solvers.observability.additions import additions
+from abbe.models.solvers.observability.present import STEP_ORDERS, present
+from abbe.models.solvers.observability.rank import Knowledge
 from tests.physics.observability_cases import FXYZ, ONE, TEN, YANG, YANG_EXPERIMENTS, laser, wang_diagonals, wang_lines
 
 PLAIN = YANG_EXPERIMENTS["d3"].runs

@@ -13,8 +13,8 @@ import pytest
 from abbe.models.compensation.per_motion import observable_alone
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.assessment import motions_of, observability, observability_of
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.solvers.observability import motions_of, observability, observability_of
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.rounding import as_meant

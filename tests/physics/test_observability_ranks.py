@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from abbe.models.geometry.bases import smooth_terms
-from abbe.models.solvers.observability import observability
-from abbe.models.solvers.observability_cures import Campaign, count_seen, trials
-from abbe.models.solvers.observability_rank import Knowledge, campaign_columns, compressed
+from abbe.models.solvers.assessment import observability
+from abbe.models.solvers.observability.cures import Campaign, count_seen, trials
+from abbe.models.solvers.observability.rank import Knowledge, campaign_columns, compressed
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import Priors
 from tests.physics.observability_cases import (

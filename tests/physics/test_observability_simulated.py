@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 
-from abbe.models.solvers.observability import observability
+from abbe.models.solvers.assessment import observability
 from tests.campaigns.population import CAMPAIGNS, draw_case
 from tests.campaigns.traces import traces
 

@@ -13,6 +13,9 @@ import pytest
 from abbe.models.geometry.bases import Term, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
+from abbe.models.papers.wang.experiments import Plan, distance_errors_mm, interpolated_mm, readings
+from abbe.models.papers.wang.mirror import diagonal_beam
+from abbe.models.papers.wang.model import exact_positions_mm
 from abbe.models.solvers.helix import LINEAR, fit_helix
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.least_squares import Estimate, solve_map
@@ -21,9 +24,6 @@ from abbe.models.solvers.observe import Setup, linearise, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.solvers.step_diagonal import increments, wang_eq7
 from abbe.models.volumetric import volume_grid
-from abbe.models.wang.experiments import Plan, distance_errors_mm, interpolated_mm, readings
-from abbe.models.wang.mirror import diagonal_beam
-from abbe.models.wang.model import exact_positions_mm
 from abbe.service.vectors.case import Case
 from abbe.service.vectors.wang_demo import DEMO_PLANS, IDEAL, NOISY, TILTED
 from abbe.service.vectors.wang_step_diagonal import errors_of, tilts_of

@@ -13,9 +13,9 @@ from abbe.models.notation.pahk import (
     pahk_squareness,
     pahk_type,
 )
-from abbe.models.pahk.diagonals import length_deviation, space_diagonals
-from abbe.models.pahk.tables import ParameterTables
-from abbe.models.pahk.volume_map import chain_deviation_mm, volumetric_map
+from abbe.models.papers.pahk.diagonals import length_deviation, space_diagonals
+from abbe.models.papers.pahk.tables import ParameterTables
+from abbe.models.papers.pahk.volume_map import chain_deviation_mm, volumetric_map
 
 
 def first_order(name, p, d, e, square):

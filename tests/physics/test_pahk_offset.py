@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from abbe.models.functions.line_fit import straight_line
 from abbe.models.notation.pahk import TYPES
-from abbe.models.pahk.offset import Setup, as_measured, line_deviation_mm, offset_terms, refer_to_origin
-from abbe.models.pahk.tables import ParameterTables
+from abbe.models.papers.pahk.offset import Setup, as_measured, line_deviation_mm, offset_terms, refer_to_origin
+from abbe.models.papers.pahk.tables import ParameterTables
 
 # math.md 2.1, corrected value = measured + terms; <> only with the functional point at the probe tip.
 RULES = {

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from abbe.models.geometry.chain import all_chains, deviation_mm
 from abbe.models.machine import Machine
 from abbe.models.notation.pahk import TYPES, motions_from_pahk, pahk_machine
-from abbe.models.pahk.diagonals import length_random_error_mm, shared_variables
-from abbe.models.pahk.random_errors import (
+from abbe.models.papers.pahk.diagonals import length_random_error_mm, shared_variables
+from abbe.models.papers.pahk.random_errors import (
     PARAMETERS,
     REPEATABILITY_COVERAGE,
     RandomErrors,

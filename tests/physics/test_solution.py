@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.paths.lines import DIAGONALS
 from abbe.models.solvers.observations import RunData
-from abbe.service.cli.solve import _print
+from abbe.service.cli.results.solve import _print
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import InstrumentsDisagree
 from abbe.service.identification.solve import Solved, solve_runs

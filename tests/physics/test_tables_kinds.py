@@ -14,8 +14,8 @@ from abbe.models.compensation.per_motion import enough_for_the_field, motion_tab
 from abbe.models.compensation.stages import Stage, applied, at_corrected_position, of_corrected_position, second_order_mm
 from abbe.models.compensation.summary import SQUARENESS, mean_linear
 from abbe.models.compensation.tables import NineTables, nine_tables, quantise
+from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.solvers.observability import observability_of
 from abbe.models.uncertainty.inputs import Inputs
 from abbe.models.uncertainty.sources import error_sources
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth

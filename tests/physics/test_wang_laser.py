@@ -6,19 +6,8 @@ import pytest
 from abbe.models.functions.monomials import ErrorArrays
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.notation.wang import ACUTE_FROM_OBTUSE, iso_motions, iso_squareness, machine
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
-from abbe.models.solvers.step_diagonal import (
-    closure_mm,
-    demeaned,
-    increments,
-    project_eq6,
-    squareness_contrast,
-    u_wang_four,
-    wang_eq7,
-    wang_four,
-)
-from abbe.models.wang.angular import abbe_and_spurious_eq7, closure_of_angles_mm, false_straightness_mm
-from abbe.models.wang.mirror import (
+from abbe.models.papers.wang.angular import abbe_and_spurious_eq7, closure_of_angles_mm, false_straightness_mm
+from abbe.models.papers.wang.mirror import (
     cosine_error,
     diagonal_beam,
     mirror_normal,
@@ -29,14 +18,25 @@ from abbe.models.wang.mirror import (
     tilt_bias_eq7,
     tilt_closure_mm,
 )
-from abbe.models.wang.model import displacement_eq11, displacement_eq11_printed, position_error_eq9, position_error_eq9_printed
-from abbe.models.wang.squareness import (
+from abbe.models.papers.wang.model import displacement_eq11, displacement_eq11_printed, position_error_eq9, position_error_eq9_printed
+from abbe.models.papers.wang.squareness import (
     AcuteSquareness,
     bias_eq13,
     common_scale,
     diagonal_totals_eq12,
     squareness_eq13_printed,
     sum_test_mm,
+)
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.solvers.step_diagonal import (
+    closure_mm,
+    demeaned,
+    increments,
+    project_eq6,
+    squareness_contrast,
+    u_wang_four,
+    wang_eq7,
+    wang_four,
 )
 
 N, INC = 7, np.array([80.0, 50.0, 40.0])

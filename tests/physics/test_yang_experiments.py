@@ -5,15 +5,15 @@ import pytest
 
 from abbe.models.functions.monomials import error_arrays, monomials
 from abbe.models.notation.yang import workpiece_mm
+from abbe.models.papers.wang.experiments import Plan as LaserPlan
+from abbe.models.papers.wang.experiments import distance_errors_mm, interpolated_mm, problem, readings
+from abbe.models.papers.wang.model import monomial_errors as wang_errors
+from abbe.models.papers.wang.model import monomial_field as wang_field
+from abbe.models.papers.wang.model import position_error_eq9
+from abbe.models.papers.yang.complete import delta_eq1, monomial_errors, monomial_field
+from abbe.models.papers.yang.experiments import Plan, all_helices, one_helix, step_diagonals, together, vector_map
+from abbe.models.papers.yang.origins import origin_plan
 from abbe.models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution, stacked
-from abbe.models.wang.experiments import Plan as LaserPlan
-from abbe.models.wang.experiments import distance_errors_mm, interpolated_mm, problem, readings
-from abbe.models.wang.model import monomial_errors as wang_errors
-from abbe.models.wang.model import monomial_field as wang_field
-from abbe.models.wang.model import position_error_eq9
-from abbe.models.yang.complete import delta_eq1, monomial_errors, monomial_field
-from abbe.models.yang.experiments import Plan, all_helices, one_helix, step_diagonals, together, vector_map
-from abbe.models.yang.origins import origin_plan
 
 TRAVEL, TOOL = np.array([812.8, 495.0, 508.0]), np.array([0.0, 0.0, 150.0])
 ORIGINS = origin_plan(np.stack([np.zeros(3), TRAVEL], axis=1))

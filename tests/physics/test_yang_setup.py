@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from abbe.models.notation.yang import YangErrors
+from abbe.models.papers.yang.complete import delta_eq1
+from abbe.models.papers.yang.simplified import fit_eq9
 from abbe.models.paths.helix import helix_points
 from abbe.models.solvers.helix import CONDITION_LIMIT, fit_helix
-from abbe.models.yang.complete import delta_eq1
-from abbe.models.yang.simplified import fit_eq9
 
 
 def test_ten_micrometres_of_mounting_fake_a_hundred_microradians_in_the_papers_fit_only():

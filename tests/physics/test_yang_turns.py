@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.machine import Machine
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.recipes import Helix
+from abbe.service.sequences.recipes.recipe import Helix
 
 MACHINE = Machine("w-b-X-Y-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 

@@ -24,8 +24,8 @@ from abbe.service.events import ignore_progress
 from abbe.service.jobs.check import run_check
 from abbe.service.jobs.guided_campaign import led_campaign
 from abbe.service.jobs.investigate import Bench
-from abbe.service.sequences.campaigns import identification
 from abbe.service.sequences.control import Control
+from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.site import Site, site_of
 from abbe.service.storage.owner import this_process
 from tests.push.test_whose_table import Left, left_in_probation

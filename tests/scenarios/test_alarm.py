@@ -15,7 +15,7 @@ import pytest
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
-from abbe.service.cli.serve import duties_on
+from abbe.service.cli.administration.serve import duties_on
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.proposal_checks import approve
 from abbe.service.compensation.proposal_doc import load
@@ -33,14 +33,14 @@ from abbe.service.scheduler.loop import Scheduler, Terms
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.sequences.campaigns import identification
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.verification.alarm_states import Alarm, Kind
 from abbe.service.verification.alarms import acknowledge, alarms_of
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 from abbe.service.web.view import View
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
 from tests.scenarios.conftest import Sims

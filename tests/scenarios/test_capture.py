@@ -16,7 +16,7 @@ from abbe.service.capture.recovery import ledger_of
 from abbe.service.cli import run
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
-from abbe.service.sequences.recipes import Helix
+from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store

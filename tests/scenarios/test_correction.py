@@ -23,7 +23,7 @@ from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.semantic_digest import meaning_of_tables
-from abbe.service.sequences.campaigns import identification, verification
+from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store

@@ -25,8 +25,8 @@ from abbe.service.config import load_machine
 from abbe.service.errors import ConfigError, DevicesNotReady
 from abbe.service.events import ignore_progress
 from abbe.service.jobs.check import run_check
-from abbe.service.sequences.recipe_file import recipe_text
-from abbe.service.sequences.recipes import Helix, Linear
+from abbe.service.sequences.recipes.recipe import Helix, Linear
+from abbe.service.sequences.recipes.recipe_file import recipe_text
 from abbe.service.storage.store import Store
 from abbe.simulators.cnc.log import MOTION
 from tests.scenarios.conftest import Sims, simulated

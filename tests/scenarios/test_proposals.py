@@ -28,9 +28,9 @@ from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import StoreError, TableRefused
 from abbe.service.events import ignore_progress
 from abbe.service.push.book import read_entries
-from abbe.service.sequences.campaigns import identification, verification
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.records import ApprovalRecord

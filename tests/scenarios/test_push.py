@@ -27,7 +27,7 @@ from abbe.service.push.entries import check_chain
 from abbe.service.push.operations import Verdict
 from abbe.service.push.states import State
 from abbe.service.runs.columns import load_run
-from abbe.service.sequences.recipes import Diagonal
+from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store

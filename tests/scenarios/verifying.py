@@ -24,7 +24,7 @@ from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import check_chain
 from abbe.service.push.operations import Verdict
-from abbe.service.sequences.recipes import Diagonal, Helix
+from abbe.service.sequences.recipes.recipe import Diagonal, Helix
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -28,7 +28,7 @@ from abbe.service.push.operations import Verdict
 from abbe.service.scheduler import alarm_manager
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.sequences.recipes import Diagonal
+from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.serve import serve
 from abbe.service.site import Site, machine_doc, machine_from_doc

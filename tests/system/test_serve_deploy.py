@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.cli.serve import setup_of
+from abbe.service.cli.administration.serve import setup_of
 from abbe.service.config import load_machine
 from tests.system.serve_bench import Process, free_port, require
 

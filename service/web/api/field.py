@@ -9,9 +9,9 @@ from pydantic import Field
 
 from abbe.service.identification.solution_field import NodeMap, StoredField, node_map, stored_field
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.api.shapes import Answer
 from abbe.service.web.api.sources import Number, Sources, as_stored
+from abbe.service.web.login.access import needs
 
 MOST_NODES = 9
 Nodes = Annotated[int, Query(ge=2, le=MOST_NODES, description="So many per axis.")]

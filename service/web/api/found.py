@@ -16,7 +16,6 @@ from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.users.roles import Permission
 from abbe.service.verification.trend_table import as_doc, trends
 from abbe.service.verification.verified_by import verified_by
-from abbe.service.web.access import needs
 from abbe.service.web.api.shapes import Trends
 from abbe.service.web.api.shapes_tables import (
     ChangedSince,
@@ -29,6 +28,7 @@ from abbe.service.web.api.shapes_tables import (
     Solutions,
 )
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, read_as, storable
+from abbe.service.web.login.access import needs
 
 CHECKS = 20_000
 """So many of the latest checks make a trend: more than ten years of four a day."""

@@ -8,12 +8,12 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
 from abbe.service.runs.machine_object import MachineObject
-from abbe.service.storage.store_pages import LARGEST, visible_status
+from abbe.service.storage.repositories.pages import LARGEST, visible_status
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.api import shapes as s
 from abbe.service.web.api.samples import BINARY_ROWS, JSON_ROWS, binary_stretch, columns_stretch, stretch
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, read_as
+from abbe.service.web.login.access import needs
 
 First = Annotated[int, Query(ge=0, le=LARGEST, description="Number of the first one, from 0.")]
 ChannelName = Annotated[str, Query(description="As the run's `channels` name it.")]

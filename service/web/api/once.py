@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from abbe.service.errors import AbbeError, KeyInUse, KeyReused
 from abbe.service.push.entries import canonical
 from abbe.service.storage.store import Store
-from abbe.service.web.auth_middleware import Visit
+from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.problems import MEDIA_TYPE, problem_of
 
 REPLAYED = "Idempotent-Replayed"

@@ -10,10 +10,10 @@ from abbe.service.campaigns.builtin_recipes import RECIPES
 from abbe.service.errors import Unusable
 from abbe.service.scheduler.slots import Schedule, cron_in_words, next_slot
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.api import shapes as s
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, finite, read_as
 from abbe.service.web.catalogue import entries
+from abbe.service.web.login.access import needs
 from abbe.service.web.schemas import Verification
 
 LATEST = 10

@@ -13,8 +13,8 @@ from abbe.service.errors import NotStored
 from abbe.service.rendering.document import Document
 from abbe.service.report.report import FORMS, default_name, numbered_report, stored_report
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.api.sources import Number, Sources, as_stored, storable
+from abbe.service.web.login.access import needs
 
 AT_A_TIME = 2
 

@@ -20,8 +20,8 @@ from abbe.service.errors import NotStored, StoreError, Unusable
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.store_pages import LARGEST
-from abbe.service.web.logtail import LogTail
+from abbe.service.storage.repositories.pages import LARGEST
+from abbe.service.web.core_link.logtail import LogTail
 from abbe.service.web.schemas import Device
 
 log = structlog.get_logger("abbe.api")

@@ -7,13 +7,13 @@ from fastapi.responses import Response
 
 from abbe.service.channel.messages import Answer
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.api.once import REPLAYED, Key
 from abbe.service.web.api.shapes_tables import PushBody, RollbackBody
 from abbe.service.web.api.sources import Number
-from abbe.service.web.auth_middleware import Visit
-from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.jobs import ACCEPTED, REFUSALS, answered
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.schemas_jobs import JobState
 
 LONGEST_BODY = 4096

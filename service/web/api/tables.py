@@ -17,13 +17,13 @@ from abbe.service.errors import NotStored, Unusable
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import Entry
 from abbe.service.storage.base import utc_text
-from abbe.service.storage.store_pages import LARGEST
+from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.api import shapes_tables as s
 from abbe.service.web.api.once import Key, once
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, as_stored
-from abbe.service.web.auth_middleware import Visit
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.auth_middleware import Visit
 
 LONGEST_BODY = 4096
 

@@ -17,7 +17,7 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from abbe.service.web import words
 from abbe.service.web.api.sources import storable
-from abbe.service.web.authentication import Door
+from abbe.service.web.login.authentication import Door
 from abbe.service.web.schemas import Status, Verification
 
 T = TypeVar("T")

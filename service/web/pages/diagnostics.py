@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from abbe.service.campaign_data.provenance import versions
-from abbe.service.storage.store_health import Health
+from abbe.service.storage.repositories.health import Health
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.pages.blanking import blanked_doc, blanked_line
 from abbe.service.web.schemas import Status

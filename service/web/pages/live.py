@@ -11,9 +11,9 @@ from jinja2 import Environment
 from abbe.service.channel.messages import JobSeen
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
-from abbe.service.web.access import needs
-from abbe.service.web.authentication import Door
 from abbe.service.web.frame import current
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.authentication import Door
 from abbe.service.web.pages.desk import Desk, Source
 
 SCRIPT_WORDS = (

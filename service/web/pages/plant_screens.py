@@ -14,11 +14,11 @@ from pydantic import AfterValidator
 from abbe.service.audit.chain import Event
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
-from abbe.service.web.access import needs
 from abbe.service.web.api.sources import Sources
-from abbe.service.web.auth_middleware import Visit
-from abbe.service.web.authentication import Door
 from abbe.service.web.frame import THEMES, current
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.auth_middleware import Visit
+from abbe.service.web.login.authentication import Door
 from abbe.service.web.pages.desk import Desk, Source, can_be_stored
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes

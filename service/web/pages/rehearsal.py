@@ -10,8 +10,8 @@ from abbe.service.channel.messages import MachineTold, RulesTold
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.dry_run_page import picture
-from abbe.service.sequences.campaigns import identification
 from abbe.service.sequences.check import DryRun, dry_run_campaign
+from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MountLaser, TestPlan
 from abbe.service.site import machine_from_doc
 

@@ -9,8 +9,8 @@ from fastapi.responses import HTMLResponse
 
 from abbe.service.storage.records import SolutionRecord
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.frame import current
+from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen
 from abbe.service.web.pages.compare import compare_screen
 from abbe.service.web.pages.desk import Desk, found

@@ -17,9 +17,9 @@ from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
 from abbe.service.report.report_parts import Rules
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
-from abbe.service.web.auth_middleware import Visit
-from abbe.service.web.authentication import Door
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.auth_middleware import Visit
+from abbe.service.web.login.authentication import Door
 from abbe.service.web.pages import times
 from abbe.service.web.pages.colours import themed
 from abbe.service.web.pages.desk import Desk, Source, can_be_stored, found

@@ -11,10 +11,10 @@ from jinja2 import Environment
 from abbe.service.errors import JournalChanged
 from abbe.service.tables.table_history import story
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.api.sources import Sources
-from abbe.service.web.authentication import Door
 from abbe.service.web.frame import current
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.authentication import Door
 from abbe.service.web.pages.desk import Desk, Source
 
 MOST = 50

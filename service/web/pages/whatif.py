@@ -13,7 +13,7 @@ from abbe.service.errors import AbbeError
 from abbe.service.identification.solution_field import StoredField, stored_field
 from abbe.service.rendering.numbers import COVERAGE, with_uncertainty
 from abbe.service.rendering.plots.paired import Pair, paired_bars
-from abbe.service.sequences.campaigns import hemisphere
+from abbe.service.sequences.recipes.campaigns import hemisphere
 from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
@@ -21,7 +21,7 @@ from abbe.service.web.frame import current
 MEAN = "mean."
 """Before the name of a scale or squareness that is averaged over the volume."""
 CHECK_PLACE, CHECK_SHARE = (0.45, 0.55, 0.12), 0.7
-"""Where the shipped checks set up the ball-bar (`abbe.service.sequences.campaigns.quick_check`)."""
+"""Where the shipped checks set up the ball-bar (`abbe.service.sequences.recipes.campaigns.quick_check`)."""
 UM = 1e3
 RESOLUTION_MM = 1e-7
 """Nobody measures a tenth of a nanometre; an uncertainty below it is rounding of numbers."""

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from abbe.models.arrays import F1, F2
-from abbe.models.effects import vibration
 from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.drives import vibration
 from abbe.models.effects.effect import Effect
 from abbe.models.effects.path import Path
 from abbe.models.effects.probe_paths import CENTRE_MM, DEAD_PATH_MM, MACHINE, probe_paths

@@ -198,7 +198,7 @@ def test_driver_error_is_one_line(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -
     def broken(_: str | None, __: Path | None = None) -> str:
         raise LinkDown("mqtt://me:topsecret@h", "open", "refused\nby peer", "plug it in")
 
-    monkeypatch.setattr("abbe.service.cli.show.database_url", broken)
+    monkeypatch.setattr("abbe.service.cli.results.show.database_url", broken)
     assert abbe.fails("runs") == "error DRV-002: mqtt://me:***@h: open: refused by peer (plug it in)\n"
 
 
@@ -208,7 +208,7 @@ def test_a_device_that_does_not_answer_is_one_line_too(abbe: Abbe, monkeypatch: 
     def silent(_: str | None, __: Path | None = None) -> str:
         raise ReplyTimeout("serial:///dev/ttyUSB0", "read samples", "no sample for 1 s", "box switched off?")
 
-    monkeypatch.setattr("abbe.service.cli.show.database_url", silent)
+    monkeypatch.setattr("abbe.service.cli.results.show.database_url", silent)
     assert abbe.fails("runs") == "error DRV-003: serial:///dev/ttyUSB0: read samples: no sample for 1 s (box switched off?)\n"
 
 
@@ -216,7 +216,7 @@ def test_interrupt_exits_with_130(abbe: Abbe, monkeypatch: pytest.MonkeyPatch) -
     def interrupted(_: str | None, __: Path | None = None) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("abbe.service.cli.show.database_url", interrupted)
+    monkeypatch.setattr("abbe.service.cli.results.show.database_url", interrupted)
     assert abbe("runs").code == 130
 
 

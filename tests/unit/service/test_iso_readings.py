@@ -8,7 +8,7 @@ import pytest
 from abbe.models.machine import Machine
 from abbe.models.verification import diagonal_figure
 from abbe.service.runs.observations import run_data
-from abbe.service.sequences.recipes import Linear
+from abbe.service.sequences.recipes.recipe import Linear
 from abbe.service.sequences.steps import MoveTo, ReadLaser
 from abbe.service.verification.iso_readings import circle_tests, diagonal_tests, linear_tests
 from abbe.service.verification.iso_report import evaluate

@@ -8,7 +8,7 @@ import pytest
 from abbe.models.discovery.unseen import LATE_S
 from abbe.service.discovery.discovery_words import ADDS
 from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
-from abbe.service.sequences.recipes import Helix
+from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import MountBar, MoveTo, RecordPath, Unmount
 from abbe.service.site import machine_from_doc
 from tests.unit.service.discovery_bench import MACHINE, Doc

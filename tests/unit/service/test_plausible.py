@@ -13,11 +13,11 @@ import pytest
 
 from abbe.service import cli
 from abbe.service.campaigns.plausibility import Doubts, doubts
-from abbe.service.cli.serve import setup_of
+from abbe.service.cli.administration.serve import setup_of
 from abbe.service.config import load_machine
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.recipe_file import recipe_text
-from abbe.service.sequences.recipes import Helix
+from abbe.service.sequences.recipes.recipe import Helix
+from abbe.service.sequences.recipes.recipe_file import recipe_text
 
 pytestmark = pytest.mark.usefixtures("clean_environment")
 

@@ -14,10 +14,10 @@ from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.base import StoreBase
 from abbe.service.storage.owner import Owner
 from abbe.service.storage.records import ApprovalRecord, ChunkRecord, ImportedRun, NewVersion, PushEntryRecord, SlotRecord
-from abbe.service.storage.store_audit import AuditRecord
-from abbe.service.storage.store_decisions import RejectionRecord
-from abbe.service.storage.store_pages import LISTINGS
-from abbe.service.storage.store_people import TokenRecord
+from abbe.service.storage.repositories.audit import AuditRecord
+from abbe.service.storage.repositories.decisions import RejectionRecord
+from abbe.service.storage.repositories.pages import LISTINGS
+from abbe.service.storage.repositories.people import TokenRecord
 
 START = datetime(2026, 11, 21, 3, 34, 5, 123456, tzinfo=UTC)
 DOC: dict[str, Any] = {"µm": 0.1, "list": [None, 1e-7, -0.0], "text": "ü'\"\n\\ 工", "large": 2**53 + 1}

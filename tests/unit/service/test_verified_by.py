@@ -32,7 +32,7 @@ from abbe.service.scheduler.fleet import Stand, stands
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.verification.verified_by import STRANGE, VerifiedBy, verified_by
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 from abbe.service.web.page import environment, render
 from abbe.service.web.pages.times import trend_screen
 from abbe.service.web.schemas import Status

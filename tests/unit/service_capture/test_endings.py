@@ -26,8 +26,8 @@ from abbe.service.capture.settings import CaptureSettings, segment_folder, segme
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.runs.codec import decode_bar
-from abbe.service.storage import store_chunks
 from abbe.service.storage.records import ChunkRecord
+from abbe.service.storage.repositories import chunks as store_chunks
 from abbe.service.storage.store import Store
 from tests.patience import within
 from tests.unit.service_capture.capture_bench import abandon, batch, new_run

@@ -11,8 +11,8 @@ from abbe.service.capture.live import ANGLES, LONGEST, MOST_BATCHES, LiveFeed, a
 from abbe.service.channel.messages import LARGEST_B, encode
 from abbe.service.clock import SystemClock
 from abbe.service.core.live import _message
-from abbe.service.sequences.campaigns import hemisphere
-from abbe.service.sequences.recipes import Circle, Helix
+from abbe.service.sequences.recipes.campaigns import hemisphere
+from abbe.service.sequences.recipes.recipe import Circle, Helix
 from abbe.service.sequences.steps import RecordPath
 
 SYNC, OUT = 0b1000, 0b0001

@@ -16,7 +16,7 @@ import pytest
 
 from abbe.drivers.cnc.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
-from abbe.models.discovery import changed
+from abbe.models.discovery.changed import comparison as changed
 from abbe.service.campaign_data.campaign_folder import from_store, keep
 from abbe.service.discovery.changed_since import since_of
 from abbe.service.discovery.changed_words import changed_lines, changed_words

@@ -17,16 +17,16 @@ from typing import Any
 import pytest
 
 from abbe.service.campaigns.campaign_run import plan_hash
+from abbe.service.cli.administration.serve import _campaigns
 from abbe.service.cli.measure import _plan
-from abbe.service.cli.serve import _campaigns
 from abbe.service.clock import SystemClock
 from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
 from abbe.service.jobs.guided_campaign import Led
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Watching
-from abbe.service.sequences.recipe_file import recipe_text
-from abbe.service.sequences.recipes import Helix, Linear
+from abbe.service.sequences.recipes.recipe import Helix, Linear
+from abbe.service.sequences.recipes.recipe_file import recipe_text
 from abbe.service.sequences.steps import CampaignPlan
 from tests.unit.service_serve.fakes import settle
 from tests.unit.service_web_pages.test_rehearsal import MACHINE

@@ -10,7 +10,7 @@ from abbe.service.campaigns.listen import Heard, row_times, wanted
 from abbe.service.runs.laser_columns import MM_PER_COUNT, laser_columns
 from abbe.service.runs.observations import run_data
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
-from abbe.service.sequences.recipes import Diagonal, FaceDiagonal, Linear
+from abbe.service.sequences.recipes.recipe import Diagonal, FaceDiagonal, Linear
 from abbe.service.sequences.steps import MountLaser
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))

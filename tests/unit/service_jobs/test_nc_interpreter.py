@@ -12,7 +12,7 @@ import pytest
 from abbe.models.machine import Machine
 from abbe.service.sequences.nc.blocks import BAR_DWELL_S, LASER_DWELL_S, PATH_REST_S
 from abbe.service.sequences.nc.write import nc_program
-from abbe.service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
+from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
 from abbe.service.sequences.steps import CampaignPlan, FollowPath, MoveTo, ReadBar, ReadLaser, RecordPath
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [-50.0, 450.0]]))

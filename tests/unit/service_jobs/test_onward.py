@@ -14,7 +14,7 @@ from abbe.drivers.api import BarSample, ControllerStatus
 from abbe.service.errors import RunInterrupted, StretchDiffers
 from abbe.service.runs.pieces import Piece, SoFar, arc_of
 from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, Onward, SameStretch, Way, rest_of_path
-from abbe.service.sequences.recipes import Circle
+from abbe.service.sequences.recipes.recipe import Circle
 from abbe.service.sequences.resume_plan import rest_of, way_back
 from abbe.service.sequences.steps import MountBar, RecordPath
 from tests.faults.sequencer_world import MACHINE

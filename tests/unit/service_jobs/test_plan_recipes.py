@@ -19,9 +19,9 @@ from abbe.service.cli.app import app
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.sequences.check import dry_run, dry_run_campaign
-from abbe.service.sequences.recipe_file import parse_recipe, read_recipe, recipe_text
-from abbe.service.sequences.recipes import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
-from abbe.service.sequences.setups import shared_setups
+from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
+from abbe.service.sequences.recipes.recipe_file import parse_recipe, read_recipe, recipe_text
+from abbe.service.sequences.recipes.setups import shared_setups
 from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
 from abbe.service.site import Site, machine_doc
 

@@ -10,9 +10,9 @@ import pytest
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.service.errors import StrokeError
-from abbe.service.sequences.campaigns import identification, quick_check, verification
 from abbe.service.sequences.check import dry_run, dry_run_campaign, positions
-from abbe.service.sequences.recipes import Diagonal, Helix, Linear
+from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification
+from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear
 from abbe.service.sequences.steps import MAX_PATH_POINTS, MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, TestPlan, Unmount, ZeroLaser
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
@@ -159,7 +159,7 @@ def test_a_path_the_controller_cannot_hold_is_refused_before_anything_moves():
 
 
 def test_a_discovery_campaign_s_helices_stay_within_a_quarter_of_a_micrometre_of_their_sphere():
-    from abbe.service.sequences.discovery_campaign import BACK, discovery_campaign, new_measurement
+    from abbe.service.sequences.recipes.discovery_campaign import BACK, discovery_campaign, new_measurement
 
     for plan in discovery_campaign(MACHINE).tests:
         for step in plan.steps:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from abbe.models.solvers.observability_volume import Number
+from abbe.models.solvers.observability.volume import Number
 from abbe.models.uncertainty.prediction import Prediction
 from abbe.service.identification.solve_verdict import WORDS, verdict
 

@@ -7,7 +7,7 @@ from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS
 from abbe.service.campaign_data.run_geometry import geometry
 from abbe.service.identification.solve import step_diagonals
-from abbe.service.sequences.recipes import Diagonal
+from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import MoveTo, ReadLaser
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))

@@ -11,12 +11,12 @@ import pytest
 from abbe.models.machine import Machine
 from abbe.models.paths.circles import way_on_sphere
 from abbe.service.errors import StrokeError
-from abbe.service.sequences.bar_tables import bar_table
 from abbe.service.sequences.check import dry_run
-from abbe.service.sequences.recipe_file import parse_recipe
-from abbe.service.sequences.recipes import Circle
+from abbe.service.sequences.recipes.bar_tables import bar_table
+from abbe.service.sequences.recipes.recipe import Circle
+from abbe.service.sequences.recipes.recipe_file import parse_recipe
+from abbe.service.sequences.recipes.setups import shared_setups
 from abbe.service.sequences.resume_plan import end_of, remounted, rest_of
-from abbe.service.sequences.setups import shared_setups
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, RecordPath, TakeBarOut
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"

@@ -13,7 +13,7 @@ from abbe.service.plant.gather import Gatherer, table_in_force
 from abbe.service.plant.opcua.picture import picture_of
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.records import PushEntryRecord
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 from abbe.service.web.view import View
 from tests.unit.service_plant.facts_for_tests import NOON, facts
 from tests.unit.service_serve.fakes import STEP, FakeClock

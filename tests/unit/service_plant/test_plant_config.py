@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.cli.serve import setup_of
+from abbe.service.cli.administration.serve import setup_of
 from abbe.service.config import load_machine
 from abbe.service.errors import ConfigError
 from tests.certificates import authority, issued

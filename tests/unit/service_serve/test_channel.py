@@ -23,8 +23,8 @@ from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.errors import ChannelBroken, CoreSilent
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.web import import_guard
-from abbe.service.web.core_line import QUEUE, SILENT_S, CoreLine
+from abbe.service.web.core_link.core_line import QUEUE, SILENT_S, CoreLine
+from abbe.service.web.process import import_guard
 from tests.patience import within
 from tests.unit.service_serve.fakes import FakeClock, settle, utc
 
@@ -259,7 +259,7 @@ def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
     """In a fresh interpreter: everything that the process loads, and what it is refused afterwards."""
     program = (
         "import sys\nfrom abbe.service.web import import_guard, process\nimport_guard.build()\n"
-        "import abbe.service.web.serving, abbe.service.logs\n"
+        "import abbe.service.web.process.serving, abbe.service.logs\n"
         "bad = [name for name in sys.modules if import_guard.behind(name)]\nassert not bad, bad\n"
         "for name in ('abbe.drivers.registry', 'pymodbus.client', 'serial', 'abbe.service.push.adapter', 'abbe.service.push.execute'):\n"
         "    try:\n        __import__(name)\n    except ImportError as error:\n        assert 'does not import' in str(error), error\n"

@@ -15,13 +15,13 @@ from fastapi.responses import PlainTextResponse
 from abbe.service.errors import ConfigError
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.users.roles import ALLOWED, Permission, Role
-from abbe.service.web.access import MUTATING, PUBLIC, Open, cells, needs
 from abbe.service.web.app import create_app
-from abbe.service.web.auth_middleware import CSRF_HEADER
-from abbe.service.web.authentication import COOKIE, Door, csrf_token
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 from abbe.service.web.headers import HEADERS
 from abbe.service.web.listening import check_exposure
+from abbe.service.web.login.access import MUTATING, PUBLIC, Open, cells, needs
+from abbe.service.web.login.auth_middleware import CSRF_HEADER
+from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
 from abbe.service.web.view import View
 from tests.unit.service_users.conftest import PHRASE, World
 

@@ -20,8 +20,8 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import Event, anchor_of, digest_of, faults, follow, mac_of
 from abbe.service.errors import AuditBroken, StoreError
 from abbe.service.push.entries import GENESIS
+from abbe.service.storage.repositories.audit import AuditRecord
 from abbe.service.storage.store import Store
-from abbe.service.storage.store_audit import AuditRecord
 from tests.unit.service_users.conftest import World
 
 KEY = bytes(range(32))

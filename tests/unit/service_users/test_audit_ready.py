@@ -19,7 +19,7 @@ import typer
 from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import Event, follow
 from abbe.service.cli import run
-from abbe.service.cli.audited import record_all
+from abbe.service.cli.administration.audited import record_all
 from abbe.service.cli.common import print_table
 from abbe.service.errors import AuditBroken, StoreError
 from abbe.service.storage.private import private_file, seen_by_others

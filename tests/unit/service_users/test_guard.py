@@ -15,10 +15,10 @@ from starlette.responses import StreamingResponse
 from abbe.service.errors import AbbeError, StoreError
 from abbe.service.users.people import IDLE
 from abbe.service.users.roles import Permission
-from abbe.service.web.access import needs
 from abbe.service.web.app import as_in_host_header, create_app
-from abbe.service.web.auth_middleware import CSRF_HEADER
-from abbe.service.web.authentication import Door, Front
+from abbe.service.web.login.access import needs
+from abbe.service.web.login.auth_middleware import CSRF_HEADER
+from abbe.service.web.login.authentication import Door, Front
 from tests.unit.service_users.conftest import PHRASE, World
 from tests.unit.service_users.test_access import BASE, OWN, Gate, app_of, gate, log_in
 
@@ -264,7 +264,7 @@ async def test_an_address_with_colons_is_a_name_as_well(world: World) -> None:
 
 
 def _view(world: World) -> Any:
-    from abbe.service.web.board import Board
+    from abbe.service.web.core_link.board import Board
     from abbe.service.web.view import View
 
     return View("mill-7", "0.1.0", Board({}, world.clock), world.store, lambda: [], "", world.clock)

@@ -35,11 +35,11 @@ from abbe.service.users.people import People
 from abbe.service.users.roles import ALLOWED, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.auth_middleware import CSRF_HEADER
-from abbe.service.web.authentication import COOKIE, Door, csrf_token
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
 from abbe.service.web.listening import bind
-from abbe.service.web.server import make_server
+from abbe.service.web.login.auth_middleware import CSRF_HEADER
+from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
+from abbe.service.web.process.server import make_server
 from abbe.service.web.view import View
 from tests.unit.service.discovery_bench import MACHINE, Search, write_case
 

@@ -13,7 +13,7 @@ from abbe.service.compensation.proposal_checks import reject, valid_approval
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import check_waiting, standing
 from abbe.service.errors import TableRefused
-from abbe.service.storage.store_decisions import RejectionRecord
+from abbe.service.storage.repositories.decisions import RejectionRecord
 from tests.unit.service_web.api_bench import Plant
 
 BASE = "http://127.0.0.1:8080"

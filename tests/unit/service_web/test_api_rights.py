@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from abbe.service.users.roles import ALLOWED, Role
-from abbe.service.web.access import MUTATING, PUBLIC, cells
+from abbe.service.web.login.access import MUTATING, PUBLIC, cells
 from abbe.service.web.problems import MEDIA_TYPE
 from tests.unit.service_web.api_bench import Plant, app_of, served
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.storage.repositories.decisions import RejectionRecord
+from abbe.service.storage.repositories.pages import LISTINGS
 from abbe.service.storage.store import Store
-from abbe.service.storage.store_decisions import RejectionRecord
-from abbe.service.storage.store_pages import LISTINGS
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

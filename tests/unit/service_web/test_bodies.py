@@ -7,8 +7,8 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from abbe.service.web.access import MUTATING, cells
 from abbe.service.web.bodies import LONGEST_B
+from abbe.service.web.login.access import MUTATING, cells
 from abbe.service.web.problems import MEDIA_TYPE
 from tests.system.test_serve_bodies import BY_FORM
 from tests.unit.service_web.api_bench import Plant

@@ -18,7 +18,7 @@ from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import Parts, create_app
-from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 from abbe.service.web.problems import MEDIA_TYPE
 from abbe.service.web.view import View

@@ -20,9 +20,9 @@ from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.auth_middleware import CSRF_HEADER
-from abbe.service.web.authentication import COOKIE, Door, csrf_token
-from abbe.service.web.board import Board
+from abbe.service.web.core_link.board import Board
+from abbe.service.web.login.auth_middleware import CSRF_HEADER
+from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
 from abbe.service.web.view import View
 
 PHRASE = "correct horse battery staple"

@@ -11,7 +11,7 @@ import pytest
 
 from abbe.service.channel.messages import LivePath, LiveSamples
 from abbe.service.errors import ChannelBroken
-from abbe.service.web.sample_board import HEAD, KEPT_FRAMES, MOST_EACH, MOST_LISTENERS, QUEUE, SampleBoard
+from abbe.service.web.core_link.sample_board import HEAD, KEPT_FRAMES, MOST_EACH, MOST_LISTENERS, QUEUE, SampleBoard
 
 PATH = LivePath("path", 3, "helix1", "ballbar_helix", 150.0, 2000.0, 1000, 84.2, (0.0, 90.0))
 

@@ -17,12 +17,12 @@ from abbe.service.channel.messages import Answer, Jobs, JobSeen, Outcome, PushNo
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.users.roles import ALLOWED, Permission, Role
-from abbe.service.web.access import cells
 from abbe.service.web.api.once import REPLAYED
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
-from abbe.service.web.board import Board
-from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_link.board import Board
+from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.login.access import cells
 from abbe.service.web.problems import MEDIA_TYPE
 from abbe.service.web.view import View
 from tests.unit.service_serve.test_channel import MOMENT

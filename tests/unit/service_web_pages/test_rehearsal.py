@@ -14,7 +14,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run_campaign
 from abbe.service.site import machine_from_doc
-from abbe.service.web.core_line import CoreLine
+from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.page import HERE, environment
 from abbe.service.web.pages.new import expired

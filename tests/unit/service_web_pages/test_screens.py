@@ -9,9 +9,9 @@ import pytest
 
 from abbe.service.clock import SystemClock
 from abbe.service.users.roles import ALLOWED, Permission, Role
-from abbe.service.web.access import cells
 from abbe.service.web.app import create_app
-from abbe.service.web.auth_middleware import CSRF_HEADER
+from abbe.service.web.login.access import cells
+from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.page import HERE
 from abbe.service.web.view import View
 from tests.pages_world import PROPOSER, USERS, Filled, Served, as_user, screens

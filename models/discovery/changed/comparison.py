@@ -1,0 +1,119 @@
+"""What has changed in a machine since a solution: which of its error motions, by how much, judged by runs that did not choose it.
+
+A known machine that drifts lacks no physical effect: its model is whole and its numbers are old. So the solution from before is held
+against new runs, with its own covariance, and error motions compete for what is left: six linear ones (scales, squareness) and the shape of
+each of the 21. One that makes the readings more likely by more than its price is taken in, and the others are asked again; one that those
+taken in later make needless goes (marginal likelihood of a linear normal model, as `abbe.models.solvers.components`; price: logarithm of
+the number of candidates). To prove it, one half of the set-ups chooses and the other judges, both ways round. Set-ups and lost motion are
+refitted throughout: a new cup is no change of the machine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from abbe.models.discovery.changed.search import Bench, Chosen
+from abbe.models.solvers.engine import Problem, build, expected_noise, settle
+from abbe.models.solvers.information import Sums, total
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.priors import Priors
+from abbe.models.uncertainty.known_field import KnownField
+
+FEWEST_SETUPS = 2
+"""Set-ups of each half below which nothing can be judged."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One error motion that has changed.
+
+    Attributes
+    ----------
+    name : str
+        ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for what is not linear in it (of an angle: all of it).
+    value, u : float
+        Change and standard uncertainty, all scales and squareness free beside it: rad (m/m) of a linear one; of a shape its rms over the
+        stroke, mm or rad. ``u`` holds what was not known of the machine before.
+    evidence : float
+        Gain in log evidence after its price, beside all others that were named.
+    rivals : tuple of (name, evidence less)
+        Others that explain nearly as much in its place: these runs cannot tell it from them.
+    halves : int
+        By how many of the two halves of the runs it was chosen without the other: 0 to 2.
+    """
+
+    name: str
+    value: float
+    u: float
+    evidence: float
+    rivals: tuple[tuple[str, float], ...]
+    halves: int
+
+
+@dataclass(frozen=True)
+class Changed:
+    """All that has changed.
+
+    ``before_mm``, ``after_mm``, ``floor_mm``: rms of readings less the solution from before; less the changes, too, that the OTHER half
+    of the set-ups has chosen; and of noise. ``judged``: log of how much more likely each half is with what the other has chosen, the
+    smaller of the two. None: there are too few set-ups to judge. ``hidden``: how large each scale and squareness that was not named may
+    have changed all the same, rad; one that these runs do not see is not in it.
+    """
+
+    changes: tuple[Change, ...]
+    before_mm: float | None
+    after_mm: float | None
+    floor_mm: float
+    judged: float | None
+    hidden: dict[str, float]
+
+
+def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
+    """Name what has changed in a machine since it was solved.
+
+    Parameters
+    ----------
+    known : KnownField
+        Solution from before, with its covariance.
+    runs : tuple of RunData
+        Measured since, less what a table in force and known effects did, as those that were solved.
+
+    Raises
+    ------
+    ValueError
+        No runs, or one that cannot be used (named).
+    """
+    if not runs:
+        raise ValueError("changes: no runs")
+    problem = build(known.machine, known.terms, runs, Priors(), expected_noise(runs, None, None))
+    fit = settle(problem, _silent)
+    bench = Bench(known, problem, fit)
+    whole = bench.choose(total(fit.parts))
+    by_half = [bench.choose(total(half)) for half in _halves(fit.parts, problem)]
+    before, after, judged = bench.judged(by_half) if by_half else (None, None, None)
+    return Changed(_changes(bench, whole, by_half), before, after, bench.floor_mm(), judged, bench.hidden(whole))
+
+
+def _silent(_: str) -> None:
+    return None
+
+
+def _halves(parts: tuple[Sums, ...], problem: Problem) -> list[tuple[Sums, ...]]:
+    """Folds (whole set-ups) with even and with odd numbers; none where one half would have too few set-ups."""
+    folds = problem.readings.fold
+    setups = [{problem.runs[k].setup for k in np.unique(problem.readings.run[folds % 2 == odd])} for odd in (0, 1)]
+    if min(len(s) for s in setups) < FEWEST_SETUPS:
+        return []
+    return [parts[odd::2] for odd in (0, 1)]
+
+
+def _changes(bench: Bench, whole: Chosen, by_half: list[Chosen]) -> tuple[Change, ...]:
+    """All that were chosen by all runs, the largest evidence first."""
+    out = []
+    for taken in whole.taken:
+        value, u = bench.size(whole, taken.asked)
+        halves = sum(taken.asked.name in {t.asked.name for t in half.taken} for half in by_half)
+        out.append(Change(taken.asked.name, value, u, taken.gain, taken.rivals, halves))
+    return tuple(sorted(out, key=lambda c: -c.evidence))

@@ -1,0 +1,271 @@
+"""New runs of a machine that was solved before: candidates for what has changed, the choice among them, their sizes, and the judgement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.changed.evidence import Asked, evidence_of, log_evidence
+from abbe.models.geometry.bases import Term, term_values
+from abbe.models.machine import AXES
+from abbe.models.solvers.engine import Fit, Problem
+from abbe.models.solvers.information import Sums
+from abbe.models.uncertainty.known_field import KnownField
+
+LINEAR = ("EXX", "EYY", "EZZ", "C0Y", "B0Z", "A0Z")
+LINEAR_SIZES = (3e-6, 10e-6, 30e-6, 100e-6, 300e-6)
+"""Sizes of a change of scale or squareness that are tried, rad."""
+SHAPE_SIZES = (0.1, 0.3, 1.0, 3.0)
+"""Sizes of a change of a motion's shape that are tried, in documented sizes of the motion itself (`abbe.models.solvers.priors`)."""
+ENOUGH = 3.0
+"""Evidence (natural logarithm) after its price from which on a change is told: twenty times as likely with it."""
+NEAR = 3.0
+"""A rival with so much less evidence or less is one that the runs cannot tell from what is named."""
+MOST = 6
+POINTS = 41
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A candidate that was chosen: with which size it stands beside the others, its gain after its price, and its near rivals."""
+
+    asked: Asked
+    size: float
+    gain: float
+    rivals: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What some runs have chosen, and their normal equations less what the solution from before expects: (p, p) and (p,)."""
+
+    taken: tuple[Taken, ...]
+    gram: F2
+    moment: F1
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """The new runs, linearised about what they themselves say, and the machine from before. Unknowns in units of their typical size."""
+
+    known: KnownField
+    problem: Problem
+    fit: Fit
+
+    @property
+    def _n(self) -> int:
+        return len(self.known.terms)
+
+    @cached_property
+    def _open(self) -> F2:
+        """Factor of what is open without any change, shape (p, p): the solution's own covariance, lost motion, set-ups."""
+        typical, p, n = self.problem.sizes.typical, len(self.problem.names), self._n
+        out = np.zeros((p, p))
+        out[:n, :n] = self.known.root() / typical[:n, None]
+        out[range(n, p), range(n, p)] = self.fit.prior_sd[n:] / typical[n:]
+        return out
+
+    @cached_property
+    def candidates(self) -> tuple[Asked, ...]:
+        """All that may have changed, as far as the solution from before has terms for it."""
+        names = {t.motion if t.order == 0 else t.name for t in self.known.terms}
+        linear = [m for m in LINEAR if (m if m[1] == "0" else f"{m}.1") in names]
+        out = [Asked(m, self._scaled(self.known.linear({m: 1.0})), LINEAR_SIZES) for m in linear]
+        bent = dict.fromkeys(t.motion for t in self.known.terms if _is_shape(t))
+        return (*out, *(Asked(f"{m} shape", self._shape(m), SHAPE_SIZES, several=True) for m in bent))
+
+    def _scaled(self, coefficients: F1) -> F2:
+        """One direction (P,) in mm and rad as a direction of all unknowns, shape (p, 1)."""
+        out = np.zeros((len(self.problem.names), 1))
+        out[: self._n, 0] = coefficients / self.problem.sizes.typical[: self._n]
+        return out
+
+    def _shape(self, motion: str) -> F2:
+        """Factor of the documented size of a motion but for its linear part, shape (p, q)."""
+        return self.problem.sizes.root[:, [k for k, t in enumerate(self.known.terms) if t.motion == motion and _is_shape(t)]]
+
+    def choose(self, sums: Sums) -> Chosen:
+        """Take in what gains most, one after another, until nothing gains enough; what has become needless goes.
+
+        That alone would go wrong twice. A shape is so pliant that it may gain more at first than either of two linear changes which explain
+        all together. And of an equal growth of all axes each alone gains nothing, because a laser's wavelength explains it nearly as
+        well. So the linear ones also get the first word, one by one, and all together less what is needless; the choice that makes the
+        readings most likely is taken, none included.
+        """
+        weight = np.exp(-self.fit.components.eta)
+        gram, moment = np.tensordot(weight, sums.gram, 1), weight @ sums.moment
+        start = np.zeros(len(moment))
+        start[: self._n] = self.known.coefficients / self.problem.sizes.typical[: self._n]
+        none = Chosen((), gram, moment - gram @ start)
+        linear = tuple(a for a in self.candidates if not a.several)
+        every = self._needed(replace(none, taken=tuple(Taken(a, max(LINEAR_SIZES), 0.0, ()) for a in linear)))
+        grown = [self._grown(start, self.candidates) for start in (none, self._grown(none, linear), every)]
+        best = max([none, *grown], key=lambda c: log_evidence(gram, c.moment, self._beside(c.taken)) - self._price * len(c.taken))
+        return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
+
+    def _rivals(self, chosen: Chosen, taken: Taken) -> tuple[tuple[str, float], ...]:
+        """Candidates that explain nearly as much in place of one that was chosen, beside all the others."""
+        names = {t.asked.name for t in chosen.taken}
+        left = [a for a in self.candidates if a.name not in names]
+        others = self._beside([t for t in chosen.taken if t is not taken])
+        own, *found = evidence_of(chosen.gram, chosen.moment, others, [taken.asked, *left])
+        near = [(e.name, own.gain - e.gain) for e in found if own.gain - e.gain < NEAR]
+        return tuple(sorted(near, key=lambda item: item[1]))
+
+    def _grown(self, chosen: Chosen, candidates: Sequence[Asked]) -> Chosen:
+        while len(chosen.taken) < MOST and (best := self._best(chosen, candidates)) is not None:
+            grown = self._needed(replace(chosen, taken=(*chosen.taken, best)))
+            if best.asked.name not in {t.asked.name for t in grown.taken}:
+                break
+            chosen = grown
+        return chosen
+
+    def _best(self, chosen: Chosen, candidates: Sequence[Asked]) -> Taken | None:
+        names = {t.asked.name for t in chosen.taken}
+        left = [a for a in candidates if a.name not in names]
+        if not left:
+            return None
+        found = evidence_of(chosen.gram, chosen.moment, self._beside(chosen.taken), left)
+        k = int(np.argmax([e.gain for e in found]))
+        gain = found[k].gain - self._price
+        if gain < ENOUGH:
+            return None
+        return Taken(left[k], found[k].size, gain, ())
+
+    def _needed(self, chosen: Chosen) -> Chosen:
+        """Every one with its gain and size beside all the others; the least needed goes first, until all are needed."""
+        taken = list(chosen.taken)
+        while taken:
+            for k, one in enumerate(taken):
+                found = evidence_of(chosen.gram, chosen.moment, self._beside([o for o in taken if o is not one]), [one.asked])[0]
+                taken[k] = replace(one, gain=found.gain - self._price, size=found.size)
+            least = min(taken, key=lambda t: t.gain)
+            if least.gain >= ENOUGH:
+                break
+            taken.remove(least)
+        return replace(chosen, taken=tuple(taken))
+
+    @property
+    def _price(self) -> float:
+        return float(np.log(len(self.candidates)))
+
+    def _beside(self, taken: Sequence[Taken]) -> F2:
+        """Factor of all that is open when these have changed, shape (p, k)."""
+        return np.column_stack([self._open, *(t.asked.directions * t.size for t in taken)])
+
+    def _free(self, chosen: Chosen, but: str) -> F2:
+        """The same with all scales and squareness free, too, without one candidate."""
+        others = [t for t in chosen.taken if t.asked.name != but]
+        names = {but, *(t.asked.name for t in others)}
+        linear = [Taken(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
+        return self._beside([t if t.asked.several else replace(t, size=max(LINEAR_SIZES)) for t in (*others, *linear)])
+
+    def size(self, chosen: Chosen, asked: Asked) -> tuple[float, float]:
+        """Value of a change and its standard uncertainty (as `Change` of the comparison), all that is linear free beside it."""
+        coefficients, covariance = self._coefficients(chosen, asked)
+        if not asked.several:
+            direction = self.known.linear({asked.name: 1.0})
+            k = int(np.argmax(np.abs(direction)))
+            return float(coefficients[k] / direction[k]), float(np.sqrt(covariance[k, k]) / abs(direction[k]))
+        rows = self._values(asked.name.split()[0])
+        value = float(np.sqrt(np.mean((rows @ coefficients) ** 2)))
+        slope = rows.T @ (rows @ coefficients) / (len(rows) * max(value, 1e-300))
+        return value, float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
+
+    def _coefficients(self, chosen: Chosen, asked: Asked) -> tuple[F1, F2]:
+        """Coefficients (P,) of one change, mm or rad, and their covariance."""
+        size = next(t.size for t in chosen.taken if t.asked.name == asked.name)
+        factor = asked.directions * (size if asked.several else max(LINEAR_SIZES))
+        whole = np.column_stack([factor, self._free(chosen, asked.name)])
+        inside = whole.T @ chosen.gram @ whole
+        inside[np.diag_indices_from(inside)] += 1.0
+        low = linalg.cho_factor(inside)
+        mine = slice(0, factor.shape[1])
+        x = linalg.cho_solve(low, whole.T @ chosen.moment)[mine]
+        covariance = linalg.cho_solve(low, np.eye(len(inside))[:, mine])[mine]
+        typical = self.problem.sizes.typical[: self._n, None]
+        turned = factor[: self._n] * typical
+        return turned @ x, turned @ covariance @ turned.T
+
+    def _values(self, motion: str) -> F2:
+        """A motion over its stroke per coefficient, shape (POINTS, P)."""
+        stroke = self.known.machine.stroke_mm
+        axis = AXES.index(motion[2])
+        points = np.tile(stroke.mean(axis=1), (POINTS, 1))
+        points[:, axis] = np.linspace(float(stroke[axis, 0]), float(stroke[axis, 1]), POINTS)
+        mine = np.array([t.motion == motion for t in self.known.terms])
+        return np.asarray(term_values(self.known.terms, points, stroke) * mine)
+
+    def hidden(self, chosen: Chosen) -> dict[str, float]:
+        """How large each scale and squareness that was not chosen may have changed all the same, rad: estimate and U (k = 2), without sign.
+
+        All linear ones are free. What these runs do not see, up to the largest size that is tried, is left out.
+        """
+        names = {t.asked.name for t in chosen.taken}
+        out = {}
+        for asked in self.candidates:
+            if not asked.several and asked.name not in names:
+                one = Taken(asked, max(LINEAR_SIZES), 0.0, ())
+                value, u = self.size(replace(chosen, taken=(*chosen.taken, one)), asked)
+                if 2.0 * u < max(LINEAR_SIZES):
+                    out[asked.name] = abs(value) + 2.0 * u
+        return out
+
+    def floor_mm(self) -> float:
+        """Noise of the readings, rms."""
+        return float(np.sqrt(np.mean(self._noise_mm[self._whole] ** 2)))
+
+    @property
+    def _noise_mm(self) -> F1:
+        return np.asarray(self.problem.sigma * np.exp(0.5 * self.fit.components.eta)[self.problem.readings.kind])
+
+    @property
+    def _whole(self) -> NDArray[np.bool_]:
+        """Readings that count."""
+        return np.asarray(self.fit.weight > 0.5)
+
+    def judged(self, by_half: Sequence[Chosen]) -> tuple[float, float, float]:
+        """What each half says of the other's choice: rms of all readings without and with it, mm, set-ups refitted; gain in log likelihood.
+
+        The gain is the smaller one of the two halves, everything that is open without a change integrated out.
+        """
+        old = self.known.coefficients
+        before, after, count, gains = 0.0, 0.0, 0, []
+        for odd, (mine, others) in enumerate(zip(by_half, reversed(by_half), strict=True)):
+            rows = (self.problem.readings.fold % 2 == odd) & self._whole
+            change = sum((self._coefficients(others, t.asked)[0] for t in others.taken), start=np.zeros_like(old))
+            before += self._left(rows, old)
+            after += self._left(rows, old + change)
+            count += int(rows.sum())
+            gains.append(self._likelier(mine, change))
+        return float(np.sqrt(before / count)), float(np.sqrt(after / count)), min(gains)
+
+    def _likelier(self, mine: Chosen, change: F1) -> float:
+        """Log of how much more likely some runs are after a change of the coefficients that they did not choose."""
+        moved = self._scaled(change)[:, 0]
+        shifted = mine.moment - mine.gram @ moved
+        plain, with_it = (log_evidence(mine.gram, m, self._open) for m in (mine.moment, shifted))
+        return with_it - plain + float(moved @ mine.moment) - 0.5 * float(moved @ mine.gram @ moved)
+
+    def _left(self, rows: NDArray[np.bool_], coefficients: F1) -> float:
+        """Sum of squares of readings less what coefficients predict, mm²; lost motion and set-ups refitted within their priors."""
+        r, n, typical = self.problem.readings, self._n, self.problem.sizes.typical
+        noise = self._noise_mm[rows]
+        sd = self.fit.prior_sd[n:] / typical[n:]
+        at = self.fit.theta / typical
+        at[:n] -= coefficients / typical[:n]
+        y = (self.fit.residual_mm[rows] + self.problem.sigma[rows] * (r.a[rows] @ at)) / noise
+        a = r.a[rows, n:] * sd * (self.problem.sigma[rows] / noise)[:, None]
+        x = linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y, assume_a="pos")
+        return float(np.sum(((y - a @ x) * noise) ** 2))
+
+
+def _is_shape(term: Term) -> bool:
+    """Whether a term is no scale and no squareness: those are asked apart."""
+    return term.order > 0 and not (term.order == 1 and term.component == term.axis)

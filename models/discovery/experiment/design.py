@@ -1,0 +1,213 @@
+"""What to measure next: the addition that best separates the remaining suspects, by simulation (T-optimal design, Atkinson and Fedorov).
+
+For every addition that the campaign does not hold, the suspect's own signal over old and new runs is fitted by each rival with everything
+that may change fitted anew: the rival's coefficients, the present simulation, the set-ups. What is left, in sigmas of the noise, is the
+expected separation. What separates most per minute is proposed, ball-bar and laser before optics and standards that few shops have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from abbe.models.arrays import F1, F2
+from abbe.models.discovery.answer import NextTest
+from abbe.models.discovery.baseline import Baseline, baseline_of
+from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.discovery.experiment.candidates import Offer, offers
+from abbe.models.effects.effect import Effect, Values
+from abbe.models.effects.path import Path, Places
+
+THIN = 100
+"""Old runs count with so many readings each; a thinned reading stands for those left out."""
+ENOUGH = 5.0
+"""Separations above this many sigmas are as good as this one."""
+WORTH, LEAST = 2.0, 0.02
+"""Sigmas that make a test worth its time; what adds less than the second adds nothing."""
+NOISE_MM = {"bar": 4e-4, "laser": 3e-4}
+LENGTH_MM = 3e-4
+SEPARATED = 4.0
+"""A rival that is this many sigmas away is excluded."""
+WIDE = 10.0
+"""Priors of the simulation's unknowns are taken this much wider than usual, as in the search."""
+RIDGE = 1e-10
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An effect that may be the missing one.
+
+    Attributes
+    ----------
+    coefficients : array, shape (k,)
+        As found; only of the leading suspect they are looked at. None: typical strength.
+    """
+
+    effect: Effect
+    key: str
+    values: Values
+    coefficients: F1 | None = None
+
+    @property
+    def label(self) -> str:
+        """``name:key``."""
+        return self.effect.label(self.key)
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """What an addition would tell: separation of the leader from each rival, sigmas, in the order of the rivals; what is known already."""
+
+    offer: Offer
+    sigmas: F1
+    already: F1
+
+    @property
+    def gain(self) -> F1:
+        """Sigmas that it adds, by rival."""
+        return np.asarray(self.sigmas - self.already)
+
+    @property
+    def plain(self) -> bool:
+        """Whether what is at hand anyway, ball-bar and laser, is enough: no other tool holder, standard or optics."""
+        open_ = self.already < SEPARATED
+        return not self.offer.special and bool((self.sigmas[open_] >= SEPARATED).all() and open_.any())
+
+    @property
+    def per_minute(self) -> float:
+        """Gain in squared separation per minute, what is enough counted as enough."""
+        gain = np.minimum(self.sigmas, ENOUGH) ** 2 - np.minimum(self.already, ENOUGH) ** 2
+        return float(np.maximum(gain, 0.0).sum() / max(self.offer.minutes, 1.0))
+
+
+def propose(case: Case, leader: Suspect, rivals: tuple[Suspect, ...], noise_mm: Mapping[str, float] | None = None) -> NextTest | None:
+    """The addition that tells the leading suspect from its rivals best, per minute.
+
+    Parameters
+    ----------
+    leader : the suspect that is named, with its coefficients.
+    rivals : what it may be instead.
+    noise_mm : of one reading of "bar" and "laser"; instruments that the campaign lacks get usual ones.
+
+    Returns
+    -------
+    NextTest or None
+        None without rivals, or where nothing on offer tells anything. Where nothing adds two sigmas, what adds most, with what it adds.
+    """
+    found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
+    if not found:
+        return None
+    useful = [p for p in found if p.gain.max() >= WORTH]
+    best = useful[0] if useful else max(found, key=lambda p: float(p.gain.max()))
+    told = best.gain >= min(WORTH, float(best.gain.max()))
+    labels = [r.label for r, t in zip(rivals, told, strict=True) if t]
+    return NextTest((best.offer.adds,), (leader.label, *labels), float(best.sigmas[told].min()), float(best.offer.minutes), best.offer.why)
+
+
+def prospects(
+    case: Case, leader: Suspect, rivals: tuple[Suspect, ...], noise_mm: Mapping[str, float] | None = None
+) -> tuple[Prospect, ...]:
+    """All additions with what they would tell, best per minute first; parameters as `propose`."""
+    found = offers(case)
+    if not rivals or not found:
+        return ()
+    noise = {**NOISE_MM, **(noise_mm or {})}
+    old = tuple(_thinned(r) for r in case.of("identify"))
+    new = tuple(r for o in found for r in (*o.runs, *o.less))
+    every = replace(case, runs=tuple(r for r, _ in old) + new)
+    table = _Columns.of(_with_setups(every), leader, rivals, tuple(r.path for r in every.runs))
+    known = np.sum([table.gram(r, k, w / noise[r.path.kind] ** 2) for k, (r, w) in enumerate(old)], axis=0)
+    already = table.left(known)
+    out, at = [], len(old)
+    for offer in found:
+        gram = known.copy()
+        for i, run in enumerate(offer.runs):
+            less = (offer.less[i], at + len(offer.runs) + i) if offer.less else None
+            gram += table.gram(run, at + i, 1.0 / noise[run.path.kind] ** 2, less)
+        at += len(offer.runs) + len(offer.less)
+        out.append(Prospect(offer, table.left(gram, knows_length=offer.knows_length), already))
+    return tuple(sorted(out, key=lambda p: (not p.plain, -p.per_minute, p.offer.minutes, p.offer.adds)))
+
+
+def _with_setups(case: Case) -> Baseline:
+    """The present simulation with unknowns for every set-up; a new mounting always has a cup, a length and a tilt that nobody knows."""
+    return baseline_of(replace(case, includes=case.includes | {"setup_centre_offset", "bar_length_error", "mirror_tilt"}))
+
+
+def _thinned(run: CaseRun) -> tuple[CaseRun, float]:
+    """A run with fewer readings, and for how many each stands."""
+    step = max(run.path.n // THIN, 1)
+    p, rows = run.path, slice(None, None, step)
+    a = p.at
+    at = Places(
+        a.q_mm[rows],
+        a.sign[rows],
+        a.since_mm[rows],
+        a.v_mm_s[rows],
+        a.a_mm_s2[rows],
+        a.t_s[rows],
+        {k: v[rows] for k, v in a.temp_c.items()},
+    )
+    path = replace(p, at=at, look=p.look[rows], feed_mm_min=p.feed_mm_min[rows], direction=p.direction[rows], travel_mm=p.travel_mm[rows])
+    return replace(run, path=path, deviation_mm=np.zeros(path.n), valid=run.valid[rows]), float(step)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Signals of leader and rivals over all runs, old and new, and the present simulation."""
+
+    base: Baseline
+    leader: tuple[F1, ...]
+    rivals: tuple[tuple[F2, ...], ...]
+
+    @classmethod
+    def of(cls, base: Baseline, leader: Suspect, rivals: tuple[Suspect, ...], paths: tuple[Path, ...]) -> _Columns:
+        own = leader.effect.signal(paths, leader.key, leader.values)
+        given = usual(leader, own[0].shape[1]) if leader.coefficients is None else leader.coefficients
+        # columns of set-ups that are new: as large as those of the old ones
+        c = np.full(own[0].shape[1], float(np.sqrt(np.mean(given**2))))
+        c[: given.size] = given[: c.size]
+        found = tuple(tuple(r.effect.signal(paths, r.key, r.values)) for r in rivals)
+        return cls(base, tuple(np.asarray(s @ c) for s in own), found)
+
+    def gram(self, run: CaseRun, k: int, weight: float, less: tuple[CaseRun, int] | None = None) -> F2:
+        """Normal matrix of one run: unknowns of the simulation, rivals, leader; ``less``: a run whose readings are taken off, its place."""
+        columns = self._of_run(run, k)
+        if less is not None:
+            columns = columns - self._of_run(*less)
+        return np.asarray(columns.T @ columns * weight)
+
+    def _of_run(self, run: CaseRun, k: int) -> F2:
+        jacobian = self.base.linear(run.data(), np.zeros(self.base.size))[1]
+        return np.column_stack([jacobian, *(r[k] for r in self.rivals), self.leader[k]])
+
+    def left(self, gram: F2, *, knows_length: bool = False) -> F1:
+        """Length of the leader's signal that neither a rival nor the simulation can imitate, sigmas, by rival."""
+        n, out = self.base.size, []
+        sd = self.base.prior_sd * WIDE
+        if knows_length:
+            sd = np.where([name.startswith("bar_length") for name in self.base.names], LENGTH_MM, sd)
+        start = n
+        for rival in self.rivals:
+            columns = np.arange(start, start + rival[0].shape[1])
+            start += columns.size
+            use = np.concatenate([np.arange(n), columns])
+            inner = gram[np.ix_(use, use)] + np.diag(np.concatenate([sd**-2.0, np.zeros(columns.size)]))
+            scale = 1.0 / np.sqrt(np.diag(inner) + 1e-30)
+            inner = inner * scale * scale[:, None] + RIDGE * np.eye(use.size)
+            b = gram[use, -1] * scale
+            out.append(np.sqrt(max(gram[-1, -1] - b @ linalg.solve(inner, b, assume_a="pos"), 0.0)))
+        return np.array(out)
+
+
+def usual(suspect: Suspect, columns: int) -> F1:
+    """Coefficients of the middle of what is usual, in the first column, for any power law of the strength."""
+    effect = suspect.effect
+    sizes = [abs(effect.strength(c * effect.per_unit * np.eye(columns)[0], suspect.values)) / effect.per_unit for c in (1.0, 4.0)]
+    power = np.log(sizes[1] / sizes[0]) / np.log(4.0)
+    out = np.zeros(columns)
+    out[0] = effect.per_unit * (np.sqrt(np.prod(effect.typical)) / sizes[0]) ** (1.0 / power)
+    return out

@@ -1,0 +1,1 @@
+"""A signal that no effect of the catalogue explains: its shape and place."""

@@ -1,0 +1,201 @@
+"""Structures without a name: effects that mean "unknown". They compete with the catalogue in the same contest, and say where the gap lives.
+
+Without them four of five effects outside of the catalogue get a wrong name (discovery.md 2, variant C).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.models.discovery.answer import Where
+from abbe.models.discovery.case import Case
+from abbe.models.discovery.generic.scan import PERIODS_S, PITCHES_MM, Seen, bumps, bursts, periods, pitches, step_moments
+from abbe.models.discovery.generic.shapes import SIGNALS, lobe_latitude, place_at
+from abbe.models.discovery.signal_localization import where_of_signal
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.path import Path
+from abbe.models.machine import AXES
+
+PREFIX = "unnamed_"
+COMPONENTS = tuple(f"E{d}{a}" for a in AXES for d in AXES)
+CROSS = tuple(key for key in COMPONENTS if key[1] != key[2])
+LOBES = (3, 4, 5, 6)
+WIDTHS_MM = (13.0, 24.0)
+SOURCE = "effects.md 5; discovery.md 4, candidates"
+TOP = 6
+"""Starts per label that a scan of the residuals keeps."""
+CLOCK_S = 30.0
+"""A moment is stated with this margin."""
+NO_TEST = "measure again: nothing in the catalogue looks like this"
+
+
+def is_unnamed(name: str) -> bool:
+    """Whether a name means that something is there which the catalogue does not explain."""
+    return name.startswith(PREFIX)
+
+
+def generic_rivals(
+    case: Case, residuals: Mapping[str, F1] | None = None, sigma_mm: Mapping[str, float] | None = None
+) -> tuple[Effect, ...]:
+    """Unnamed structures as effects, with starts for this campaign.
+
+    Parameters
+    ----------
+    residuals : dict, optional
+        Whitened residuals of runs by label, shape (n,) each, zero at readings that do not count: what the present model leaves. With them a
+        scan finds the starts (call again when the model has grown); without them the starts are a coarse grid.
+    sigma_mm : dict, optional
+        Noise of one reading of "bar" and "laser"; only needed with residuals.
+
+    Returns
+    -------
+    tuple of Effect
+        Names start with ``unnamed_``; strengths are micrometres.
+    """
+    runs = case.of("identify") or case.of("identify", "holdout")
+    paths = tuple(r.path for r in runs)
+    if residuals is None or sigma_mm is None:
+        starts = _coarse(paths)
+    else:
+        kept = tuple(p for p in paths if p.label in residuals)
+        starts = _scanned(Seen(kept, tuple(residuals[p.label] for p in kept), tuple(sigma_mm[p.kind] for p in kept)))
+    bar = any(p.kind == "bar" for p in paths)
+    return tuple(e for e in _all(starts, paths) if bar or e.name not in ("unnamed_lobes", "unnamed_burst"))
+
+
+def where_of(effect: Effect, key: str, values: Values, case: Case) -> Where:
+    """Where an unnamed structure lives, from its parameters (time, place, period, lobes) and from where its columns are (tests, axes).
+
+    Parameters
+    ----------
+    values : its non-linear parameters as found.
+    """
+    paths = tuple(r.path for r in case.of("identify", "holdout"))
+    columns = effect.signal(paths, key, values)
+    base = where_of_signal(paths, tuple(np.linalg.norm(c, axis=1) for c in columns))
+    said: dict[str, object] = {"tests": base.tests, "runs": base.runs}
+    letters = key[1:] if key[:1] == "E" else key
+    said["axes"] = tuple(a for a in AXES if a in letters) or base.axes
+    kind = effect.name.removeprefix(PREFIX)
+    if kind in ("step", "slip", "settling"):
+        later = 3.0 * values.get("tau_s", 0.0)
+        said["time_s"] = (values["t0_s"] - CLOCK_S, values["t0_s"] + CLOCK_S + later)
+    elif kind == "burst":
+        said["time_s"] = (values["t0_s"] - 2.0 * values["width_s"], values["t0_s"] + 2.0 * values["width_s"])
+    elif kind == "surge":
+        said["period_s"] = values["period_s"]
+    elif kind == "wave":
+        said["period_mm"] = values["pitch_mm"]
+    elif kind == "lobes":
+        said |= {"angular_lobes": int(key[1:]), "axes": (), "tests": base.tests}
+    elif kind == "bump":
+        x, y, z = place_at(paths, values["at_s"])
+        said |= {"position_mm": (float(x), float(y), float(z)), "radius_mm": 2.0 * values["width_mm"]}
+    return Where(**said, depends_on=DEPENDS[kind])  # type: ignore[arg-type]
+
+
+DEPENDS: dict[str, tuple[str, ...]] = {
+    "smooth": ("position",), "odd": ("position", "direction"), "wave": ("position",), "surge": ("time",), "step": ("time",),
+    "slip": ("time",), "settling": ("time",), "bump": ("position",), "lobes": ("bar azimuth",), "burst": ("time",),
+}  # fmt: skip
+Starts = dict[str, dict[str, tuple[float, ...]]]
+"""Starts by parameter, ``"period_s"``, by key; ``"*"`` for all keys."""
+
+
+def _scanned(seen: Seen) -> Starts:
+    moments = step_moments(seen, TOP)
+    t0, width, hertz = bursts(seen, TOP)
+    return {
+        "step": moments, "slip": {"": moments[""]}, "settling": {k: moments[k][:3] for k in AXES}, "surge": periods(seen, TOP),
+        "wave": pitches(seen, TOP), "bump": {"": bumps(seen, WIDTHS_MM, 2 * TOP)},
+        "burst": {"t0_s": t0[:4], "width_s": width[:3], "frequency_hz": hertz[:4]},
+    }  # fmt: skip
+
+
+def _coarse(paths: tuple[Path, ...]) -> Starts:
+    """Starts without any residual: borders and inside of runs, periods and pitches by resolution, places along the path."""
+    t = np.concatenate([np.linspace(p.at.t_s[0], p.at.t_s[-1], 6) for p in paths])
+    moments = tuple(float(v) for v in t + 0.5)
+    places = tuple(float(v) for p in _apart(paths) for v in np.linspace(p.at.t_s[0], p.at.t_s[-1], 24))
+    bars = [p for p in paths if p.kind == "bar"]
+    middles = tuple(float(v) for p in bars for v in np.linspace(p.at.t_s[0], p.at.t_s[-1], 8))
+    clock = max(p.at.t_s[-1] for p in paths) - min(p.at.t_s[0] for p in paths)
+    lines = min(int(clock * 2.0 * (1.0 / 25.0 - 1.0 / 80.0)) + 2, 60)
+    period = tuple(float(1.0 / f) for f in np.linspace(1.0 / 80.0, 1.0 / 25.0, lines))
+    pitch = tuple(float(1.0 / f) for f in np.linspace(1.0 / PITCHES_MM[1], 1.0 / 10.0, 20))
+    return {
+        "step": dict.fromkeys(AXES, moments), "slip": {"": moments[::2]}, "settling": dict.fromkeys(AXES, moments[::6]),
+        "surge": dict.fromkeys(("X", "Y", "Z", "bar", "laser"), period), "wave": dict.fromkeys(CROSS, pitch), "bump": {"": places},
+        "burst": {"t0_s": middles or (0.0,), "width_s": (1.5,), "frequency_hz": (1.0,)},
+    }  # fmt: skip
+
+
+def _apart(paths: tuple[Path, ...]) -> tuple[Path, ...]:
+    """One run of every different path: way back and other feeds pass the same places."""
+    seen: dict[tuple[float, ...], Path] = {}
+    for p in paths:
+        seen.setdefault((*p.centre_mm, p.radius_mm, *np.round(np.ptp(p.at.q_mm, axis=0)), *np.round(p.look[0], 2) ** 2), p)
+    return tuple(seen.values())
+
+
+def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
+    end = max(float(p.at.t_s[-1]) for p in paths)
+    kinds = {p.kind for p in paths}
+    out = [
+        _effect("smooth", "smooth function of one axis", COMPONENTS, (), absorbed_by=("rigid21",)),
+        # along the axis itself this has a name: backlash that depends on the position, with its forms
+        _effect("odd", "function of one axis that turns its sign with the direction", CROSS, ()),
+        _effect("lobes", "ball out of round", tuple(f"{a}{n}" for a in AXES for n in LOBES), (), forms=(Form("latitude", lobe_latitude),)),
+    ]
+    clock, tau = (0.0, end), Parameter("tau_s", "s", 20.0, 900.0, 120.0, SOURCE, (120.0,))
+    # one effect per key where the scan gives every key its own starts: an effect has one set of starts for all its keys
+    for key in AXES:
+        out.append(_effect("step", "step of one axis", (key,), (_par("t0_s", clock, starts["step"][key]),)))
+        out.append(_effect("settling", "one axis wanders off", (key,), (_par("t0_s", clock, starts["settling"][key]), tau)))
+    out.append(_effect("slip", "work holding gave way", ("",), (_par("t0_s", clock, starts["slip"][""]),)))
+    for key in (*AXES, *sorted(kinds)):
+        shortest = max(PERIODS_S[0], _resolved_s([p for p in paths if key in (*AXES, p.kind)]))
+        seen = tuple(v for v in starts["surge"][key] if v >= shortest)
+        out.append(_effect("surge", "wave on the clock", (key,), (_par("period_s", (min(shortest, PERIODS_S[1]), PERIODS_S[1]), seen),)))
+    for key in CROSS:
+        out.append(_effect("wave", "wave along one axis across it", (key,), (_par("pitch_mm", PITCHES_MM, starts["wave"][key]),)))
+    width = Parameter("width_mm", "mm", 8.0, 45.0, 20.0, SOURCE, WIDTHS_MM)
+    out.append(_effect("bump", "bump at one place", ("",), (_par("at_s", clock, starts["bump"][""]), width)))
+    b = starts["burst"]
+    burst = (
+        _par("t0_s", clock, b["t0_s"]),
+        _par("width_s", (0.15, 6.0), b["width_s"]),
+        _par("frequency_hz", (0.05, 12.0), b["frequency_hz"]),
+    )
+    out.append(_effect("burst", "short disturbance of the reading", ("",), burst))
+    return [e for e in out if all(p.starts for p in e.shape)]
+
+
+def _resolved_s(paths: Sequence[Path]) -> float:
+    """Shortest period that the readings of the quickest run tell from a longer one: two intervals."""
+    steps = [float(np.median(np.diff(p.at.t_s))) for p in paths if p.n > 1]
+    return 2.0 * min(steps, default=np.inf)
+
+
+def _par(name: str, bounds: tuple[float, float], starts: tuple[float, ...]) -> Parameter:
+    kept = tuple(dict.fromkeys(float(np.clip(v, *bounds)) for v in starts))
+    return Parameter(name, name.rsplit("_", 1)[1], bounds[0], bounds[1], kept[0] if kept else bounds[0], SOURCE, kept)
+
+
+def _size(coefficients: F1, values: Values) -> float:
+    return float(np.linalg.norm(coefficients))
+
+
+def _effect(
+    kind: str, title: str, keys: tuple[str, ...], shape: tuple[Parameter, ...], *,
+    absorbed_by: tuple[str, ...] = (), forms: tuple[Form, ...] = (),
+) -> Effect:  # fmt: skip
+    name = PREFIX + kind
+    return Effect(
+        name=name, title=title, family="structure", keys=keys, unit="um", per_unit=1.0, typical=(0.5, 30.0), shape=shape,
+        signal=SIGNALS[name], strength=_size, needs="", signature="depends on " + " and ".join(DEPENDS[kind]), remedy="mechanics",
+        remedy_text=NO_TEST, source=SOURCE, forms=forms, absorbed_by=absorbed_by,
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Readings that scatter more than noise: where, when and with which rhythm."""

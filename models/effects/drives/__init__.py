@@ -1,0 +1,1 @@
+"""Effects of drives and controls: one file an effect."""

@@ -1,0 +1,1 @@
+"""Shapes of axes beyond smooth error motions: one file an effect."""

@@ -1,0 +1,1 @@
+"""Effects of bed, ram and guides: one file an effect."""

@@ -1,0 +1,1 @@
+"""Effects of warming: one file an effect."""

@@ -1,0 +1,238 @@
+"""Kinematic calibration: geometric parameters of every leg from commands and CMM points, the step that Kwon's paper leaves open.
+
+The paper supposes that errors of the kinematic parameters cause the position errors (4.2), and fits a surface to them. Here the 18
+parameters themselves are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.papers.kwon.sensitivity`) together with the unknown
+placement on the CMM, with a stated prior for each: what the points do not carry stays at its prior and is named. Points worse than stated
+and a prior that the points contradict are noticed, widened and said (`abbe.models.papers.kwon.weighing`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.papers.kwon.errors import NotSettled
+from abbe.models.papers.kwon.frames import best_fit_errors, best_fit_frame, checked_frame, from_frame, rms
+from abbe.models.papers.kwon.geometry import LEGS, PER_LEG, Geometry, poses
+from abbe.models.papers.kwon.kinematics import forward, inverse
+from abbe.models.papers.kwon.readings import FRAME_NAMES, Readings, moved_frame, point_design, whitened
+from abbe.models.papers.kwon.sensitivity import parameter_names
+from abbe.models.papers.kwon.weighing import PriorTest, Weights, outlying_points, weigh
+from abbe.models.solvers.identifiability import Combination, Identifiability, analyse, project_out
+from abbe.models.solvers.least_squares import Estimate, solve_map
+
+PARAMETERS = parameter_names()
+TOLERANCE_MM, TOLERANCE_RAD = 0.05, 0.5e-3
+CARRIED = 0.5
+ITERATIONS = 20
+SHOWN = 10
+SETTLED = 1e-6
+"""A step below this share of the standard uncertainty ends the iteration."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Identified machine.
+
+    Attributes
+    ----------
+    geometry : Geometry
+        Nominal plus estimated deviations.
+    frame : array, shape (4, 4)
+        From the base frame to the CMM: estimated, or the one that was given.
+    pivot_mm : array (3,) or None
+        Point of the base frame about which the turns of ``frame`` are uncertain; None when the frame was given.
+    estimate : Estimate
+        Deviations from nominal (mm, rad) with covariance, names PARAMETERS, then FRAME_NAMES when the frame was unknown (increments about
+        ``frame``, so zero). Residuals and chi2 are in units of the stated uncertainty; the covariance is that of the fit with
+        ``variance_factor`` on the points and ``prior_factor`` on the prior, and EVERY uncertainty is conditional on that prior.
+    identifiability : Identifiability
+        Rank of the 18 parameters in units of their priors, frame projected out; ``hidden``: combinations without any trace in the points.
+    carried : int
+        Directions of parameter space about which the points say more than the prior.
+    residual_mm : array, shape (n, 3)
+        Measured minus modelled, CMM axes.
+    prior_test : PriorTest
+        Whether the points contradict the prior as it was stated.
+    prior_factor : float
+        By how much all prior standard deviations were widened, 1 or more: as much as the deviations in the carried directions demand. The
+        prior of the other directions is widened alike, which nothing can check.
+    outlying : tuple of int
+        Rows of points that stand out from the others. They are not left out.
+    """
+
+    geometry: Geometry
+    frame: F2
+    pivot_mm: F1 | None
+    estimate: Estimate
+    identifiability: Identifiability
+    carried: int
+    residual_mm: F2
+    prior_test: PriorTest
+    prior_factor: float
+    outlying: tuple[int, ...]
+
+    @property
+    def on_prior(self) -> tuple[str, ...]:
+        """Parameters about which the prior says more than the points."""
+        return tuple(name for name, share in zip(self.estimate.names, self.estimate.data_share, strict=True) if share < CARRIED)
+
+    @property
+    def statement(self) -> str:
+        """What the figures rest on, in one sentence."""
+        return "; ".join([*self._seen(), *self._doubts(), "every stated uncertainty is conditional on the prior"])
+
+    def _seen(self) -> list[str]:
+        n, seen = len(PARAMETERS), self.identifiability
+        parts = [
+            f"the points see {seen.rank} of {n} combinations of parameters and carry {self.carried} of them better than the prior",
+            f"single values that rest on the prior: {', '.join(self.on_prior) or 'none'}",
+        ]
+        hidden = ", ".join(_combination(h) for h in seen.hidden)
+        return [*parts, f"combinations that leave no trace and rest on the prior alone: {hidden}"] if hidden else parts
+
+    def _doubts(self) -> list[str]:
+        test, factor = self.prior_test, self.estimate.variance_factor
+        doubts = []
+        if test.conflict:
+            doubts.append(
+                f"the points CONTRADICT the prior (chi2 {test.chi2:.4g} in {test.dof} carried directions, p = {test.p:.2g}): "
+                "the machine deviates more than the prior allows"
+            )
+        if self.prior_factor > 1.0:
+            doubts.append(f"all prior standard deviations were widened by {self.prior_factor:.3g}, as the carried directions demand")
+        if factor > 1.0:
+            doubts.append(f"the points scatter {np.sqrt(factor):.3g} times as much as stated and were weighed so")
+        if self.outlying:
+            rows = ", ".join(str(i) for i in self.outlying[:SHOWN])
+            more = f" and {len(self.outlying) - SHOWN} more" if len(self.outlying) > SHOWN else ""
+            doubts.append(f"outlying point rows, not left out: {rows}{more}")
+        return doubts
+
+    def predict_mm(self, lambda_mm: F2) -> F2:
+        """Where the ball centre is for commands, CMM coordinates, shape (n, 3)."""
+        return from_frame(self.frame, forward(self.geometry, lambda_mm))
+
+    def u_predict_mm(self, lambda_mm: F2) -> F2:
+        """Standard uncertainty of `predict_mm` along the CMM axes, from parameters and frame together, shape (n, 3)."""
+        design = self.frame[:3, :3] @ point_design(self.geometry, poses("lambda_mm", lambda_mm), self.pivot_mm)
+        return np.asarray(np.sqrt(np.einsum("ncp,pq,ncq->nc", design, self.estimate.covariance, design)))
+
+    def corrected_lambda_mm(self, p_mm: F2) -> F2:
+        """Commands that bring the real machine to positions in base coordinates, shape (n, 3); errors as `inverse`."""
+        return inverse(self.geometry, p_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorLeft:
+    """Length of position errors (rms and largest, mm) by the nominal and by the calibrated geometry, best-fit rigid motion removed."""
+
+    before_rms_mm: float
+    before_max_mm: float
+    after_rms_mm: float
+    after_max_mm: float
+
+
+def default_prior() -> F1:
+    """Prior standard deviations of R1 .. dz3, shape (18,): 0.05 mm and 0.5 mrad, ordinary making and assembly; give your own."""
+    return np.array([TOLERANCE_RAD if name.startswith("th") else TOLERANCE_MM for name in PARAMETERS])
+
+
+def calibrate(nominal: Geometry, readings: Readings, prior_sd: F1 | None = None, frame: F2 | None = None) -> Calibration:
+    """Most probable parameters, given normal priors about nominal; Gauss-Newton on the exact forward solution.
+
+    Noise and prior are widened where the points demand it (`abbe.models.papers.kwon.weighing.weigh`): the noise by what no parameter can
+    follow, all prior standard deviations by one common factor, until the deviations in the carried directions are as large as the prior
+    lets expect. A contradiction (p < 0.01) is in ``prior_test`` and in the statement.
+
+    Parameters
+    ----------
+    nominal : Geometry
+    readings : Readings
+    prior_sd : array, shape (18,), optional
+        Positive standard deviations of the deviations from nominal, order of PARAMETERS; default `default_prior`. Some combinations leave
+        no trace in positions at all (R with r for theta_p = theta_b; dz with the height of the frame), so a prior is always needed.
+    frame : array, shape (4, 4), optional
+        Known placement, from the base frame to the CMM; estimated without a prior when not given.
+
+    Raises
+    ------
+    NotSettled
+        The iteration does not come to rest.
+    PoseError, CollinearPoints
+        A command has no position (for the nominal geometry or one tried on the way), or the points lie on a line and cannot place the
+        machine.
+    ValueError
+        A prior is not positive, or the frame is no rigid motion.
+    """
+    prior = default_prior() if prior_sd is None else np.asarray(prior_sd, dtype=np.float64)
+    if prior.shape != (len(PARAMETERS),) or not (np.isfinite(prior).all() and (prior > 0.0).all()):
+        raise ValueError(f"calibration: expected {len(PARAMETERS)} finite positive prior standard deviations, got shape {prior.shape}")
+    nominal_p = forward(nominal, readings.lambda_mm)
+    where = best_fit_frame(nominal_p, readings.measured_mm) if frame is None else checked_frame("calibration: frame", frame)
+    pivot = nominal_p.mean(axis=0) if frame is None else None
+    theta = np.zeros(prior.size)
+    for _ in range(ITERATIONS):
+        estimate, weights = _step(_with(nominal, theta), readings, where, pivot, (theta, prior))
+        move = estimate.theta[prior.size :]
+        step = np.concatenate([estimate.theta[: prior.size] - theta, move])
+        theta = estimate.theta[: prior.size]
+        where = where if pivot is None else moved_frame(where, move, pivot)
+        if (np.abs(step) <= SETTLED * np.sqrt(np.diag(estimate.covariance))).all():
+            return _result(_with(nominal, theta), readings, where, pivot, (estimate, prior, weights))
+    raise NotSettled(f"calibration: not settled after {ITERATIONS} steps; the points do not fit the nominal machine")
+
+
+def error_left(nominal: Geometry, calibrated: Geometry, lambda_mm: F2, measured_mm: F2) -> ErrorLeft:
+    """Position error before and after calibration; use points that the calibration has not seen.
+
+    Parameters
+    ----------
+    nominal, calibrated : Geometry
+    lambda_mm, measured_mm : arrays, shape (n, 3)
+        Commands and CMM points; each geometry is placed by its own best fit.
+    """
+    before = best_fit_errors(forward(nominal, lambda_mm), measured_mm)
+    after = best_fit_errors(forward(calibrated, lambda_mm), measured_mm)
+    return ErrorLeft(rms(before), _largest(before), rms(after), _largest(after))
+
+
+def _with(nominal: Geometry, theta: F1) -> Geometry:
+    return nominal.with_errors(dict(zip(PER_LEG, theta.reshape(len(PER_LEG), LEGS), strict=True)))
+
+
+def _step(geometry: Geometry, readings: Readings, frame: F2, pivot: F1 | None, known: tuple[F1, F1]) -> tuple[Estimate, Weights]:
+    """One linearised fit about the present geometry and frame, points and prior weighed as they themselves demand."""
+    theta, prior = known
+    design, misfit = whitened(geometry, readings, frame, pivot)
+    free = design.shape[1] - prior.size
+    names = PARAMETERS + (FRAME_NAMES if free else ())
+    observed = misfit + design[:, : prior.size] @ theta
+    weights = weigh(design, observed, prior)
+    sd = np.concatenate([weights.prior_factor * prior, np.full(free, np.inf)])
+    fit = solve_map(names, design, observed, np.full(misfit.size, np.sqrt(weights.variance_factor)), sd)
+    # The noise is scaled already, and a factor over all would widen the prior with it.
+    covariance, chi2 = fit.covariance / fit.variance_factor, fit.chi2 * weights.variance_factor
+    return replace(fit, covariance=covariance, chi2=chi2, variance_factor=weights.variance_factor), weights
+
+
+def _result(geometry: Geometry, readings: Readings, frame: F2, pivot: F1 | None, fit: tuple[Estimate, F1, Weights]) -> Calibration:
+    estimate, prior, weights = fit
+    design, misfit = whitened(geometry, readings, frame, pivot)
+    # The triangle of a QR decomposition has the same singular values and the same null space as all the rows.
+    seen = np.asarray(np.linalg.qr(project_out(design[:, : prior.size], design[:, prior.size :]), mode="r"))
+    residual = readings.measured_mm - from_frame(frame, forward(geometry, readings.lambda_mm))
+    rank, stray = analyse(PARAMETERS, seen, typical=prior), outlying_points(misfit.reshape(-1, 3))
+    found = (weights.carried, residual, weights.test, weights.prior_factor, stray)
+    return Calibration(geometry, frame, pivot, estimate, rank, *found)
+
+
+def _combination(hidden: Combination) -> str:
+    """All parameters that a hidden combination moves together."""
+    return " with ".join(hidden.told)
+
+
+def _largest(errors_mm: F2) -> float:
+    return float(np.linalg.norm(errors_mm, axis=1).max())

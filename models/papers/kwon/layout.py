@@ -1,0 +1,128 @@
+"""What a set of measured points can tell about a cubic surface: rank of the 20 monomials, planes, heights, terms that can be fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.papers.kwon.geometry import poses
+from abbe.models.papers.kwon.planes import Planes, parallel_planes
+from abbe.models.papers.kwon.terms import CUBIC, Exponents, regressors
+
+RANK_TOLERANCE = 1e-3
+"""Singular values below this share of the largest do not count: a coefficient would be a thousand times worse than a reading."""
+FLATNESS = 5e-3
+"""How far points may be off a plane and still lie on it, by default: this share of the second largest half width of X, Y, Z (of a square
+of +-1 mm: 5 um). A stage of 1 um leaves commanded positions off their plane, and what so little height tells is worth nothing: an error
+that changes by 10 um per mm of height changes by 0.05 um over it."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where points lie, and what that allows.
+
+    Attributes
+    ----------
+    n : int
+        Points.
+    rank : int
+        Of the 20 cubic monomials on centred and scaled coordinates: 10 on one plane, 16 on two, 19 on three, 20 on four (math.md 6).
+    planes : Planes or None
+        The one, two or three parallel planes on which all points lie, horizontal, tilted or upright; None when they do not.
+    low_mm, high_mm : array, shape (3,)
+        Range of X, Y, Z.
+    terms : tuple of (i, j, k)
+        Monomials to fit: on one plane facing Z the ten of X, Y; on h parallel planes those with a power of the coordinate that they face
+        below h; else all 20. Points on other surfaces (crossing planes, a sphere) get all 20, which they do not determine.
+    tolerance_mm : float
+        How far a point may be off a plane and still lie on it.
+    """
+
+    n: int
+    rank: int
+    planes: Planes | None
+    low_mm: F1
+    high_mm: F1
+    terms: tuple[Exponents, ...]
+    tolerance_mm: float
+
+    @property
+    def plane_mm(self) -> F1 | None:
+        """a, b, c of the one plane Z = a + b X + c Y on which all points lie, shape (3,); None when there is none that faces Z."""
+        at = self.planes
+        return np.array([at.levels_mm[0], *at.slope[:2]]) if at and at.axis == 2 and len(at.levels_mm) == 1 else None
+
+    @property
+    def heights_mm(self) -> tuple[float, ...]:
+        """Different Z of the points, where they are at most 3 and no plane is tilted; empty otherwise."""
+        return self.planes.levels_mm if self.planes and self.planes.axis == 2 and not self.planes.slope.any() else ()
+
+    @property
+    def z_range_mm(self) -> tuple[float, float]:
+        """Lowest and highest Z."""
+        return float(self.low_mm[2]), float(self.high_mm[2])
+
+    @property
+    def plane_text(self) -> str:
+        """Where the points lie, in words."""
+        at = self.planes
+        if at is None:
+            return f"points between Z = {self.low_mm[2]:.6g} and {self.high_mm[2]:.6g} mm"
+        name, levels = "XYZ"[at.axis], at.levels_mm
+        if len(levels) > 1:
+            return f"points between {name} = {levels[0]:.6g} and {levels[-1]:.6g}{at.tilt_text} mm, on {len(levels)} planes"
+        other = "heights" if at.axis == 2 else f"{name}"
+        return f"all points on the plane {name} = {levels[0]:.6g}{at.tilt_text} mm: nothing is known about other {other}"
+
+
+def layout(points_mm: F2, tolerance_mm: float | None = None) -> Layout:
+    """Look at the points only, not at values.
+
+    Parameters
+    ----------
+    points_mm : array, shape (n, 3)
+        Where the errors were measured (commanded positions).
+    tolerance_mm : float, optional
+        How far a point may be off a plane and still lie on it; FLATNESS times the second largest half width when not given. No two points
+        of one plane are farther apart along its axis than twice the tolerance.
+
+    Raises
+    ------
+    ValueError
+        There is no point, a coordinate is not finite, or the tolerance is negative.
+    """
+    p = poses("points_mm", points_mm)
+    if p.shape[0] == 0:
+        raise ValueError("layout: there is no point")
+    if tolerance_mm is not None and not 0.0 <= tolerance_mm < np.inf:
+        raise ValueError(f"layout: the tolerance of a plane must not be negative, got {tolerance_mm:g} mm")
+    low, high = p.min(axis=0), p.max(axis=0)
+    tolerance = FLATNESS * _middle(0.5 * (high - low)) if tolerance_mm is None else float(tolerance_mm)
+    planes = parallel_planes(p, tolerance)
+    rank = rank_of(p if planes is None else planes.snapped(p))
+    return Layout(p.shape[0], rank, planes, low, high, CUBIC if planes is None else planes.terms, tolerance)
+
+
+def rank_of(points_mm: F2, terms: tuple[Exponents, ...] = CUBIC) -> int:
+    """Rank of monomials at points: singular values above RANK_TOLERANCE of the largest, on centred and scaled coordinates."""
+    shift, scale = centring(points_mm)
+    s = np.linalg.svd(regressors((points_mm - shift) / scale, terms), compute_uv=False)
+    return int((s > RANK_TOLERANCE * s[0]).sum())
+
+
+def centring(points_mm: F2) -> tuple[F1, F1]:
+    """Middle and scale of the points along X, Y, Z, each shape (3,).
+
+    The scale is the half width, but no less than FLATNESS of the second largest: a spread that is flat for the others must not be blown up
+    to their size.
+    """
+    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
+    half = 0.5 * (high - low)
+    scale = np.maximum(half, FLATNESS * _middle(half))
+    return 0.5 * (low + high), np.where(scale > 0.0, scale, 1.0)
+
+
+def _middle(half_mm: F1) -> float:
+    return float(np.sort(half_mm)[1])

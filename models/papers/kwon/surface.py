@@ -1,0 +1,176 @@
+"""Cubic response surface of one error component: fit, coefficients, prediction with uncertainty. Kwon 2004 (26)-(28), math.md 6."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.models.arrays import F1, F2
+from abbe.models.papers.kwon.anova import Anova, anova
+from abbe.models.papers.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
+from abbe.models.papers.kwon.geometry import poses
+from abbe.models.papers.kwon.layout import RANK_TOLERANCE, Layout, centring, layout
+from abbe.models.papers.kwon.terms import Exponents, regressors, term_matrix, term_name
+from abbe.models.solvers.identifiability import analyse
+
+MARGIN = 0.1
+"""How far outside the measured range a surface may be asked for by default, as a share of the half width (of +-1 mm: 0.1 mm)."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Surface at some points.
+
+    Attributes
+    ----------
+    value, u_surface, u_reading : array, shape (n,)
+        Value; its standard uncertainty; standard uncertainty of one new reading there (surface and residual scatter together).
+    """
+
+    value: F1
+    u_surface: F1
+    u_reading: F1
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A fitted surface.
+
+    Attributes
+    ----------
+    layout : Layout
+        Where the points lie: plane, rank, terms.
+    shift_mm, scale_mm : array, shape (3,)
+        Centre and half width used for the fit.
+    scaled : array, shape (p,)
+        Coefficients of the centred and scaled monomials.
+    unscaled_cov : array, shape (p, p)
+        (X'X)^-1 of the centred and scaled monomials; times ``anova.ms_res`` it is the covariance of ``scaled``.
+    residual : array, shape (n,)
+        Value minus surface.
+    anova : Anova
+    """
+
+    layout: Layout
+    shift_mm: F1
+    scale_mm: F1
+    scaled: F1
+    unscaled_cov: F2
+    residual: F1
+    anova: Anova
+
+    @property
+    def terms(self) -> tuple[Exponents, ...]:
+        """Exponents of X, Y, Z, in the order of `coefficients`."""
+        return self.layout.terms
+
+    @property
+    def coefficients(self) -> F1:
+        """Coefficients of the raw monomials of X, Y, Z in mm, shape (p,). On planes they hold on and between those planes only."""
+        value: F1 = term_matrix(self.terms, self.shift_mm, self.scale_mm) @ self.scaled
+        return value
+
+    @property
+    def u_coefficients(self) -> F1:
+        """Standard uncertainty of `coefficients`, shape (p,)."""
+        m = term_matrix(self.terms, self.shift_mm, self.scale_mm)
+        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", m, self.unscaled_cov, m) * self.anova.ms_res))
+
+    def predict(self, points_mm: F2, margin: float = MARGIN) -> Prediction:
+        """Value and uncertainty at points.
+
+        Parameters
+        ----------
+        points_mm : array, shape (n, 3)
+        margin : float
+            How far X and Y (Z too, where the planes face X or Y) may lie outside the measured range, as a share of its half width. There
+            is no margin across the planes or in height: nothing was measured there.
+
+        Raises
+        ------
+        ExtrapolationRefused
+            A point lies off the measured plane, beyond the outer ones of several, above or below all measured heights, or beyond the
+            margin.
+        ValueError
+            The margin is negative.
+        """
+        p = poses("points_mm", points_mm)
+        self._refuse_beyond(p, margin)
+        x = regressors((p - self.shift_mm) / self.scale_mm, self.terms)
+        share = np.einsum("ni,ij,nj->n", x, self.unscaled_cov, x)
+        variance = self.anova.ms_res
+        return Prediction(x @ self.scaled, np.sqrt(share * variance), np.sqrt((1.0 + share) * variance))
+
+    def _refuse_beyond(self, p: F2, margin: float) -> None:
+        if not 0.0 <= margin < np.inf:
+            raise ValueError(f"surface: the margin must not be negative, got {margin:g}")
+        at, planes = self.layout, self.layout.planes
+        axis = 2 if planes is None else planes.axis
+        levels = (at.low_mm[2], at.high_mm[2]) if planes is None else (planes.levels_mm[0], planes.levels_mm[-1])
+        offset = p[:, 2] if planes is None else planes.offset_mm(p)
+        bad = np.flatnonzero(np.maximum(levels[0] - offset, offset - levels[1]) > at.tolerance_mm)
+        if bad.size:
+            raise ExtrapolationRefused(
+                f"point row {bad[0]}{_more(bad)}: {'XYZ'[axis]} = {p[bad[0], axis]:.6g} mm was not measured; {at.plane_text}"
+            )
+        reach = 0.5 * margin * (at.high_mm - at.low_mm) + at.tolerance_mm
+        outside = (p < at.low_mm - reach) | (p > at.high_mm + reach)
+        outside[:, axis] = False
+        bad = np.flatnonzero(outside.any(axis=1))
+        if bad.size:
+            k = int(outside[bad[0]].argmax())
+            measured = f"measured from {at.low_mm[k]:.6g} to {at.high_mm[k]:.6g} mm"
+            raise ExtrapolationRefused(
+                f"point row {bad[0]}{_more(bad)}: {'XYZ'[k]} = {p[bad[0], k]:.6g} mm was not measured; {measured}, margin {margin:g}"
+            )
+
+
+def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) -> Surface:
+    """Least-squares cubic surface with the terms that the points can carry.
+
+    Points on one plane Z = a + bX + cY give the ten monomials of X and Y and the plane is reported; 20 coefficients of (27) have only
+    rank 10 there and P'P of (28) has no inverse (math.md 3, K (28)). Two or three parallel planes, tilted or upright ones too, give 16 or
+    19 terms; the planes alone decide that. Too few lines within a plane (X^3 on three columns) are refused, not fitted with fewer terms.
+
+    Parameters
+    ----------
+    points_mm : array, shape (n, 3)
+    values : array, shape (n,)
+        One error component.
+    tolerance_mm : float, optional
+        How far a point may be off a plane and still lie on it; default as in `layout`: 1/200 of the second largest half width.
+
+    Raises
+    ------
+    SurfaceNotDetermined
+        The points do not determine the terms, or a combination a thousand times worse than the best (RANK_TOLERANCE), with what cannot be
+        told apart; or they are not more than the terms.
+    ValueError
+        Shapes differ or a value is not finite.
+    """
+    p, y = poses("points_mm", points_mm), np.asarray(values, dtype=np.float64)
+    if y.shape != (p.shape[0],) or not np.isfinite(y).all():
+        raise ValueError(f"surface: {p.shape[0]} points need as many finite values, got shape {y.shape}")
+    where = layout(p, tolerance_mm)
+    shift, scale = centring(p)
+    x = regressors((p - shift) / scale, where.terms)
+    u, s, vt = np.linalg.svd(x, full_matrices=False)
+    if y.size <= len(where.terms) or int((s > RANK_TOLERANCE * s[0]).sum()) < len(where.terms):
+        raise SurfaceNotDetermined(_why(x, where))
+    scaled = vt.T @ ((u.T @ y) / s)
+    fitted = x @ scaled
+    return Surface(where, shift, scale, scaled, (vt.T / s**2) @ vt, y - fitted, anova(y, fitted, len(where.terms)))
+
+
+def _more(bad: NDArray[np.intp]) -> str:
+    return f" and {bad.size - 1} more" if bad.size > 1 else ""
+
+
+def _why(x: F2, where: Layout) -> str:
+    head = f"surface: {where.n} points for {len(where.terms)} terms"
+    if where.n <= len(where.terms):
+        return f"{head}, there must be more points than terms"
+    hidden = analyse(tuple(term_name(t) for t in where.terms), x, tolerance=RANK_TOLERANCE).hidden
+    return f"{head}, but {hidden[0].text} ({where.plane_text})" if hidden else f"{head} hardly determine them ({where.plane_text})"

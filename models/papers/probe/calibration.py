@@ -1,0 +1,237 @@
+"""Effective radius and lobing map of a probe from touches on a master sphere (math.md 7; P (13), section 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.papers.probe.frame import direction, finite_vectors
+from abbe.models.papers.probe.lobing import LobingMap
+from abbe.models.papers.probe.pattern import ROUNDING_RAD, map_of_pattern
+
+ABSORBED = ("nx", "ny", "nz", "1")
+"""Functions of the touching direction that the fit takes for centre and radius: a map is known only without its share of them."""
+ITERATIONS = 50
+STEP_MM = 1e-14
+SINGULAR = 1e-8
+EDGE_RAD = 1e-6
+
+
+def master_sphere_pattern(circles: int = 5, longitudes: int = 20, step_rad: float = np.pi / 10) -> F2:
+    """Touching directions on the upper half of a sphere, from the equator upwards, the pole last (P section 3.2: 5 x 20 + 1 = 101).
+
+    Parameters
+    ----------
+    circles : int
+        Circles of latitude 0, step, 2 step, ...; they must end below the pole.
+    longitudes : int
+        Equidistant points of each circle.
+    step_rad : float
+        Distance of the circles, 18 degrees.
+
+    Returns
+    -------
+    array, shape (circles * longitudes + 1, 2)
+        Colatitude and longitude, rad, in the probe frame.
+
+    Raises
+    ------
+    ValueError
+        No circle, fewer than three longitudes, or circles up to the pole and beyond.
+    """
+    if circles < 1 or longitudes < 3 or not 0.0 < step_rad * max(circles - 1, 1) < np.pi / 2 - EDGE_RAD:
+        raise ValueError("sphere pattern: it takes a circle or more below the pole, each of three points or more")
+    colatitude = np.pi / 2 - step_rad * np.arange(circles)
+    longitude = 2.0 * np.pi * np.arange(longitudes) / longitudes
+    grid = np.stack(np.meshgrid(colatitude, longitude, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.vstack([grid, np.zeros((1, 2))])
+
+
+@dataclass(frozen=True)
+class SphereFit:
+    """Sphere through points by least squares of their distances.
+
+    Parameters
+    ----------
+    centre_mm : array, shape (3,)
+    radius_mm : float
+    residual_mm : array, shape (n,)
+        Distance from the centre minus radius.
+    cofactor : array, shape (4, 4)
+        Covariance of centre x, y, z and radius for a standard deviation of 1 of every radial distance: multiply by the variance.
+    leverage : array, shape (n,)
+        Share of each distance's own noise that the fit takes away; they sum to 4.
+    """
+
+    centre_mm: F1
+    radius_mm: float
+    residual_mm: F1
+    cofactor: F2
+    leverage: F1
+
+    @property
+    def sigma(self) -> F1:
+        """Standard deviations of centre x, y, z and radius per unit of radial noise, shape (4,)."""
+        return np.asarray(np.sqrt(np.diag(self.cofactor)))
+
+    @property
+    def correlation(self) -> F2:
+        """Correlations of centre x, y, z and radius, shape (4, 4). On a hemisphere centre z and radius are -0.84: weakly separable."""
+        return np.asarray(self.cofactor / np.outer(self.sigma, self.sigma))
+
+    def noise_mm(self) -> float:
+        """Root mean square of the residuals with n - 4 degrees of freedom: noise and lobing together. NaN, unknown, of four points."""
+        freedom = self.residual_mm.size - 4
+        return float(np.sqrt(self.residual_mm @ self.residual_mm / freedom)) if freedom > 0 else float("nan")
+
+
+def fit_sphere(points_mm: F2) -> SphereFit:
+    """Sphere of least squared radial deviations (Gauss-Newton from the algebraic fit).
+
+    Parameters
+    ----------
+    points_mm : array, shape (n, 3)
+        Four or more, not all on one circle.
+
+    Raises
+    ------
+    ValueError
+        Wrong shape, not finite, fewer than four points, or points that leave centre and radius undetermined.
+    """
+    p = finite_vectors(points_mm)
+    if p.ndim != 2 or p.shape[0] < 4:
+        raise ValueError(f"sphere fit: it takes four points or more, got shape {p.shape}")
+    middle = p.mean(axis=0)
+    size = float(np.sqrt(((p - middle) ** 2).sum(axis=1).mean()))
+    if size == 0.0:
+        raise ValueError("sphere fit: all points coincide")
+    q = (p - middle) / size
+    design = np.column_stack([2.0 * q, np.ones(len(q))])
+    singular = np.linalg.svd(design, compute_uv=False)
+    if singular[-1] < SINGULAR * singular[0]:
+        raise ValueError("sphere fit: the points lie on one circle or plane; centre and radius are not determined")
+    start = np.linalg.lstsq(design, (q * q).sum(axis=1), rcond=None)[0]
+    centre = start[:3] * size
+    shifted = p - middle
+    for _ in range(ITERATIONS):
+        way = shifted - centre
+        distance = np.linalg.norm(way, axis=1)
+        step = np.linalg.lstsq(_columns(way / distance[:, None]), distance - distance.mean(), rcond=None)[0]
+        centre = centre + step[:3]
+        if np.abs(step[:3]).max() < STEP_MM * max(size, 1.0):
+            break
+    way = shifted - centre
+    distance = np.linalg.norm(way, axis=1)
+    columns = _columns(way / distance[:, None])
+    cofactor = np.asarray(np.linalg.inv(columns.T @ columns), dtype=np.float64)
+    leverage = np.asarray(np.einsum("ni,ij,nj->n", columns, cofactor, columns))
+    return SphereFit(centre + middle, float(distance.mean()), distance - distance.mean(), cofactor, leverage)
+
+
+def _columns(normal: F2) -> F2:
+    """Derivative of the distances with respect to centre and radius: nx, ny, nz, 1."""
+    return np.column_stack([normal, np.ones(normal.shape[0])])
+
+
+def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
+    """A lobing function less what a sphere fit over the same directions takes for centre and radius (least squares on nx, ny, nz, 1).
+
+    Parameters
+    ----------
+    directions_rad : array, shape (n, 2)
+        Colatitude and longitude.
+    values_mm : array, shape (n,)
+
+    Returns
+    -------
+    array, shape (n,): the only part of ``values_mm`` that a calibration can find, to first order.
+    """
+    angles, v = np.asarray(directions_rad, dtype=np.float64), np.asarray(values_mm, dtype=np.float64)
+    columns = _columns(direction(angles[:, 0], angles[:, 1]))
+    return np.asarray(v - columns @ np.linalg.lstsq(columns, v, rcond=None)[0])
+
+
+@dataclass(frozen=True)
+class ProbeCalibration:
+    """What a master sphere tells about a probe.
+
+    ``probe_mm`` is the lobing at the touched directions, positive where the reading is too near the sphere's centre. It is known only
+    modulo the four functions `ABSORBED`: a true lobing with a share of nx, ny, nz moved the centre, one with a constant the radius.
+
+    Parameters
+    ----------
+    fit : SphereFit
+        Of the ball centres; its radius is master plus effective ball radius.
+    effective_radius_mm : float
+        Mean of Rm - Rs, P (13).
+    directions_rad : array, shape (n, 2)
+        Touched colatitudes and longitudes.
+    probe_mm : array, shape (n,)
+        Reff - (Rm - Rs).
+    """
+
+    fit: SphereFit
+    effective_radius_mm: float
+    directions_rad: F2
+    probe_mm: F1
+
+    def uncertainty_mm(self, noise_mm: float) -> tuple[F1, F1]:
+        """Standard uncertainties for a radial noise of one touch: of centre x, y, z and effective radius (4,), of each map value (n,).
+
+        A map value is a residual: its variance is the noise's times (1 - leverage). Unknown noise (NaN, as `SphereFit.noise_mm` says of
+        four points) gives NaN.
+
+        Raises
+        ------
+        ValueError
+            The noise is negative or infinite.
+        """
+        if noise_mm < 0.0 or np.isinf(noise_mm):
+            raise ValueError(f"calibration: noise_mm must be finite and not negative, got {noise_mm}")
+        return noise_mm * self.fit.sigma, np.asarray(noise_mm * np.sqrt(np.maximum(1.0 - self.fit.leverage, 0.0)))
+
+    def lobing_map(self, tolerance_rad: float = ROUNDING_RAD) -> LobingMap:
+        """The map for look-ups, where the touches form circles with the same longitudes and one pole (`master_sphere_pattern`).
+
+        Parameters
+        ----------
+        tolerance_rad : float
+            How far a touch may be from its place in the pattern, see `map_of_pattern`.
+
+        Raises
+        ------
+        ValueError
+            They do not.
+        """
+        return map_of_pattern(self.directions_rad, self.probe_mm, tolerance_rad)
+
+
+def calibrate(ball_centres_mm: F2, directions_rad: F2, master_radius_mm: F1 | float) -> ProbeCalibration:
+    """Effective radius and lobing from ball centres at a master sphere (P (13)).
+
+    Parameters
+    ----------
+    ball_centres_mm : array, shape (n, 3)
+        Readings.
+    directions_rad : array, shape (n, 2)
+        Colatitude and longitude of each touch in the probe frame; they only name the map's nodes.
+    master_radius_mm : float, or array of shape (n,)
+        Radius of the master sphere, or its calibrated radius in each direction (Rs(phi, theta)).
+
+    Raises
+    ------
+    ValueError
+        Shapes do not agree, numbers are not finite, the radius is not positive, or the points determine no sphere.
+    """
+    p, angles = finite_vectors(ball_centres_mm), np.asarray(directions_rad, dtype=np.float64)
+    radius = np.asarray(master_radius_mm, dtype=np.float64)
+    if p.ndim != 2 or angles.shape != (p.shape[0], 2) or radius.shape not in ((), (p.shape[0],)):
+        raise ValueError(f"calibration: centres {p.shape}, directions {angles.shape} and radius {radius.shape} do not fit together")
+    if not np.isfinite(angles).all() or not (np.isfinite(radius) & (radius > 0.0)).all():
+        raise ValueError("calibration: directions must be finite and the master's radius positive")
+    fit = fit_sphere(p)
+    over = fit.radius_mm + fit.residual_mm - radius
+    effective = float(over.mean())
+    return ProbeCalibration(fit, effective, angles, effective - over)

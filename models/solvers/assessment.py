@@ -1,0 +1,238 @@
+"""What a campaign tells about a machine and what it does not, before it is measured and after it is solved.
+
+`observability` needs the runs' set-ups only (a planner's question), `observability_of` takes a solution. Both give rank and null space in
+words with a cause and a cure, what is known of every parameter and motion, and how well the deviation is known in the volume. Rank is of
+the readings and stated calibrations alone; uncertainties include the documented priors (`abbe.models.solvers.priors`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from abbe.models.machine import Machine
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability.cures import Campaign
+from abbe.models.solvers.observability.free import hidden_free
+from abbe.models.solvers.observability.hidden import Advice, HiddenGroup, picture
+from abbe.models.solvers.observability.parameters import Correlation, Motion, Parameter, correlations, hidden_terms, motions, parameters
+from abbe.models.solvers.observability.rank import (
+    Columns,
+    Knowledge,
+    Seen,
+    campaign_columns,
+    compressed,
+    stated_knowledge,
+    what_is_seen,
+)
+from abbe.models.solvers.observability.volume import Knowing, Number, Plane, Volume, observability_number, plane_at, volume_at, whole_volume
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import setup_unknowns
+from abbe.models.solvers.priors import Priors, size_model
+
+__all__ = ["Observability", "motions_of", "observability", "observability_of"]
+
+SIGMA_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
+FLOOR_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
+"""Noise of one reading and smallest uncertainty of an averaged one, mm, where a planner says nothing else (issue: 0.5 and 0.3 um)."""
+
+
+@dataclass(frozen=True)
+class Observability:
+    """The whole report.
+
+    Attributes
+    ----------
+    machine, terms, model
+        Nominal machine; coefficients of its error motions that count for the rank; all coefficients of the model (a solution carries higher
+        orders along, for honest uncertainties).
+    seen : Seen
+        Rank, effective rank, condition, null space (unit columns).
+    reachable : int
+        Rank that no run with the same tools could exceed: the whole deviation vector everywhere (math.md 4.6, "upper bound").
+    known : tuple of str
+        Set-up unknowns counted as known for the rank, because somebody states them.
+    hidden : tuple of HiddenGroup
+        The null space in words; groups that change nothing with the tools used come last.
+    advice : tuple of Advice
+        Additions to the campaign in the order in which they show most, with the rank after each.
+    parameters, correlations, motions
+        Every unknown; pairs with a correlation above 0.9; every error motion as a function.
+    volume : Volume
+        On a grid of 11 nodes per axis. Other points: `at`.
+    number : Number
+    """
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    model: tuple[Term, ...]
+    seen: Seen
+    reachable: int
+    known: tuple[str, ...]
+    hidden: tuple[HiddenGroup, ...]
+    advice: tuple[Advice, ...]
+    parameters: tuple[Parameter, ...]
+    correlations: tuple[Correlation, ...]
+    motions: tuple[Motion, ...]
+    knowing: Knowing
+    volume: Volume
+    number: Number
+
+    @property
+    def rank(self) -> int:
+        """How many combinations of the coefficients the readings show."""
+        return self.seen.rank
+
+    def at(self, axes_mm: F2) -> Volume:
+        """Prior size, uncertainty and noise gain at commanded positions (n, 3), mm."""
+        return volume_at(self.machine, self.model, self.knowing, axes_mm)
+
+    def plane(self, fixed: int = 2, nodes: int = 15) -> Plane:
+        """The same over the plane in the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture: nodes x nodes points."""
+        return plane_at(self.machine, self.model, self.knowing, fixed, nodes)
+
+    def lines(self) -> tuple[str, ...]:
+        """The report in short sentences, most important first."""
+        n, v, k = len(self.terms), self.volume, self.volume.worst_point
+        out = [self.number.text]
+        out.append(f"The readings show {self.seen.rank} of {n} coefficients, {self.seen.effective_rank} of them well; ")
+        out[-1] += f"with the tools used no run could show more than {self.reachable}."
+        place = ", ".join(f"{x:.0f}" for x in v.axes_mm[k])
+        out.append(
+            f"Largest standard uncertainty of the predicted deviation: {v.u_mm[k] * 1e3:.2g} µm at ({place}) mm; noise gain there "
+            f"{v.gain[k]:.2g} µm per µm."
+        )
+        out += [g.text for g in self.hidden]
+        return (*out, *(a.text for a in self.advice))
+
+
+def observability(
+    machine: Machine,
+    runs: tuple[RunData, ...],
+    *,
+    terms: int | tuple[Term, ...] = 5,
+    priors: Priors | None = None,
+    sigma_mm: dict[str, float] | None = None,
+    floor_mm: dict[str, float] | None = None,
+    known: Knowledge | None = None,
+) -> Observability:
+    """What runs could tell, from where they measure: no reading is looked at.
+
+    Parameters
+    ----------
+    terms : int or tuple of Term
+        The model: highest Legendre order of the 21 error motions, or its coefficients.
+    priors
+        As in `abbe.models.solvers.joint.solve_joint`.
+    sigma_mm, floor_mm : dict with keys "bar", "laser", optional
+        Standard uncertainty of one raw reading, and the least one of an averaged value, mm (the larger of the two counts).
+    known : Knowledge, optional
+        What is known of the set-up, for the rank; default `stated_knowledge`: what the runs themselves state.
+
+    Raises
+    ------
+    ValueError
+        No runs, or runs that contradict each other (`setup_unknowns`).
+    """
+    if not runs:
+        raise ValueError("observability: no runs")
+    terms = smooth_terms(terms) if isinstance(terms, int) else terms
+    priors = priors or Priors()
+    setup = setup_unknowns(runs, priors, machine)
+    sigma, floor = sigma_mm or SIGMA_MM, floor_mm or FLOOR_MM
+    rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
+    sizes = size_model(machine, terms, rest, np.concatenate([np.full(3, priors.backlash_mm), setup.prior_sd]), priors)
+    u = np.concatenate([np.maximum(sigma[r.kind] / np.sqrt(r.weight_n), floor[r.kind]) for r in runs])
+    columns = campaign_columns(machine, terms, runs, setup)
+    whitened = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1) / u[:, None]
+    information, root = whitened.T @ whitened, sizes.typical[:, None] * sizes.root
+    beliefs = _Beliefs(None, posterior_covariance(information, root), root, information, float(np.sqrt(np.mean(u**2))))
+    return _report(_Model(machine, terms, len(terms)), runs, columns, beliefs, known)
+
+
+def observability_of(solution: JointSolution, known: Knowledge | None = None) -> Observability:
+    """What the runs of a solution told: as `observability`, with the solution's own estimates, covariance, priors and noise.
+
+    Rank and null space count the terms up to the order that the solution chose; the orders above it, which the solver carries along so
+    that no interval is too narrow, count in every uncertainty and share.
+    """
+    e, s = solution.estimate, solution
+    noise = np.concatenate([np.full(r.residual_mm.size, r.expected_mm) for r in s.runs])
+    beliefs = _Beliefs(e.theta, e.covariance, s.prior_root, s.information, float(np.sqrt(np.mean(noise**2))))
+    columns = campaign_columns(s.machine, s.terms, s.data, s.setup)
+    return _report(_Model(s.machine, s.terms, s.order), s.data, columns, beliefs, known)
+
+
+def motions_of(solution: JointSolution) -> tuple[Motion, ...]:
+    """Every error motion of a solution judged, as in its whole report, without the report's other parts."""
+    p = len(solution.terms)
+    root = solution.prior_root[:p]
+    return motions(solution.machine, solution.terms, solution.term_covariance, root @ root.T, solution.identifiability.involved)
+
+
+def posterior_covariance(information: F2, prior_root: F2) -> F2:
+    """Covariance of all unknowns, shape (p, p), from the information of the readings and the prior covariance root root^T."""
+    scaled = prior_root.T @ information @ prior_root + np.eye(information.shape[0])
+    half = linalg.solve_triangular(linalg.cholesky(scaled, lower=True, check_finite=False), prior_root.T, lower=True, check_finite=False)
+    return np.asarray(half.T @ half)
+
+
+@dataclass(frozen=True)
+class _Beliefs:
+    """Estimates (None before solving), covariance, root of the prior covariance, information of the readings, rms noise of one, mm."""
+
+    theta: F1 | None
+    covariance: F2
+    prior_root: F2
+    information: F2
+    noise_mm: float
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Nominal machine, its terms, and the highest order that counts for the rank."""
+
+    machine: Machine
+    terms: tuple[Term, ...]
+    order: int
+
+
+def _report(model: _Model, runs: tuple[RunData, ...], columns: Columns, beliefs: _Beliefs, known: Knowledge | None) -> Observability:
+    machine, p = model.machine, len(model.terms)
+    counted = [i for i, t in enumerate(model.terms) if t.order <= model.order]
+    terms = tuple(model.terms[i] for i in counted)
+    few = compressed(replace(columns, machine=columns.machine[:, counted]))
+    known = stated_knowledge(terms, runs, columns.setup_names) if known is None else known
+    seen, prior_sd = what_is_seen(few, known), np.linalg.norm(beliefs.prior_root, axis=1)
+    found = picture(Campaign(machine, terms, runs, few, known), seen, prior_sd[counted])
+    names = (*(t.name for t in model.terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
+    secret = hidden_terms(terms, seen.null_space)
+    knowing = _knowing(beliefs, p)
+    volume = whole_volume(machine, model.terms, knowing)
+    return Observability(
+        machine=machine,
+        terms=terms,
+        model=model.terms,
+        seen=seen,
+        reachable=found.reachable,
+        known=tuple(known.held),
+        hidden=found.groups,
+        advice=found.advice,
+        parameters=parameters(names, beliefs.theta, beliefs.covariance, prior_sd, secret | hidden_free(few, known, seen)),
+        correlations=correlations(names, beliefs.covariance),
+        motions=motions(machine, model.terms, knowing.posterior, knowing.prior, secret),
+        knowing=knowing,
+        volume=volume,
+        number=observability_number(volume),
+    )
+
+
+def _knowing(beliefs: _Beliefs, p: int) -> Knowing:
+    """Covariances of the terms; the noise part is that of the estimator in use, priors included."""
+    plain = posterior_covariance(beliefs.information, beliefs.prior_root)[:p]
+    root = beliefs.prior_root[:p]
+    return Knowing(root @ root.T, beliefs.covariance[:p, :p], plain @ beliefs.information @ plain.T / beliefs.noise_mm**2)

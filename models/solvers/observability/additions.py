@@ -1,0 +1,201 @@
+"""Usual additions to a campaign as virtual runs or certificates: laser lines, step diagonals, more cups, other tools, a calibrated bar.
+
+Virtual runs have no readings and no reversals; only where they would measure counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.observability.present import Present, free_corner, on_opposite_edges, place_words, present
+from abbe.models.solvers.observability.rank import Knowledge
+from abbe.models.solvers.observations import RunData
+from abbe.models.solvers.observe import with_tool
+
+LONGER_MM = 100.0
+ASIDE_MM = (100.0, 50.0)
+"""Virtual tools: that much longer; that far off the spindle's axis (math.md 4.6)."""
+READINGS, RUNS = 130, 10
+"""Readings of a virtual run, and runs repeated with another tool, at most: they cost time, and a rank needs few."""
+SHORTEST_BAR_MM = 10.0
+"""No ball-bar is shorter."""
+MARGIN = 0.1
+"""Share of the stroke that virtual runs keep off its ends."""
+
+
+@dataclass(frozen=True)
+class Addition:
+    """One thing that could be done: why something is hidden without it, what to do, and what it would be in numbers.
+
+    ``ending``: how "cannot be told apart" goes on without it.
+    """
+
+    key: str
+    cause: str
+    cure: str
+    runs: tuple[RunData, ...] = ()
+    knows: tuple[str, ...] = ()
+    ending: str = ""
+
+
+def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, names: tuple[str, ...], order: int) -> tuple[Addition, ...]:
+    """What could be added to these runs, cheapest first; every cause is a fact about them (`abbe.models.solvers.observability.present`).
+
+    Parameters
+    ----------
+    known, names : Knowledge, tuple of str
+        What is known of the set-up, and all its unknowns.
+    order : int
+        Highest order of the error motions: lines and diagonals get enough positions for it.
+    """
+    there = present(runs)
+    lasers = (*_lines(machine, there, order), _edges(machine, there, order), _diagonals(machine, there, order))
+    return (*_certificates(known, names), *lasers, *_bar_additions(machine, runs, there))
+
+
+def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
+    """What need not be measured on the machine."""
+    out = []
+    if lengths := tuple(n for n in names if n.startswith("bar_length_") and n not in known.held):
+        some = any(n.startswith("bar_length_") for n in known.held)
+        radii = " and ".join(n.removeprefix("bar_length_") for n in lengths)
+        cause = f"the length of the bar of {radii} mm is not calibrated" if some else "no bar length here is calibrated"
+        out.append(Addition("bar", cause, "a calibrated bar", knows=lengths))
+    if tilts := tuple(n for n in names if n.startswith("tilt_") and n not in known.held):
+        out.append(Addition("tilt", "the tilt of the mirror is unknown and reads like it", "a mirror of measured tilt", knows=tilts))
+    return out
+
+
+def _lines(machine: Machine, there: Present, order: int) -> list[Addition]:
+    """One laser line along each axis: where none is yet, or far from those that are."""
+    out = []
+    for k, a in enumerate(AXES):
+        places = there.lines[k]
+        corner = free_corner(machine, k, _inner(machine), places)
+        if not places:
+            cause, cure = f"nothing here measures {a} alone against a known length", f"a laser line along {a}"
+        else:
+            where = "; ".join(place_words(k, p) for p in places[:2]) + ("; ..." if len(places) > 2 else "")
+            count = "one line" if len(places) == 1 else f"{len(places)} lines"
+            cause = f"{a} alone was measured along {count} only ({where})"
+            cure = f"another laser line along {a} at {place_words(k, corner)}"
+        out.append(Addition(f"line {a}", cause, cure, (_line(machine, k, corner, order),)))
+    return out
+
+
+def _edges(machine: Machine, there: Present, order: int) -> Addition:
+    """Lines along all axes on two opposite edges; where these are there, on the two others."""
+    inner, cure = _inner(machine), "laser lines along X, Y and Z on two opposite edges"
+    sides = np.array([[0, 0, 0], [1, 1, 1]])
+    if not any(there.lines):
+        cause = "there are no laser lines here"
+    elif all(on_opposite_edges(machine, k, there.lines[k]) for k in range(3)):
+        cause, cure = "the laser lines here stand on too few edges", "laser lines along X, Y and Z on two more edges"
+        sides = np.array([[0, 0, 1], [0, 1, 0]])  # turned with the axis: low in one of the other two, high in the other
+    else:
+        cause = "the laser lines here do not stand on opposite edges in all three axes"
+    runs = tuple(_line(machine, k, inner[range(3), np.roll(side, k)], order, i) for k in range(3) for i, side in enumerate(sides))
+    return Addition("edges", cause, cure, runs)
+
+
+def _diagonals(machine: Machine, there: Present, order: int) -> Addition:
+    """Step diagonals, in an order of steps that was not used yet."""
+    sequence, done = there.next_order, " and ".join(there.orders)
+    if there.stepped and there.diagonals < len(DIAGONALS):
+        cause = f"only {there.diagonals} of the four body diagonals {'was' if there.diagonals == 1 else 'were'} stepped ({done})"
+        cure = f"step diagonals along all four body diagonals in another step order ({sequence})"
+    elif len(there.orders) == 1:
+        cause, cure = f"all step diagonals were stepped in one order ({done})", f"step diagonals in a second step order ({sequence})"
+    elif there.stepped:
+        cause, cure = f"the diagonals were stepped in {done} only", f"step diagonals in another step order ({sequence})"
+    else:
+        cause = "the diagonals here were run straight, without steps" if there.plain else "nothing here crosses the volume step by step"
+        cure = "four step diagonals"
+    return Addition("diagonals", cause, cure, tuple(_diagonal(machine, d, sequence, order) for d in DIAGONALS))
+
+
+def _bar_additions(machine: Machine, runs: tuple[RunData, ...], there: Present) -> list[Addition]:
+    longer, aside = _other_tools(machine, runs)
+    one = len({tuple(np.round(with_tool(machine, r.tool_mm).tool_mm, 6)) for r in runs}) == 1
+    length = "all runs used one tool length" if one else "the tools of these runs give it no lever of its own"
+    beside = "in all runs the tool's end stood on one line, so that turning about it is not seen" if one else length
+    short = " with one tool length" if one else " with these tools"
+    lined = " with tools that end on one line" if one else short
+    count = "at one place" if there.cups == 1 else f"at {there.cups} places"
+    cups = f"the ball-bar stood {count} only" if there.cups else "no ball-bar was used"
+    helices = _helices(machine, runs)
+    return [
+        *([Addition("centres", cups, "ball-bar helices about five centres", helices)] if helices else []),
+        Addition("tool", length, "a second tool length" if one else "another tool length", _with(runs, longer, "long"), (), short),
+        Addition("aside", beside, "a tool whose end stands off to the side", _with(runs, aside, "aside"), (), lined),
+    ]
+
+
+def _laser(label: str, path_mm: F2) -> RunData:
+    n, way = len(path_mm), path_mm[-1] - path_mm[0]
+    beam = way / np.linalg.norm(way)
+    return RunData(label, label, "laser", path_mm, np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.ones(n), beam=beam)
+
+
+def _line(machine: Machine, axis: int, through_mm: F1, order: int, number: int = 0) -> RunData:
+    """Along an axis through a place, MARGIN inside the stroke."""
+    start, end = through_mm.copy(), through_mm.copy()
+    start[axis], end[axis] = _inner(machine)[axis]
+    return _laser(f"virtual {AXES[axis]}{number}", straight_line(start, end, 2 * order + 3, back=False))
+
+
+def _diagonal(machine: Machine, name: str, sequence: str, order: int) -> RunData:
+    start, end = diagonal_ends(_inner(machine), name)
+    return _laser(f"virtual {name} {sequence}", step_diagonal(start, end, 2 * order + 4, sequence, back=False))
+
+
+def _inner(machine: Machine) -> F2:
+    return np.asarray(machine.stroke_mm + MARGIN * machine.length_mm[:, None] * np.array([1.0, -1.0]))
+
+
+def _helices(machine: Machine, runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
+    """About the middle and four places around it, with the campaign's own bar where it has one; none where no bar has room."""
+    own = next((r for r in runs if r.radius_mm is not None), None)
+    radius = 0.2 * float(machine.length_mm.min()) if own is None or own.radius_mm is None else own.radius_mm
+    if own is None and radius < SHORTEST_BAR_MM:
+        return ()
+    pole = int(np.argmax(np.abs(machine.tool_mm))) if machine.tool_mm.any() else 2
+    across = [a for a in range(3) if a != pole]
+    aside = np.clip(0.25 * machine.length_mm, 0.0, np.maximum(0.5 * machine.length_mm - radius, 0.0))  # beyond the stroke nothing is stated
+    out = []
+    for k, signs in enumerate(((0, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))):
+        centre = machine.centre_mm.copy()
+        centre[across] += aside[across] * signs
+        centre[pole] -= 0.5 * radius
+        path = helix_points(centre, radius, turns=5, n=READINGS, law="area", axis=pole)
+        n, name = len(path), f"virtual helix {k}"
+        bar = RunData(name, name, "bar", path, np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.ones(n), centre, radius)
+        out.append(bar if own is None else replace(bar, u_length_mm=own.u_length_mm, length_calibrated=own.length_calibrated))
+    return tuple(out)
+
+
+def _other_tools(machine: Machine, runs: tuple[RunData, ...]) -> tuple[F1, F1]:
+    """A tool longer than those of the runs, and one whose end stands aside."""
+    tools = [with_tool(machine, r.tool_mm).tool_mm for r in runs]
+    tool = max(tools, key=lambda t: float(np.linalg.norm(t)))
+    along = tool / np.linalg.norm(tool) if tool.any() else np.array([0.0, 0.0, -1.0])
+    helper = np.eye(3)[int(np.argmin(np.abs(along)))]
+    first = np.cross(along, helper) / np.linalg.norm(np.cross(along, helper))
+    return tool + LONGER_MM * along, tool + ASIDE_MM[0] * first + ASIDE_MM[1] * np.cross(along, first)
+
+
+def _with(runs: tuple[RunData, ...], tool_mm: F1, key: str) -> tuple[RunData, ...]:
+    """The ball-bar runs (without any, the laser runs) once more with another tool and newly mounted."""
+    out = []
+    for run in (tuple(r for r in runs if r.kind == "bar") or runs)[:RUNS]:
+        n = run.deviation_mm.size
+        at = np.unique(np.linspace(0, n - 1, min(n, READINGS)).round().astype(np.intp))
+        parts = {name: getattr(run, name)[at] for name in ("axes_mm", "deviation_mm", "sign", "t_s", "weight_n")}
+        out.append(replace(run, label=f"{key} {run.label}", setup=f"{key} {run.setup}", tool_mm=tool_mm, **parts))
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""Commands that solve, search, show and report what was measured."""

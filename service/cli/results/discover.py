@@ -1,0 +1,212 @@
+"""`abbe discover`: what the simulation of a machine lacks, named, sized and proved; nothing is written to the machine."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from abbe.service.cli.common import DbOption, MachineOption, database_url, open_store
+from abbe.service.cli.measure import AcceptTable
+from abbe.service.cli.results.solve import stored_campaign
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from abbe.service.campaign_data.campaign_folder import Campaign
+    from abbe.service.discovery.discover import Job, Journal
+    from abbe.service.discovery.discover_live import Added
+    from abbe.service.site import Site
+    from abbe.service.storage.store import Store
+
+
+def discover(  # noqa: PLR0913 - one argument for each option
+    campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
+    json_file: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Also write the answer (abbe-discovery/1); - is stdout.", show_default=False),
+    ] = None,
+    report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine of --machine, and go on.")] = False,
+    accept_table: AcceptTable = False,
+) -> None:
+    """Find where measurement and simulation disagree, and name the missing effect: size, what to do, what else it could be, what next.
+
+    Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
+    only if --db or --machine names a database. Stopped with Ctrl-C, the same command goes on where it was.
+    """
+    if live:
+        _live_needs(campaign, machine)
+    with opened(campaign, db, machine, without or []) as (found, store):
+        job, journal = _started(found, store)
+        finding = _searched(job, journal)
+        if live and store is not None and machine is not None:
+            job, journal, finding = _gone_on(store, machine, (job, journal, finding), accept_table=accept_table)
+        _written(job, journal, finding, json_file, report)
+    if json_file is not None and str(json_file) == "-":
+        return
+    _print(job, journal, finding)
+    for name, target in (("answer", json_file), ("report", report)):
+        if target is not None:
+            typer.echo(f"{name}: {target}")
+
+
+@contextmanager
+def opened(campaign: str, db: str | None, machine: Path | None, without: list[str]) -> Iterator[tuple[Campaign, Store | None]]:
+    """A campaign and the store it belongs to; a folder's is None where no database is named."""
+    from abbe.service.campaign_data.campaign_folder import from_folder, is_folder
+
+    if is_folder(campaign):
+        found = from_folder(Path(campaign)).without(without)
+        with ExitStack() as stack:
+            named = db is not None or machine is not None
+            yield found, stack.enter_context(open_store(database_url(db, machine), must_exist=False)) if named else None
+    else:
+        with stored_campaign(campaign, database_url(db, machine)) as (store, found):
+            yield found.without(without), store
+
+
+def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
+    """The job and where it stands."""
+    from abbe.service.discovery.changed_since import since_of
+    from abbe.service.discovery.discover import Journal, prepare
+    from abbe.service.discovery.discovery_store import journal_of
+    from abbe.service.effects.effect_catalogue import catalogue
+    from abbe.service.effects.model_book import current
+    from abbe.service.identification.table_removal import NO_TABLE, table_then
+
+    base = None if store is None else current(store, campaign.site.name)
+    table = NO_TABLE if store is None else table_then(store, campaign)
+    since = None if store is None else since_of(store, campaign)
+    job = prepare(campaign, catalogue(), base, table=table, since=since)
+    return job, Journal() if store is None else journal_of(store, job)
+
+
+def _live_needs(campaign: str, machine: Path | None) -> None:
+    """Before anything is read: --live needs a machine and a campaign that was measured on it."""
+    from abbe.service.campaign_data.campaign_folder import is_folder
+    from abbe.service.errors import ConfigError
+
+    if machine is None:
+        raise ConfigError("--live needs the machine", "give --machine FILE")
+    if is_folder(campaign):
+        raise ConfigError("--live goes on with a campaign of the store, not with a folder", "measure it with `abbe measure`")
+
+
+def _gone_on(
+    store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]], *, accept_table: bool = False
+) -> tuple[Job, Journal, dict[str, Any]]:
+    """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is done twice."""
+    from datetime import timedelta
+
+    from abbe.service.clock import SystemClock
+    from abbe.service.config import load_machine
+    from abbe.service.discovery.discover_live import ROUNDS, added, next_search, rounds
+    from abbe.service.discovery.discovery_store import StoredJournal
+    from abbe.service.discovery.experiment_recipes import next_plan
+    from abbe.service.site import site_of
+
+    site = site_of(load_machine(machine).machine)
+    job, journal, finding = at
+    for _ in range(ROUNDS):
+        if finding["next_test"] is None or not isinstance(journal, StoredJournal):
+            break
+        _print(job, journal, finding)
+        number = rounds(store, job.campaign.name) + 1
+        name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
+        test = finding["next_test"]
+        about = finding["where"] | {"runs": [test["like"]]} if finding["verdict"] == "unknown" and test.get("like") else None
+        wanted = next_plan(test["adds"], site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
+        if wanted.plan is None:
+            typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe runs on this machine by itself")
+            break
+        what = added(store, job.campaign, wanted.plan, wanted.after_s)
+        wait_s = _measured(store, site, job.campaign, what, accept_table=accept_table)
+        accept_table = accept_table and what.left is None  # the person has looked at the table of now, not at one that comes later
+        if wait_s > 0.0:
+            start = SystemClock().utc() + timedelta(seconds=wait_s + 1.0)
+            what_for = ", ".join(test["adds"])
+            typer.echo(f"too early for {what_for}: give the same command at {start:%H:%M:%S} UTC or later; nothing has moved")
+            break
+        job, journal = next_search(store, job, journal, what.plan.name)
+        finding = _searched(job, journal)
+    return job, journal, finding
+
+
+def _measured(store: Store, site: Site, campaign: Campaign, what: Added, *, accept_table: bool) -> float:
+    """What is left of an added measurement, run on the machine; stopped, it says what is kept. Gives the seconds to wait, or 0."""
+    from abbe.service.cli.measure import ready_session
+    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import run_job
+    from abbe.service.discovery.discover_live import measure_added
+
+    if what.begun is not None:
+        done = len(what.plan.tests) - (0 if what.left is None else len(what.left.tests))
+        typer.echo(f"going on with campaign {what.plan.name!r}: {done} of {len(what.plan.tests)} runs are measured")
+    if what.left is None:
+        return 0.0
+
+    async def work() -> float:
+        with display() as sink:
+            async with ready_session(store, site, accept_table=accept_table) as session:
+                return await measure_added(session, store, site, campaign, what, sink)
+
+    try:
+        return run_job(work())
+    except SystemExit:
+        typer.echo("stopped: runs that were measured completely are kept; the same command goes on there", err=True)
+        raise
+
+
+def _searched(job: Job, journal: Journal) -> dict[str, Any]:
+    """The finding, with progress on stderr; Ctrl-C says what is kept."""
+    from abbe.service.cli.progress import display
+    from abbe.service.discovery.discover import discover as work
+    from abbe.service.discovery.discovery_engine import search
+
+    with display() as sink:
+        try:
+            return work(job, journal, search, sink)
+        except KeyboardInterrupt:
+            state = journal.states[-1][0] if journal.states else "nothing"
+            kept = (
+                f"discovery {journal.id} stands at {state}; the same command goes on there"
+                if journal.id
+                else "nothing is kept of a folder without --db"
+            )
+            typer.echo(f"stopped: {kept}", err=True)
+            raise
+
+
+def _written(job: Job, journal: Journal, finding: dict[str, Any], json_file: Path | None, report: Path | None) -> None:
+    """Files that were asked for, each whole or not at all."""
+    from abbe.service.clock import SystemClock
+    from abbe.service.rendering.discovery_page import render_discovery
+    from abbe.service.rendering.page_file import write_page
+    from abbe.service.report.discovery_pages import discovery_page, page_facts
+
+    if json_file is not None:
+        text = json.dumps(finding["answer"], ensure_ascii=False) + "\n"
+        typer.echo(text, nl=False) if str(json_file) == "-" else write_page(text, json_file)
+    if report is not None:
+        made = SystemClock().utc().isoformat(timespec="seconds")
+        write_page(render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, made))), report)
+
+
+def _print(job: Job, journal: Journal, finding: dict[str, Any]) -> None:
+    from abbe.service.discovery.discovery_words import lines_of
+
+    typer.echo(f"campaign {job.campaign.name}: {len(finding['runs'])} runs, {len(job.effects)} effects in the catalogue")
+    for line in job.flags:
+        typer.echo(f"look at this: {line}")
+    for line in lines_of(finding):
+        typer.echo(line)
+    if journal.id is not None:
+        brought = f", model version {journal.version} of {job.campaign.site.name}" if journal.version else ""
+        typer.echo(f"stored: discovery {journal.id}, {journal.states[-1][0]}{brought}")

@@ -1,0 +1,111 @@
+"""``abbe runs`` and ``abbe show``: what was measured."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, run_or_campaign
+
+if TYPE_CHECKING:
+    from abbe.service.storage.records import ChunkRecord, RunRecord
+
+
+def runs(
+    campaign: Annotated[str | None, typer.Option("--campaign", help="Only the runs of this campaign.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the runs in the database."""
+    with open_store(database_url(db, machine)) as store:
+        found = store.runs(store.campaign(campaign).id if campaign is not None else None)
+        if as_json:
+            print_json([_summary(run) for run in found])
+            return
+        rows = [[str(value) for value in _summary(run).values()] for run in found]
+        print_table(("number", "campaign", "run", "test", "role", "status", "reason", "started (UTC)", "ended (UTC)"), rows)
+
+
+def show(
+    run: Annotated[
+        str,
+        typer.Argument(metavar="RUN", help="Number, label (r01) or campaign/label of a run; or a campaign's name.", show_default=False),
+    ],
+    db: DbOption = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show one run: state, setup and what its columns hold (--json: as an exchange file). Or a campaign: runs and incidents."""
+    from abbe.service.cli.results.show_campaign import show_campaign
+    from abbe.service.runs.columns import run_document, whole_document
+    from abbe.service.runs.coverage import not_judged, with_state
+    from abbe.service.storage.records import RunRecord
+
+    with open_store(database_url(db, machine)) as store:
+        record = run_or_campaign(store, run)
+        if not isinstance(record, RunRecord):
+            show_campaign(store, record, as_json=as_json)
+            return
+        chunks = store.chunks(record.id)
+        document = (
+            whole_document(store, record) if record.visible_status == "complete" else with_state(run_document(record, chunks), record)
+        )
+    if as_json:
+        print_json(document)
+        return
+    pieces = (document.get("timing") or {}).get("pieces", [])
+    told = {"pieces": ", ".join(f"{one['readings']} of {one['run']}" for one in pieces) + " and its own"} if pieces else {}
+    told |= {"judged": why} if (why := not_judged(document)) else {}
+    setup = {f"setup.{key}": value for key, value in document["setup"].items()}
+    print_table(
+        ("key", "value"),
+        [(key, str(value)) for key, value in (_summary(record) | told | setup | _samples(record, chunks)).items()],
+        title=f"run {record.campaign}/{record.label}",
+    )
+    print_table(
+        ("column", "rows", "smallest", "largest", "mean"), [_statistics(key, values) for key, values in document["columns"].items()]
+    )
+
+
+def _summary(run: RunRecord) -> dict[str, Any]:
+    who = {"number": run.id, "campaign": run.campaign, "run_id": run.label, "test": run.test, "role": run.role}
+    return who | {"status": run.visible_status, "reason": _told(run), "started_utc": run.started_utc, "ended_utc": run.ended_utc or ""}
+
+
+def _told(run: RunRecord) -> str:
+    """Why a run is not complete, or what it lacks although it is."""
+    if run.visible_status == "incomplete":
+        return "its process ended before the run was closed; the next command that connects to the machine takes over what was saved"
+    gaps = (run.end_doc or {}).get("gaps") or []
+    if run.reason or not gaps:
+        return run.reason
+    return f"{len(gaps)} gaps, {sum(gap['last'] - gap['first'] + 1 for gap in gaps if gap.get('last') is not None)} samples missing"
+
+
+def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
+    """Where every ball-bar sample ended: stored, flagged, or in which gap."""
+    from abbe.service.capture.account import ledger_of, streams_told
+    from abbe.service.capture.ledger import FLAGS
+
+    streams = streams_told(run.end_doc)
+    ledger = ledger_of(chunks, streams)
+    if not ledger.stored and not ledger.gaps:
+        return {}
+    sums = ledger.doc()
+    flags = ", ".join(f"{reason} {sums['flags'][reason]}" for reason in FLAGS.values() if reason in sums["flags"])
+    told = {"samples": f"{sums['stored_valid']} valid, {sums['stored_flagged']} flagged" + (f" ({flags})" if flags else "")}
+    told["missing"] = f"{sums['in_gaps']} in {sums['gaps']} gaps" + (f", {sums['unaccounted']} unaccounted" if sums["unaccounted"] else "")
+    if (count := len(ledger.ends())) > 1:
+        told["streams"] = str(count) if streams is not None else f"{count} (guessed: the run does not say)"
+    for number, gap in enumerate(ledger.gaps, start=1):
+        last = "?" if gap.last is None else str(gap.last)
+        told[f"gap {number}"] = f"samples {gap.first} to {last}: {gap.cause}"
+    return told
+
+
+def _statistics(key: str, values: list[float] | None) -> tuple[str, ...]:
+    if not values:
+        return (key, "sealed" if values is None else "0", "", "", "")
+    return (key, str(len(values)), f"{min(values):.9g}", f"{max(values):.9g}", f"{sum(values) / len(values):.9g}")

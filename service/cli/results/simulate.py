@@ -1,0 +1,88 @@
+"""`abbe simulate`: what the present model says every run should read, beside what was measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, print_json, print_table
+from abbe.service.cli.results.discover import opened
+
+if TYPE_CHECKING:
+    from abbe.service.discovery.discover import Job
+    from abbe.service.discovery.simulate import Simulation
+
+
+def simulate(
+    campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
+    as_json: JsonOption = False,
+    report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+    without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+) -> None:
+    """Predict every run with the present model, fitted to the identify runs, and show measured against simulated. Nothing is stored.
+
+    The present model is what the campaign says, with the effects of the machine's model book.
+    """
+    from abbe.service.cli.progress import display
+    from abbe.service.discovery.discover import prepare
+    from abbe.service.discovery.simulate import simulate as work
+    from abbe.service.discovery.simulate import simulation_doc
+    from abbe.service.effects.effect_catalogue import catalogue
+    from abbe.service.effects.model_book import current
+    from abbe.service.events import Progress
+    from abbe.service.identification.table_removal import NO_TABLE, table_then
+
+    with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
+        sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
+        base, table = (None, NO_TABLE) if store is None else (current(store, found.site.name), table_then(store, found))
+        job = prepare(found, catalogue(), base, table=table)
+        sink(Progress("simulate", 1.0, 2.0, None, "present model fitted to the identify runs"))
+        told = work(job)
+        sink(Progress("simulate", 2.0, 2.0, 0.0, "done"))
+    doc = simulation_doc(job, told)
+    if report is not None:
+        _write_report(job, told, report)
+    if as_json:
+        print_json(doc)
+        return
+    _print(doc)
+    if report is not None:
+        typer.echo(f"report: {report}")
+
+
+def _write_report(job: Job, told: Simulation, target: Path) -> None:
+    from abbe.service.clock import SystemClock
+    from abbe.service.discovery.discover import Journal
+    from abbe.service.discovery.simulate import simulated_finding, verdict_line
+    from abbe.service.rendering.discovery_page import render_discovery
+    from abbe.service.rendering.page_file import write_page
+    from abbe.service.report.discovery_pages import discovery_page, page_facts
+
+    facts, said = page_facts(job, Journal(), SystemClock().utc().isoformat(timespec="seconds"))
+    finding = simulated_finding(job, told)
+    said |= {"title": f"Campaign {job.campaign.name} - measured against simulated", "verdict": verdict_line(finding)}
+    write_page(render_discovery(discovery_page(finding, job.runs, facts, said)), target)
+
+
+def _print(doc: dict[str, Any]) -> None:
+    from abbe.service.discovery.simulate import verdict_line
+    from abbe.service.rendering.numbers import plain
+
+    version = (
+        "" if doc["model_version"] is None else f", model version {doc['model_version']} ({', '.join(doc['known_effects']) or 'no effect'})"
+    )
+    typer.echo(f"campaign {doc['campaign']}: present model {', '.join(doc['present_model'])}{version}")
+    for line in doc["flags"]:
+        typer.echo(f"look at this: {line}")
+    rows = []
+    for label, r in doc["runs"].items():
+        gap = r.get("rms_before_um")
+        times = "sealed" if gap is None else f"{gap / r['floor_um']:.2f}"
+        rows.append((label, r["test"], r["role"], str(r["readings"]), plain(gap), plain(r["floor_um"]), times))
+    headings = ("run", "test", "role", "readings", "measured - simulated, rms (µm)", "noise (µm)", "times the noise")
+    print_table(headings, rows)
+    typer.echo(" ".join(verdict_line(doc)[1:]))

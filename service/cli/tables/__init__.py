@@ -1,0 +1,1 @@
+"""Commands about compensation tables: propose, approve, push, take back."""

@@ -1,0 +1,126 @@
+"""`abbe comp push | rollback`: a proposal into the controller through the same door as `abbe correct`, and the table of before back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session, verification_before
+from abbe.service.cli.tables.comp_proposals import ProposalArgument
+
+if TYPE_CHECKING:
+    from abbe.service.compensation.correct import Correction
+    from abbe.service.compensation.rollback import Back
+    from abbe.service.storage.store import Store
+
+
+def push(
+    machine: MachineArgument,
+    proposal: ProposalArgument,
+    before: Annotated[
+        str, typer.Option(metavar="CAMPAIGN", help="Verification campaign measured with the present table; default: it is measured now.")
+    ] = "",
+    wait_s: Annotated[
+        float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
+    ] = 600.0,
+    accept_table: AcceptTable = False,
+) -> None:
+    """Push a proposal, prove it, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
+    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import run_job
+    from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.compensation.commission import check_commissioned
+    from abbe.service.compensation.correct import push as work_push
+    from abbe.service.compensation.correct import reasons_now
+    from abbe.service.compensation.proved_levels import check_level
+    from abbe.service.config import load_machine
+    from abbe.service.errors import TableRefused
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+
+    loaded = load_machine(machine)
+    site = site_of(loaded.machine)
+    said: list[str] = []
+
+    async def work(store: Store) -> Correction | list[str]:
+        with display() as sink:
+            async with ready_session(store, site, accept_table=accept_table) as session:
+                await check_commissioned(session.controller, store, site)
+                said.append(await check_level(session.controller, store, site))
+                against = await reasons_now(session, store, site, proposal)
+                if against:
+                    return against
+                runs = await verification_before(session, store, site, before, sink)
+                async with taken_back_when_safe(session, store, site, wait_s):
+                    return await work_push(session, store, site, proposal, runs, progress=sink)
+
+    with Store.open(loaded.database_url) as store:
+        try:
+            found = run_job(work(store))
+        except TableRefused as error:  # the answer is no, not a fault
+            found = [error.detail, *getattr(error, "__notes__", [])]
+    if isinstance(found, list):
+        for reason in found:
+            typer.echo(f"not pushed: {reason}")
+        raise typer.Exit(1)
+    typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
+    for line in (*(f"not in the tables: {text}" for text in found.not_for_tables), *filter(None, said)):
+        typer.echo(line)
+    raise typer.Exit(0 if found.decision.keep else 1)
+
+
+def rollback(
+    machine: MachineArgument,
+    to: Annotated[
+        int | None,
+        typer.Option(
+            "--to", metavar="PUSH", help="To what was in force when this push had ended; 0: before the first.", show_default=False
+        ),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask: the machine is unverified afterwards, and I want that.")] = False,
+) -> None:
+    """Make the table active again that was in force before the last kept push: by a person's order, without measuring. Asks first."""
+    from dataclasses import replace
+
+    from abbe.service.cli.running import run_job
+    from abbe.service.compensation.rollback import rollback as work_rollback
+    from abbe.service.config import load_machine
+    from abbe.service.devices.session import DeviceUrls
+    from abbe.service.errors import ConfigError
+    from abbe.service.push.book import read_entries
+    from abbe.service.push.states import TERMINAL
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.verification.verified_by import measure_now
+
+    loaded = load_machine(machine)
+    site = site_of(loaded.machine)
+
+    async def work(store: Store) -> Back | str | None:
+        last = read_entries(store, site.name, site.control)[-1:]
+        finished = bool(last) and last[0].state not in TERMINAL
+        if not (finished and to is None) and not yes and not await _asked(to):
+            raise ConfigError("nothing was taken back", "say yes, or add --yes where nobody is at the console")
+        async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
+            if finished and to is None:
+                return f"push {last[0].push} was open and is finished; to go further back, say so again"
+            return await work_rollback(session.controller, store, site, to)
+
+    with Store.open(loaded.database_url) as store:
+        found = run_job(work(store))
+    if found is None:
+        typer.echo("this table is in force already; nothing was written")
+    elif isinstance(found, str):
+        typer.echo(found)
+    else:
+        typer.echo(f"in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}")
+        typer.echo(f"the machine is unverified now: {measure_now(str(machine))}")
+
+
+async def _asked(to: int | None) -> bool:
+    """Whether the person at the console wants the table of before; nobody there: no."""
+    from abbe.service.cli.ask import console_confirm
+
+    which = {None: "from before the last kept push", 0: "from before the first push"}.get(to, f"that was in force after push {to}")
+    return await console_confirm(f"The table {which} comes back without a measurement, and the machine is unverified then. Really?")

@@ -1,0 +1,287 @@
+"""Ball-bar recipes: helices in one go or point by point, and circles in the planes of two axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.circles import Plane, arc_through, circle_points, way_on_sphere
+from abbe.models.paths.helix import Law, even_helix_points, helix_points
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.recipes.approach import BAR_APPROACH_MM, LINK_CHORD_MM, Array, as_point, pole_of, to_path
+from abbe.service.sequences.steps import MAX_PATH_POINTS, FollowPath, MoveTo, Point, ReadBar, RecordPath, Step, TestPlan, Unmount
+
+MIN_TURNS = 3.0
+"""Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition 28 at 3 turns, 58 at 2, 1900 at 1; math.md 4.5)."""
+PARTIAL_DEG, PARTIAL_LEAD_DEG = 220.0, 2.0
+"""ISO 230-4's partial arc, and what comes before and after it."""
+Path = tuple[tuple[Point, ...], tuple[int, int] | None]
+"""Points of a path, and the first and last that count; None: all."""
+
+
+def joined(arcs: tuple[Array, Array, Array]) -> Path:
+    """Feed-in, measured part and feed-out (each begins where the one before ends) as one path."""
+    lead, middle, tail = arcs
+    points = np.concatenate([lead[:-1], middle, tail[1:]])
+    first = max(len(lead) - 1, 0)
+    whole = len(lead) <= 1 and len(tail) <= 1
+    return tuple(as_point(p) for p in points), None if whole else (first, first + len(middle) - 1)
+
+
+def reversed_path(path: Path) -> Path:
+    """The same path the other way round."""
+    points, measured = path
+    last = len(points) - 1
+    return points[::-1], None if measured is None else (last - measured[1], last - measured[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Helix:
+    """Hemispherical helix of the ball-bar test (math.md 4.3): continuous, constant feed, pole to equator or (direction -1) back.
+
+    ``chord_mm`` is the wanted mean distance of the path's points; a long path gets longer chords, so that the controller can hold it. The
+    polyline then runs chord^2 / (8 radius) inside the sphere, and by the area law radius / (4 n) beside the pole: with 750 mm, 1.3 and
+    23 um. Columns and solvers take the commanded position on the polyline, not on the sphere: that costs accuracy only
+    where a sample's place on the path is uncertain by a part of a chord. ``even``: points almost equally far apart along the same curve.
+    ``feed_in_deg`` and ``feed_out_deg``: arcs of the great circles that touch the path's ends, driven before and after it in one go with
+    it, so that what is recorded in between is at constant feed; ``feed_in_deg`` comes first in either direction.
+    ``mount`` and ``unmount`` are false where two tests in a row share one set-up: the second does not mount, the first leaves the bar.
+    ``change_bar``: the second has another radius; the cup stays, the bar is taken out before the machine moves and the other one is hung in
+    where its path starts. ``link_mm``: where the first has left the machine, if this one begins elsewhere on the same sphere.
+    ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
+    ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: nobody measured it.
+    """
+
+    label: str
+    setup_id: str
+    role: str
+    centre_mm: Point
+    radius_mm: float
+    turns: float = 5.0
+    law: Law = "area"
+    axis: int = 2
+    feed_mm_min: float = 2000.0
+    direction: Literal[1, -1] = 1
+    rate_hz: int = 100
+    chord_mm: float = 1.0
+    mount: bool = True
+    unmount: bool = True
+    change_bar: bool = False
+    opens: Literal[1, -1] = 1
+    length_calibrated: bool = True
+    u_length_mm: float = 0.002
+    even: bool = False
+    feed_in_deg: float = 0.0
+    feed_out_deg: float = 0.0
+    link_mm: Point | None = None
+
+    def path(self) -> Path:
+        """All points in the order of driving, feed-in and feed-out included."""
+        length = 2 * np.pi * self.radius_mm * self.turns
+        arcs = np.deg2rad([self.feed_in_deg, self.feed_out_deg])
+        lead, tail = (int(np.ceil(self.radius_mm * a / self.chord_mm)) for a in arcs)
+        n = min(max(64, int(length / self.chord_mm)), MAX_PATH_POINTS - lead - tail)
+        draw = even_helix_points if self.even else helix_points
+        curve = draw(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=n, law=self.law, axis=self.axis)
+        if self.opens < 0:  # seen in a mirror across the equator
+            curve[:, self.axis] = 2.0 * self.centre_mm[self.axis] - curve[:, self.axis]
+        if self.direction < 0:
+            curve = curve[::-1]
+        centre = np.array(self.centre_mm)
+        first = arc_through(centre, curve[0], curve[1] - curve[0], np.linspace(-arcs[0], 0.0, lead + 1))
+        last = arc_through(centre, curve[-1], curve[-1] - curve[-2], np.linspace(0.0, arcs[1], tail + 1))
+        return joined((first, curve, last))
+
+    def plan(self, machine: Machine) -> TestPlan:
+        """Steps: to the centre, mount, out to the path's start, record the path, clear away.
+
+        Raises
+        ------
+        ConfigError
+            Fewer than three turns: their solution would be no measurement.
+        """
+        _check_turns(self.label, self.turns)
+        path, measured = self.path()
+        steps = to_path(self, path, machine)
+        steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction, measured))
+        if self.unmount:
+            steps.append(Unmount())
+        # what it takes to drive the same path again
+        again = {"law": self.law, "even": self.even, "chord_mm": self.chord_mm, "rate_hz": self.rate_hz}
+        if measured is not None:
+            again |= {"feed_in_deg": self.feed_in_deg, "feed_out_deg": self.feed_out_deg}
+        return TestPlan(self.label, "ballbar_helix", self.role, _setup(self, machine, turns=self.turns) | again, tuple(steps))
+
+
+@dataclass(frozen=True, slots=True)
+class HelixPoints:
+    """The same helix point by point: ``points`` places from pole to equator (direction -1: back), each read at standstill.
+
+    Between two places the machine goes along the sphere, so that the bar stays within its stroke, stops half a millimetre before the next
+    one against the motion of each axis from place to place, and goes there straight: every axis arrives in the direction in which
+    the places follow each other. There the mean of ``samples`` readings is taken after ``settle_s``.
+    """
+
+    label: str
+    setup_id: str
+    role: str
+    centre_mm: Point
+    radius_mm: float
+    turns: float = 5.0
+    law: Law = "area"
+    axis: int = 2
+    points: int = 120
+    feed_mm_min: float = 2000.0
+    direction: Literal[1, -1] = 1
+    rate_hz: int = 1000
+    settle_s: float = 0.3
+    samples: int = 20
+    mount: bool = True
+    unmount: bool = True
+    change_bar: bool = False
+    opens: Literal[1, -1] = 1
+    length_calibrated: bool = True
+    u_length_mm: float = 0.002
+    link_mm: Point | None = None
+
+    def path(self) -> Path:
+        """The places in the order of reading."""
+        curve = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=self.points, law=self.law, axis=self.axis)
+        if self.opens < 0:
+            curve[:, self.axis] = 2.0 * self.centre_mm[self.axis] - curve[:, self.axis]
+        return tuple(as_point(p) for p in curve[:: self.direction]), None
+
+    def plan(self, machine: Machine) -> TestPlan:
+        """Steps: to the centre, mount, out to the first place; read, go on along the sphere, read; clear away.
+
+        Raises
+        ------
+        ConfigError
+            Fewer than three turns.
+        """
+        _check_turns(self.label, self.turns)
+        path, _ = self.path()
+        up = pole_of(self)[1]
+        reading = ReadBar(self.direction, self.settle_s, self.samples, self.rate_hz)
+        steps: list[Step] = [*to_path(self, path, machine), reading]
+        for here, there in pairwise(path):
+            moved = np.sign(np.subtract(there, here))
+            stop = np.clip(np.array(there) - BAR_APPROACH_MM * moved, machine.stroke_mm[:, 0], machine.stroke_mm[:, 1])
+            way = way_on_sphere(np.array(self.centre_mm), np.array(here), np.array(there), up, LINK_CHORD_MM)
+            steps.append(FollowPath((*(as_point(p) for p in way[:-1]), as_point(stop)), self.feed_mm_min))
+            steps += [MoveTo(there, self.feed_mm_min), reading]
+        if self.unmount:
+            steps.append(Unmount())
+        again = {"law": self.law, "points": self.points, "settle_s": self.settle_s, "samples": self.samples, "rate_hz": self.rate_hz}
+        return TestPlan(self.label, "ballbar_helix", self.role, _setup(self, machine, turns=self.turns) | again, tuple(steps))
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """Circular test (ISO 230-4) in the plane of two axes: ``span_deg`` from ``start_deg``, angles from the plane's first axis to its
+    second.
+
+    ``direction`` 1: the way the angles count; -1: the same arc back. ``feed_in_deg`` and ``feed_out_deg`` prolong the arc along the same
+    circle and do not count (ISO 230-4: 180 degrees for a full circle). Where nothing is said, the plane across ``axis`` has a full circle
+    from 0 degrees, and the two planes that hold it the partial arc of 220 degrees about the pole with 2 degrees before and after it: what
+    carries the cup stands below. ``under_the_cup``: points lower than that are wanted; somebody has made sure that there is room.
+    ``axis`` and ``opens``: where the spindle is, as of a helix; the machine takes the way over this pole between two arcs about one cup.
+    The others: as of `Helix`.
+    """
+
+    label: str
+    setup_id: str
+    role: str
+    centre_mm: Point
+    radius_mm: float
+    plane: Plane = "XY"
+    start_deg: float | None = None
+    span_deg: float | None = None
+    feed_in_deg: float | None = None
+    feed_out_deg: float | None = None
+    feed_mm_min: float = 1000.0
+    direction: Literal[1, -1] = 1
+    rate_hz: int = 100
+    chord_mm: float = 0.5
+    axis: int = 2
+    opens: Literal[1, -1] = 1
+    mount: bool = True
+    unmount: bool = True
+    change_bar: bool = False
+    length_calibrated: bool = True
+    u_length_mm: float = 0.002
+    link_mm: Point | None = None
+    under_the_cup: bool = False
+
+    def arc(self) -> dict[str, float]:
+        """Where the arc begins, how long it is, feed-in and feed-out, degrees; what nobody said is chosen."""
+        upright = AXES[self.axis] in self.plane
+        span = self.span_deg if self.span_deg is not None else PARTIAL_DEG if upright else 360.0
+        pole = (0.0 if self.plane[0] == AXES[self.axis] else 90.0) + (0.0 if self.opens > 0 else 180.0)
+        begin = self.start_deg if self.start_deg is not None else pole - 0.5 * span if upright else 0.0
+        lead = PARTIAL_LEAD_DEG if upright else 180.0
+        return {
+            "start_deg": begin if begin < 180.0 else begin - 360.0,
+            "span_deg": span,
+            "feed_in_deg": lead if self.feed_in_deg is None else self.feed_in_deg,
+            "feed_out_deg": lead if self.feed_out_deg is None else self.feed_out_deg,
+        }
+
+    def path(self) -> Path:
+        """All points in the order of driving, feed-in and feed-out included."""
+        turn, arc = float(self.direction), self.arc()
+        first = arc["start_deg"] if turn > 0 else arc["start_deg"] + arc["span_deg"]
+        parts = np.array([arc["feed_in_deg"], arc["span_deg"], arc["feed_out_deg"]])
+        chord = max(self.chord_mm, np.deg2rad(parts.sum()) * self.radius_mm / (MAX_PATH_POINTS - 6))
+        begin = first - turn * arc["feed_in_deg"]
+        arcs = []
+        for span in parts:
+            n = int(np.ceil(np.deg2rad(span) * self.radius_mm / chord))
+            angles = np.deg2rad(begin + turn * np.linspace(0.0, span, n + 1))
+            arcs.append(circle_points(np.array(self.centre_mm), self.radius_mm, self.plane, angles))
+            begin += turn * span
+        return joined((arcs[0], arcs[1], arcs[2]))
+
+    def plan(self, machine: Machine) -> TestPlan:
+        """Steps: to the centre, mount, out to the path's start, record the path, clear away."""
+        path, measured = self.path()
+        steps = to_path(self, path, machine)
+        steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction, measured))
+        if self.unmount:
+            steps.append(Unmount())
+        arc = self.arc()
+        own: dict[str, Any] = {"plane": self.plane, "begin_deg": arc.pop("start_deg")} | arc
+        own |= {"chord_mm": self.chord_mm, "rate_hz": self.rate_hz}
+        if self.under_the_cup:
+            own["under_the_cup"] = True
+        return TestPlan(self.label, "ballbar_circle", self.role, _setup(self, machine) | own, tuple(steps))
+
+
+BarRecipe = Helix | HelixPoints | Circle
+
+
+def _setup(recipe: BarRecipe, machine: Machine, **own: Any) -> dict[str, Any]:
+    """What run-format.md 3 wants of every ball-bar set-up, and where the spindle was."""
+    return {
+        "setup_id": recipe.setup_id,
+        "centre_mm": list(recipe.centre_mm),
+        "radius_mm": recipe.radius_mm,
+        **own,
+        "length_calibrated": recipe.length_calibrated,
+        "u_length_mm": recipe.u_length_mm,
+        "tool_mm": [float(v) for v in machine.tool_mm],
+        "axis": AXES[recipe.axis],
+        "opens": recipe.opens,
+    }
+
+
+def _check_turns(label: str, turns: float) -> None:
+    if not MIN_TURNS <= turns < np.inf:
+        raise ConfigError(
+            f"test {label}: {turns:g} turns do not tell cup offset from squareness, a helix needs {MIN_TURNS:g} or more",
+            "set turns to 3 or more; 5 are usual",
+        )

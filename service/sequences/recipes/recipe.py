@@ -1,0 +1,18 @@
+"""Recipes: a few numbers that say which test; `plan` turns each into steps.
+
+Every sequence approaches its first position in the direction of its first motion, each axis for itself, so that lost motion is in a known
+state at the start; an axis that begins at the very end of its stroke cannot. Whoever mounts something has it taken away again at the end.
+"""
+
+from __future__ import annotations
+
+from abbe.service.sequences.recipes.approach import RAPID_MM_MIN, as_point
+from abbe.service.sequences.recipes.bar_recipes import MIN_TURNS, BarRecipe, Circle, Helix, HelixPoints
+from abbe.service.sequences.recipes.laser_recipes import Diagonal, FaceDiagonal, LaserRecipe, Linear
+
+__all__ = [
+    "MIN_TURNS", "RAPID_MM_MIN", "BarRecipe", "Circle", "Diagonal", "FaceDiagonal", "Helix", "HelixPoints", "LaserRecipe", "Linear",
+    "Recipe", "as_point",
+]  # fmt: skip
+
+Recipe = BarRecipe | LaserRecipe

@@ -1,0 +1,1 @@
+"""Who is asking: password, session, token, and what each role may."""

@@ -1,0 +1,141 @@
+"""The way in and out, and what an admin and an auditor read."""
+
+from __future__ import annotations
+
+import asyncio
+from math import ceil
+from typing import Annotated
+from urllib.parse import parse_qs
+
+from fastapi import FastAPI, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from jinja2 import Environment
+from starlette.requests import ClientDisconnect
+
+from abbe.service.users.lockout import Came
+from abbe.service.users.roles import Permission
+from abbe.service.web.listening import is_local
+from abbe.service.web.login.access import PUBLIC, needs
+from abbe.service.web.login.auth_middleware import Visit
+from abbe.service.web.login.authentication import Door, csrf_token
+from abbe.service.web.login.origin import is_tls
+from abbe.service.web.problems import problem
+from abbe.service.web.schemas import Problem
+from abbe.service.web.schemas_people import AuditEntry, AuditList, Me, User, Users
+
+LONGEST_FORM = 4096
+DEVICE_S = 90 * 86_400
+"""So long a browser is known again; what that is good for stands in `service/users/lockout.py`."""
+
+
+def add_login(app: FastAPI, env: Environment, door: Door) -> None:
+    """Add the routes of users to the application."""
+
+    def page(status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
+        headers = {"Retry-After": str(ceil(wait_s))} if wait_s else None
+        return HTMLResponse(env.get_template("login.html").render(text=text), status, headers)
+
+    @app.get("/login", include_in_schema=False)
+    @needs(PUBLIC)
+    async def form() -> HTMLResponse:
+        return page(200)
+
+    @app.post("/login", include_in_schema=False, max_body_size=LONGEST_FORM)
+    @needs(PUBLIC)
+    async def login(request: Request) -> Response:
+        visit: Visit = request.state.visit
+        fields = await _form(request)
+        if fields is None:
+            return problem(413, "a login is a short form of two fields")
+        name, password = fields.get("name", ""), fields.get("password", "")
+        visit.target = "unknown user"
+        came = await asyncio.to_thread(_came, door, request, name)
+        wait_s = door.lockout.wait_s(name, came)
+        if wait_s > 0:
+            return page(429, f"Too many tries. Wait {ceil(wait_s)} s.", wait_s)
+        # Counted before the password is looked at: tries that come together must not all see a free account.
+        wait_s = door.lockout.failed(name, came)
+        user = await asyncio.to_thread(door.people.check, name, password)
+        visit.target = name if await asyncio.to_thread(door.people.known, name) else "unknown user"
+        if user is None:
+            return page(401, "Name or password is wrong." + (f" Next try in {ceil(wait_s)} s." if wait_s else ""))
+        door.lockout.succeeded(name, came)
+        visit.who = f"user:{user.name}"
+        secret = await asyncio.to_thread(door.people.begin, user, visit.secret)
+        answer = RedirectResponse("/", 303)
+        _set_cookie(door, request, answer, secret)
+        if not came.device:
+            made, tls = await asyncio.to_thread(door.people.new_device, user), is_tls(request, behind_tls=door.behind_tls)
+            answer.set_cookie(door.device_cookie(), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
+        return answer
+
+    @app.post("/logout", include_in_schema=False)
+    @needs(Permission.READ)
+    async def logout(request: Request) -> Response:
+        visit: Visit = request.state.visit
+        if visit.secret:
+            await asyncio.to_thread(door.people.end, visit.secret)
+        answer = RedirectResponse("/login", 303)
+        _set_cookie(door, request, answer, "")
+        return answer
+
+    _add_reading(app, door)
+
+
+def _add_reading(app: FastAPI, door: Door) -> None:
+    refusals: dict[int | str, dict[str, object]] = {
+        401: {"model": Problem, "description": "Nobody is logged in"},
+        403: {"model": Problem, "description": "The role does not allow it"},
+        429: {"model": Problem, "description": "Too many requests"},
+        503: {"model": Problem, "description": "The store does not answer"},
+    }
+
+    @app.get("/api/v1/session", responses=refusals)
+    @needs(Permission.READ)
+    async def session(request: Request) -> Me:
+        """Who asks, what he may do, and the token for the header X-CSRF-Token."""
+        visit: Visit = request.state.visit
+        who = visit.principal
+        token = csrf_token(visit.secret) if visit.secret else ""
+        return Me(name=who.name, role=who.role or "", permissions=sorted(who.permissions), csrf_token=token)
+
+    @app.get("/api/v1/users", responses=refusals)
+    @needs(Permission.USERS)
+    async def users() -> Users:
+        """List users with their roles."""
+        found = await asyncio.to_thread(door.store.users)
+        return Users(users=[User(name=u.name, role=u.role, created_utc=u.created_utc, disabled_utc=u.disabled_utc) for u in found])
+
+    @app.get("/api/v1/audit", responses=refusals)
+    @needs(Permission.AUDIT)
+    async def audit(limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> AuditList:
+        """List the newest records of the audit, oldest first."""
+        found = await asyncio.to_thread(door.store.audit, limit)
+        names = ("id", "utc", "who", "action", "target", "outcome", "digest")
+        return AuditList(records=[AuditEntry(**{name: getattr(record, name) for name in names}) for record in found])
+
+
+async def _form(request: Request) -> dict[str, str] | None:
+    """Fields of a short form; None: it is too long, has too many fields, or did not come to its end."""
+    body = b""
+    try:
+        async for piece in request.stream():
+            body += piece
+            if len(body) > LONGEST_FORM:
+                return None
+        return {key: values[0] for key, values in parse_qs(body.decode("utf-8", "replace"), max_num_fields=8).items()}
+    except (ValueError, ClientDisconnect):
+        return None
+
+
+def _came(door: Door, request: Request, name: str) -> Came:
+    visit: Visit = request.state.visit
+    device = door.people.device_of(name, request.cookies.get(door.device_cookie(), ""))
+    return Came(visit.address, device, here=is_local(visit.address) and not door.behind_tls)
+
+
+def _set_cookie(door: Door, request: Request, answer: Response, secret: str) -> None:
+    """The cookie dies with the browser; how long the session lasts is decided here, not there."""
+    tls = is_tls(request, behind_tls=door.behind_tls)
+    age = None if secret else 0
+    answer.set_cookie(door.cookie(tls=tls), secret, max_age=age, path="/", httponly=True, samesite="strict", secure=tls)

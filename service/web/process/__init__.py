@@ -1,0 +1,1 @@
+"""The web process itself: its start, its guard of imports, its server."""
