@@ -50,7 +50,7 @@ from abbe.service.web.core_link.logtail import LogTail
 from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
-from abbe.service.web.process.server import make_server
+from abbe.service.web.process.serving import make_server
 from abbe.service.web.view import View
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.scenarios.campaign_files import measured

@@ -7,7 +7,7 @@ above the planner's order, and that noise and typical sizes will be estimated fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +15,41 @@ import numpy as np
 from abbe.models.machine import AXES, Machine
 from abbe.models.planning.candidates import candidates, opening
 from abbe.models.planning.goal import COVERAGE, Goal, limit, minutes_needed, shortest
-from abbe.models.planning.information import field_rows, problem, scale_temperature_mm2, uncertainty_mm
+from abbe.models.planning.information import Problem, field_rows, problem, scale_temperature_mm2, uncertainty_mm
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
-from abbe.models.planning.open_questions import not_observable
 from abbe.models.planning.search import Chosen, Search
+from abbe.models.solvers.assessment import observability
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
+
+# What a planned campaign cannot tell, in words, before anything is measured.
+
+
+def not_observable(what: Problem, runs: Iterable[RunData]) -> tuple[str, ...]:
+    """Sentences about what the runs of a plan leave open, with cause and cure, in the words of the solver's own report.
+
+    First what would stay hidden in the work with this tool, then what only another tool would show, then what to add.
+    """
+    tools = what.tools
+    found = observability(
+        what.machine,
+        tuple(runs),
+        terms=what.terms,
+        priors=what.priors,
+        sigma_mm={"bar": tools.bar_noise_mm, "laser": tools.laser_noise_mm},
+        floor_mm={"bar": tools.floor_mm, "laser": tools.floor_mm},
+    )
+    out = [g.text for g in found.hidden if not g.harmless]
+    silent = sum(g.count for g in found.hidden if g.harmless)
+    if silent:
+        tool = ", ".join(f"{v:g}" for v in what.machine.tool_mm)
+        out.append(
+            f"What {silent} of the error motions' {len(what.terms)} degrees of freedom do is not seen: they move nothing with the tool "
+            f"({tool}) mm, but do with another. All of this holds for this tool length only."
+        )
+    return (*out, *(a.text for a in found.advice))
+
 
 __all__ = ["Plan", "Step", "laid_out", "plan_campaign", "uncertainty_mm"]
 

@@ -5,27 +5,133 @@ One segment that cannot be taken over stops neither the others nor the machine: 
 
 from __future__ import annotations
 
+import fcntl
+import os
+import threading
+import time
 import zlib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from abbe.service.capture.account import DAMAGED, ledger_of, settle, streams_doc
+from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.folder import folder_of
 from abbe.service.capture.ingest import BATCH, chunk_of, may_pass
 from abbe.service.capture.ledger import Ledger
-from abbe.service.capture.locks import LOCK_NAME, held_alone, is_free
-from abbe.service.capture.put_away import put_away
 from abbe.service.capture.recorder import is_active
 from abbe.service.capture.records import CHUNK, CLOSE, GAP, OPEN
 from abbe.service.capture.scan import Scan, scan
-from abbe.service.capture.settings import CONFLICT, DAMAGED_SUFFIX, ORPHAN, SUFFIX, CaptureSettings, other_folders, segment_path, set_aside
+from abbe.service.capture.settings import (
+    CONFLICT,
+    DAMAGED_SUFFIX,
+    ORPHAN,
+    SUFFIX,
+    TAIL,
+    CaptureSettings,
+    free_name,
+    other_folders,
+    segment_path,
+    set_aside,
+)
 from abbe.service.errors import AbbeError, CaptureConflict, CaptureFault, StoreError
 from abbe.service.runs.codec import decode_json
 from abbe.service.storage.owner import this_process
 from abbe.service.storage.records import INTERRUPTED, RUNNING, ChunkRecord, RunRecord
 from abbe.service.storage.store import Store
+
+# What becomes of a segment whose run is closed: deleted, kept, or renamed because something in it is damaged.
+
+
+def put_away(path: Path, held: Scan, *, keep: bool) -> None:
+    """Delete or keep a segment that was taken over; nothing that could not be read is deleted. Never raises: the next start tries again.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    held : Scan
+        What is in it.
+    keep : bool
+        Keep it although the database has everything.
+    """
+    with suppress(OSError):
+        if held.damaged or (held.tail_bytes and not _copied(path, held.good_bytes)):
+            set_aside(path, DAMAGED_SUFFIX)
+        elif not keep:
+            path.unlink(missing_ok=True)
+        elif held.tail_bytes:
+            with path.open("r+b") as file:
+                file.truncate(held.good_bytes)
+                os.fsync(file.fileno())
+
+
+def _copied(path: Path, begin: int) -> bool:
+    """Copy the end of a file to a file of its own, onto the disk; False when there is no room or the disk reports an error."""
+    copy = free_name(path, TAIL)
+    try:
+        with path.open("rb") as file, copy.open("xb") as other:
+            file.seek(begin)
+            other.write(file.read())
+            other.flush()
+            os.fsync(other.fileno())
+        RealFileIO().sync_folder(path.parent)
+    except OSError:
+        with suppress(OSError):
+            copy.unlink(missing_ok=True)
+        return False
+    return True
+
+
+# Locks that the operating system gives back when a process ends, however it ends: on a segment, and on the recovery.
+
+
+LOCK_NAME = "recovery.lock"
+WAIT_S = 30.0
+_POLL_S = 0.05
+
+
+@contextmanager
+def held_alone(path: Path, wait_s: float = WAIT_S) -> Iterator[bool]:
+    """Hold a lock file; False when somebody else held it all the time.
+
+    Raises
+    ------
+    CaptureFault
+        The file cannot be made.
+    """
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
+    except OSError as error:
+        raise CaptureFault(f"{path}: lock: {error.strerror}", "look at the folder of the segments and its rights") from error
+    try:
+        until_s = time.monotonic() + wait_s
+        while not (got := _got(handle)) and time.monotonic() < until_s:
+            threading.Event().wait(_POLL_S)
+        yield got
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def is_free(path: Path) -> Iterator[bool]:
+    """Tell whether nobody writes a segment, and keep it so meanwhile. Raises OSError."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        yield _got(handle)
+    finally:
+        os.close(handle)
+
+
+def _got(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
 
 __all__ = ["DAMAGED", "Recovered", "ledger_of", "read_segment", "recover_segments"]
 

@@ -9,12 +9,15 @@ import asyncio
 import os
 import socket
 import subprocess
+from base64 import b64encode
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
 
 import structlog
 
-from abbe.service.capture.live import LiveFeed
+from abbe.service.capture.live import LiveFeed, Stretch
 from abbe.service.channel.messages import (
     PROTOCOL,
     Alive,
@@ -23,6 +26,8 @@ from abbe.service.channel.messages import (
     Begin,
     DoneByHand,
     Jobs,
+    LivePath,
+    LiveSamples,
     Moment,
     PushNow,
     RollBack,
@@ -35,10 +40,87 @@ from abbe.service.channel.wire import Wire
 from abbe.service.children import python_words
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobBook
-from abbe.service.core.limits import keep_within
-from abbe.service.core.live import show_live
 from abbe.service.core.orders import Orders
 from abbe.service.errors import AbbeError, ChannelBroken
+
+# Shows the web process what the running path reads, twenty times a second, and never waits for it.
+
+
+FRAME_S = 0.05
+"""Between two messages: 20 Hz, about 50 samples each at 1 kHz."""
+NO_PATH = LivePath("path", 0, "", "", 0.0, 0.0, 0, 0.0, ())
+WORD = 200
+
+
+async def show_live(wire: Wire, live: LiveFeed, clock: Clock) -> None:
+    """Tell every path and what it reads, until cancelled. A web process that does not read in time misses samples, and the disk none."""
+    live.stretches()  # what came in while nobody looked on is old: it would be seconds of samples at once
+    told = 0
+    while True:
+        await live.active.wait()
+        while live.path is not None:
+            if not wire.is_full:
+                told = _told(wire, live, told)
+                for part in live.stretches():
+                    wire.send(_message(part, clock))
+            await asyncio.sleep(FRAME_S)
+        if told:
+            wire.send(NO_PATH)
+            told = 0
+
+
+def _told(wire: Wire, live: LiveFeed, told: int) -> int:
+    path = live.path
+    if path is None or path.number == told:
+        return told
+    wire.send(LivePath("path", **asdict(path) | {"run": path.run[:WORD], "test": path.test[:WORD]}))
+    return path.number
+
+
+def _message(part: Stretch, clock: Clock) -> LiveSamples:
+    # The instant at which the samples came in was read off the monotonic clock; a browser knows only the calendar's.
+    ago_s = clock.monotonic_s() - part.host_s
+    arrived_ms = clock.utc().timestamp() * 1e3 - ago_s * 1e3
+    return LiveSamples("samples", part.path, part.first, arrived_ms, b64encode(part.values_um.astype("<f4").tobytes()).decode("ascii"))
+
+
+# How much memory the page's process gets: a page that grows without end must not take the process with it that moves the machine.
+#
+# Kept by the kernel for that process alone, from outside: the page cannot lift it. Should the whole service run into its own limit
+# (``MemoryMax`` of the unit), or the computer out of memory, the kernel takes the page first.
+
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+
+FIRST_TO_GO = 900
+"""As ``/proc/PID/oom_score_adj`` has it: 0 is the core's, 1000 the most there is."""
+
+
+def keep_within(pid: int, memory_mb: int) -> None:
+    """Bound what a process can allocate.
+
+    Parameters
+    ----------
+    pid : int
+        A child of ours.
+    memory_mb : int
+        Writable private memory that it may ask for, MiB; beyond it gets none.
+    """
+    with suppress(OSError):  # not everywhere there is such a file
+        Path(f"/proc/{pid}/oom_score_adj").write_text(f"{FIRST_TO_GO}\n", encoding="ascii")
+    if not hasattr(resource, "prlimit"):
+        return
+    try:
+        resource.prlimit(pid, resource.RLIMIT_DATA, (memory_mb << 20, memory_mb << 20))
+    except ProcessLookupError:
+        pass  # gone already, as its end will tell
+    except (OSError, ValueError) as error:
+        log.warning("the page's memory has no limit of its own", cause=str(error))
+
 
 log = structlog.get_logger("abbe.web")
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from abbe.drivers.api import ControllerStatus, Point
+from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point
 from abbe.drivers.errors import Refused
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
@@ -18,10 +18,9 @@ from abbe.service.sequences.guard import motion_guard
 from abbe.service.sequences.interlocks import AT_WORK, PAUSED, PROGRAM, REMOTE, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.path_resume import Onward, Way
-from abbe.service.sequences.paths import follow_path, record_path
+from abbe.service.sequences.paths import BAD_BITS, OUT_BITS, bar_trouble, follow_path, record_path
 from abbe.service.sequences.preconditions import Expected
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
-from abbe.service.sequences.standstill import read_bar
 from abbe.service.sequences.steps import (
     ChangeBar,
     FollowPath,
@@ -39,6 +38,46 @@ from abbe.service.sequences.steps import (
 )
 from abbe.service.sequences.waiting import paused
 from abbe.service.sequences.watch import NOTHING, Watch, watched
+
+# A ball-bar reading at standstill: the mean of a few samples that the box began after the axes had settled.
+
+
+async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, here: Point | None) -> dict[str, Any]:
+    """One record of a point-by-point test, with every sample that it is the mean of.
+
+    The stream is started after ``status`` said that the axes have settled, so no sample can be older than that: arrival times play no part.
+
+    Raises
+    ------
+    BarOutOfRange, MeasurementFault
+        The box itself says that a sample is none: out of range or no bar; samples lost.
+    """
+    samples: list[BarSample] = []
+    host_s = status.host_s
+    async with ballbar.stream(step.rate_hz) as batches:
+        async for batch in batches:
+            host_s = batch.host_s
+            samples += batch.samples
+            if len(samples) >= step.samples:
+                break
+    taken = samples[: step.samples]
+    bad = [s for s in taken if s.status & BAD_BITS]
+    if bad or len(taken) < step.samples:
+        if bad and bad[0].status & OUT_BITS:
+            raise bar_trouble(bad[0].status)
+        what = f"status {bad[0].status:#06x}" if bad else f"{len(taken)} of {step.samples} samples came"
+        raise MeasurementFault(f"the ball-bar's box loses samples ({what})", "look at its cable, then start the test again")
+    return {
+        "host_s": host_s,
+        "ctrl_us": status.ctrl_us,
+        "target_mm": list(here if here is not None else status.position_mm),
+        "direction": step.direction,
+        "feed_mm_min": 0.0,
+        "device_us": [s.device_us for s in taken],
+        "reading_nm": [s.reading_nm for s in taken],
+        "status": [s.status for s in taken],
+    }
+
 
 COMPENSATED = 3
 SAME_PLACE_MM = 1e-3

@@ -24,9 +24,8 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.api.table_orders import add_table_orders
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.core_link.core_unavailable import add_silence
-from abbe.service.web.document import complete
+from abbe.service.web.document import SecurityHeaders, complete
 from abbe.service.web.frame import Framed
-from abbe.service.web.headers import SecurityHeaders
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
 from abbe.service.web.login.access import PUBLIC, needs

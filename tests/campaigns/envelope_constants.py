@@ -1,4 +1,4 @@
-"""How far the line under a cloud of delays lies off: the constants of models/alignment/envelope.py, counted on clouds with known edges.
+"""How far the line under a cloud of delays lies off: the constants of models/alignment/clock.py, counted on clouds with known edges.
 
 python -m tests.campaigns.envelope_constants [--clouds 60000] [--lowest 100]
 """
@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from abbe.models.alignment.envelope import LOWEST, _edge, _edge_of_delays
+from abbe.models.alignment.clock import LOWEST, _edge, _edge_of_delays
 
 EDGES = (0.42, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.5, 3.0, 4.5)
 

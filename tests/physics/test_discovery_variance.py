@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.variance.mixture import contaminated
-from abbe.models.discovery.variance.scatter_effects import VarianceFinding, candidates, extra_variance
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, candidates, contaminated, extra_variance
 from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import bar, campaign, circle, noise
 

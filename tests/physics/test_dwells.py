@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from abbe.models.alignment.dwell import Planned, detect, merged, named
-from abbe.models.alignment.stands import noise_of
+from abbe.models.alignment.dwell import Planned, detect, merged, named, noise_of
 
 SETTLE_S = 0.3
 

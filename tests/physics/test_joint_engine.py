@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from abbe.models.solvers.engine import repeat_noise_mm
 from abbe.models.solvers.joint import JointSolution, solve_joint
-from abbe.models.solvers.noise import repeat_noise_mm
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import predict, setup_unknowns
 from abbe.models.solvers.order import folds

@@ -10,8 +10,7 @@ from abbe.models.papers.kwon.errors import ExtrapolationRefused, SurfaceNotDeter
 from abbe.models.papers.kwon.forensics import square_grid
 from abbe.models.papers.kwon.geometry import Geometry
 from abbe.models.papers.kwon.kinematics import forward, inverse
-from abbe.models.papers.kwon.layout import FLATNESS, layout
-from abbe.models.papers.kwon.planes import parallel_planes
+from abbe.models.papers.kwon.layout import FLATNESS, layout, parallel_planes
 from abbe.models.papers.kwon.surface import fit_surface
 from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, regressors
 

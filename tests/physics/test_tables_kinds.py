@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.compensation.achievable import achievable
+from abbe.models.compensation.achievable import achievable, cross_only, positioning_only, squareness_tables
 from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import quantisation_mm
-from abbe.models.compensation.one_axis import cross_only, positioning_only, squareness_tables
 from abbe.models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
 from abbe.models.compensation.stages import Stage, applied, at_corrected_position, of_corrected_position, second_order_mm
 from abbe.models.compensation.summary import SQUARENESS, mean_linear

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from scipy import linalg
 
 from abbe.models.compensation.distances import inner_box_mm, random_pairs
-from abbe.models.compensation.grid import compensable_nodes, grid_table, nodes_mm
+from abbe.models.compensation.grid import blend, compensable_nodes, grid_table, nodes_mm
 from abbe.models.compensation.interpolation import trilinear
-from abbe.models.compensation.masking import blend
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observations import block_average
 from abbe.models.volumetric import remove_rigid, rigid_design

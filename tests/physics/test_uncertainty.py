@@ -14,10 +14,9 @@ from abbe.models.uncertainty.budget import budget_over
 from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
 from abbe.models.uncertainty.inputs import STEEL_PER_K, Inputs
 from abbe.models.uncertainty.mask import compensable_mask
-from abbe.models.uncertainty.order import omitted_prior_sd
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.response import response
-from abbe.models.uncertainty.sources import WORDS, error_sources
+from abbe.models.uncertainty.sources import WORDS, error_sources, omitted_prior_sd
 from abbe.models.volumetric import remove_rigid, volume_grid
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 

@@ -16,7 +16,7 @@ import httpx
 import pytest
 
 from abbe.service.channel.messages import PAGE_MEMORY_MB
-from abbe.service.core.limits import FIRST_TO_GO
+from abbe.service.core.web_process import FIRST_TO_GO
 from abbe.service.users.roles import Role
 from tests.system.test_serve_processes import YEARLY, Running, bench, ended
 

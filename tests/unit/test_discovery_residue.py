@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.answer import NamedEffect
-from abbe.models.discovery.finding import _confounded, _of_scatter
+from abbe.models.discovery.finding import _confounded, _of_scatter, residues
 from abbe.models.discovery.localization import Where
-from abbe.models.discovery.residue import residues
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.service.discovery.discovery_answer import _effect
 

@@ -11,17 +11,99 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from abbe.models.arrays import F1
+from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Where
 from abbe.models.discovery.noise import Colour
 from abbe.models.discovery.signal_localization import where_of_signal
-from abbe.models.discovery.variance.mixture import contaminated
-from abbe.models.discovery.variance.places import NEAR_MM, bound_to_places
 from abbe.models.discovery.variance.rough import gated_roughness, loud_windows
 from abbe.models.discovery.variance.spectrum import fast, line_of_axis
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
+
+# Readings that are off because of where the machine is, not because a beam was lost: those nearby are off as well.
+
+
+NEAR_MM, LOUD = 30.0, 3.0
+"""A reading so near tells of the same place; one counts up to so many standard deviations."""
+
+
+def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
+    """How far the readings near those that are off go along with them, standard deviations, and the middle of the place, (3,) mm.
+
+    A lost beam is off once: readings nearby, and at the same place at another time, know nothing of it, so that the first is within 3.
+
+    Parameters
+    ----------
+    q_mm : array, shape (n, 3)
+        Tool positions.
+    rest : array, shape (n,)
+        Whitened residuals; exact zeros are no readings.
+    off : array of bool, shape (n,)
+        Which of them are off.
+    """
+    total = count = most = 0.0
+    held, middle = np.clip(rest, -LOUD, LOUD), np.zeros(3)
+    for i in np.flatnonzero(off):
+        near = (np.linalg.norm(q_mm - q_mm[i], axis=1) < NEAR_MM) & (rest != 0.0)
+        along = np.sign(rest[i]) * held * near
+        total += float(along.sum() - along[i])
+        count += float(near.sum()) - 1.0
+        if float(along.sum()) > most:
+            most = float(along.sum())
+            middle = np.maximum(along, 0.0) @ q_mm / np.maximum(along, 0.0).sum()
+    return (total / np.sqrt(count) if count else 0.0), np.asarray(middle)
+
+
+# Few readings that are off: a mixture of noise and of something wider against noise alone.
+
+
+RATES = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.065])
+SIZES = np.geomspace(1.5, 60.0, 24)
+"""How far a reading that is off is off typically, in sigmas, to either side."""
+SPREAD = 0.4
+"""How much that differs from one to the next (standard deviation, share of it)."""
+SCALES = np.linspace(0.75, 1.1, 15)
+"""Noise of the good readings over the rms of all: free, or a wrong noise would look like outliers."""
+
+
+@dataclass(frozen=True)
+class Contaminated:
+    """Gain in log likelihood, share of readings that are off, by how much typically (sigmas) and its uncertainty."""
+
+    gain: float
+    rate: float
+    size: float
+    u_size: float
+
+
+def contaminated(rest: F1) -> Contaminated:
+    """Best mixture of noise and outliers for whitened residuals, shape (n,); the noise's size is fitted with and without."""
+    n = rest.size
+    core = np.sort(np.abs(rest))[: max(int(0.9 * n), 1)]
+    robust = float(np.median(core) / 0.6745 * 1.06)
+    plain = -0.5 * n * (np.log(np.mean(rest**2)) + 1.0)
+    best = Contaminated(0.0, 0.0, 0.0, 0.0)
+    square = rest**2
+    by_size = np.full(len(SIZES), -np.inf)
+    for scale in robust * SCALES:
+        good = np.exp(-0.5 * square / scale**2) / scale
+        for j, size in enumerate(SIZES):
+            wide = np.hypot(scale, SPREAD * size)
+            bad = 0.5 * (np.exp(-0.5 * ((rest - size) / wide) ** 2) + np.exp(-0.5 * ((rest + size) / wide) ** 2)) / wide
+            for rate in RATES:
+                gain = float(np.log((1.0 - rate) * good + rate * bad + 1e-300).sum()) - plain
+                by_size[j] = max(by_size[j], gain)
+                if gain > best.gain:
+                    best = Contaminated(gain, float(rate), float(size), 0.0)
+    if best.gain == 0.0:
+        return best
+    weight = np.exp(by_size - by_size.max())
+    mean = float(weight @ SIZES / weight.sum())
+    u = float(np.sqrt(weight @ (SIZES - mean) ** 2 / weight.sum()))
+    return Contaminated(best.gain, best.rate, best.size, max(u, 0.05 * best.size))
+
 
 UM = 1e3
 NAME_PRICE = 7.0

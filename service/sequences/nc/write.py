@@ -5,15 +5,82 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from abbe.models.machine import Machine
 from abbe.models.paths.circles import PLANES
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.nc.blocks import Program, program
-from abbe.service.sequences.nc.duration import Pace, Runtime, runtime
+from abbe.service.sequences.nc.blocks import Arc, Block, Dwell, Go, Program, Smooth, program
 from abbe.service.sequences.nc.gcode import DIALECTS, gcode
 from abbe.service.sequences.nc.heidenhain import heidenhain
 from abbe.service.sequences.nc.settings import NcSettings
-from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.sequences.steps import CampaignPlan, Point
+
+# How long an NC program runs: every block of it, as a controller drives it, not the plan's way at full feed.
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """What is taken for granted of a controller: acceleration along the path, and the time of an exact stop until the axes are in
+    position."""
+
+    acceleration_mm_s2: float = 500.0
+    stop_s: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Runtime:
+    """Seconds that the axes move (stops included) and that the program rests. What lies before the first position, and what people take
+    at a halt, is in neither."""
+
+    moving_s: float
+    resting_s: float
+
+    @property
+    def total_s(self) -> float:
+        """Both."""
+        return self.moving_s + self.resting_s
+
+
+def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
+    """Time of all blocks: each straight line or arc from standstill to standstill, those run through without a stop as one."""
+    moving, resting, here = 0.0, 0.0, None
+    smooth, run_mm, run_feed = False, 0.0, 0.0
+    for block in blocks:
+        match block:
+            case Dwell(seconds, _):
+                resting += seconds
+            case Smooth(on):
+                moving += one_move_s(run_mm, run_feed, pace) if run_mm else 0.0
+                smooth, run_mm = on, 0.0
+            case Go() | Arc():
+                way = _way_mm(block, here)
+                here = block.target_mm
+                if smooth and (run_feed == block.feed_mm_min or not run_mm):
+                    run_mm, run_feed = run_mm + way, block.feed_mm_min
+                else:
+                    moving += one_move_s(way, block.feed_mm_min, pace)
+    return Runtime(moving + (one_move_s(run_mm, run_feed, pace) if run_mm else 0.0), resting)
+
+
+def one_move_s(way_mm: float, feed_mm_min: float, pace: Pace) -> float:
+    """From standstill to standstill: speed up, go at the feed if there is way enough to reach it, slow down, stop exactly."""
+    if way_mm <= 0.0:
+        return 0.0
+    speed, rise = feed_mm_min / 60.0, pace.acceleration_mm_s2
+    if way_mm < speed**2 / rise:
+        return 2.0 * math.sqrt(way_mm / rise) + pace.stop_s
+    return way_mm / speed + speed / rise + pace.stop_s
+
+
+def _way_mm(block: Go | Arc, here: Point | None) -> float:
+    if isinstance(block, Go):
+        return 0.0 if here is None else math.dist(here, block.target_mm)
+    a, b = ("XYZ".index(c) for c in block.plane)
+    first, last = (math.atan2(p[b] - block.centre_mm[b], p[a] - block.centre_mm[a]) for p in (block.start_mm, block.target_mm))
+    turn = (last - first if block.positive else first - last) % (2.0 * np.pi)
+    return float(turn * math.hypot(block.start_mm[a] - block.centre_mm[a], block.start_mm[b] - block.centre_mm[b]))
+
 
 NAMES = (*DIALECTS, "heidenhain")
 

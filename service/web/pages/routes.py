@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 from dataclasses import fields
 from typing import Annotated
@@ -21,7 +22,6 @@ from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.login.authentication import Door
 from abbe.service.web.pages import times
-from abbe.service.web.pages.colours import themed
 from abbe.service.web.pages.desk import Desk, Source, can_be_stored, found
 from abbe.service.web.pages.proposals import approve_as, proposal_lines, proposal_screen
 from abbe.service.web.pages.result_routes import add_result_pages
@@ -29,6 +29,25 @@ from abbe.service.web.pages.results import discovery_lines, discovery_screen, re
 from abbe.service.web.pages.runs import STATES, TESTS, Wanted, newest_run, run_list, run_screen
 from abbe.service.web.pages.table import ends
 from abbe.service.web.problems import problem
+
+# The colours of the reports' pictures on a screen: of the figures, not of the page, and dark where the reader has chosen dark.
+
+
+_DARK = re.compile(r"@media screen and \(prefers-color-scheme:dark\)\{:root\{([^}]*)\}\}")
+
+
+def themed(rules: str) -> str:
+    """The rules of `abbe.service.rendering.palette.style_rules`, for figures of a page whose ``html`` says which scheme was chosen."""
+    found = _DARK.search(rules)
+    if found is None:
+        raise ValueError("the palette has no dark colours in the form that is expected here")
+    light = rules[: found.start()] + rules[found.end() :]
+    first = light.replace(":root{color-scheme:light dark;", ":root figure{", 1)
+    if first == light:
+        raise ValueError("the palette does not begin as is expected here")
+    asked = f"@media screen and (prefers-color-scheme:dark){{:root:not([data-theme=light]) figure{{{found[1]}}}}}"
+    return f"{first}\n{asked}\n:root[data-theme=dark] figure{{{found[1]}}}\n"
+
 
 LONGEST_FORM = 1024
 HOURS = (1.0, 8.0, 24.0, 72.0)

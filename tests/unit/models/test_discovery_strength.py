@@ -10,7 +10,7 @@ import pytest
 from numpy.polynomial import legendre
 
 from abbe.models.discovery.candidates import Pick
-from abbe.models.discovery.strength import TIME_TRUE_TO_FORM, shape_of, strength_of, true_to_form
+from abbe.models.discovery.finding import TIME_TRUE_TO_FORM, shape_of, strength_of, true_to_form
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.effect import Form
 from abbe.models.effects.smooth import WITH_CONSTANT, WITH_LINE

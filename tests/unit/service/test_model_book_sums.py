@@ -9,8 +9,7 @@ import pytest
 
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.campaign_data.packed_arrays import packed_covariance
-from abbe.service.effects.model_book import grown
-from abbe.service.effects.model_sums import total
+from abbe.service.effects.model_book import grown, total
 
 SOURCE = {"campaign": "c1", "discovery": "d1", "machine_digest": "m", "runs": [], "versions": {}}
 

@@ -10,7 +10,7 @@ from abbe.models.machine import Machine
 from abbe.service.capture.live import ANGLES, LONGEST, MOST_BATCHES, LiveFeed, angles_along
 from abbe.service.channel.messages import LARGEST_B, encode
 from abbe.service.clock import SystemClock
-from abbe.service.core.live import _message
+from abbe.service.core.web_process import _message
 from abbe.service.sequences.recipes.campaigns import hemisphere
 from abbe.service.sequences.recipes.recipe import Circle, Helix
 from abbe.service.sequences.steps import RecordPath

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.capture import locks, recovery
+from abbe.service.capture import recovery
+from abbe.service.capture import recovery as locks
 from abbe.service.capture.account import DAMAGED, TORN
 from abbe.service.capture.drafts import Drafter
 from abbe.service.capture.ingest import chunk_of

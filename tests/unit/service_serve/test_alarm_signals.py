@@ -27,9 +27,8 @@ from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import PushEntryRecord, VerificationRecord
-from abbe.service.verification.alarm_signals import Terms, found_in
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Kind
-from abbe.service.verification.alarms import acknowledge, alarms_of, open_alarms, series_begins
+from abbe.service.verification.alarms import Terms, acknowledge, alarms_of, found_in, open_alarms, series_begins
 from tests.unit.service_serve.fakes import FakeClock, FakeWatcher, Result, utc
 
 START = utc(2026, 3, 1, 5)

@@ -25,8 +25,7 @@ from abbe.service.errors import StoreError, TableMismatch
 from abbe.service.jobs.guided_campaign import Led
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.prompts import Prompts
+from abbe.service.sequences.control import Control, Prompts
 from abbe.service.web.core_link.board import Board
 from tests.patience import within
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc

@@ -12,7 +12,7 @@ from abbe.service.capture.live import LiveFeed
 from abbe.service.channel.messages import LivePath, LiveSamples, from_core
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
-from abbe.service.core.live import show_live
+from abbe.service.core.web_process import show_live
 from tests.patience import within
 from tests.unit.service_capture.test_live import QUARTER, SETUP, batch
 

@@ -19,7 +19,7 @@ from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web import words
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.board import Board
-from abbe.service.web.headers import HEADERS
+from abbe.service.web.document import HEADERS
 from abbe.service.web.page import figure_verdict
 from abbe.service.web.schemas import Verification
 from abbe.service.web.trend import Point, trend_svg

@@ -17,7 +17,7 @@ from abbe.service.scheduler.slots import Schedule
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.board import Board
-from abbe.service.web.headers import HEADERS
+from abbe.service.web.document import HEADERS
 from abbe.service.web.listening import check_exposure
 from abbe.service.web.login.access import MUTATING, PUBLIC, Open, cells, needs
 from abbe.service.web.login.auth_middleware import CSRF_HEADER

@@ -17,8 +17,8 @@ from fastapi.responses import PlainTextResponse
 from abbe.service.web import problems
 from abbe.service.web.listening import bind
 from abbe.service.web.login import connections
-from abbe.service.web.process import server
-from abbe.service.web.process.server import Server, make_server
+from abbe.service.web.process import serving as server
+from abbe.service.web.process.serving import Server, make_server
 from tests.system.test_serve_users import certificate
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]

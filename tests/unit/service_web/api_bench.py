@@ -39,7 +39,7 @@ from abbe.service.web.core_link.board import Board
 from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
-from abbe.service.web.process.server import make_server
+from abbe.service.web.process.serving import make_server
 from abbe.service.web.view import View
 from tests.unit.service.discovery_bench import MACHINE, Search, write_case
 

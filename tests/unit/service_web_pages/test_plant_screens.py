@@ -16,8 +16,8 @@ from abbe.service.clock import SystemClock
 from abbe.service.scheduler.fleet import Figure, MachineLine
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web.app import create_app
-from abbe.service.web.pages.blanking import HIDDEN, blanked, blanked_doc, blanked_line
 from abbe.service.web.pages.devices import device_screen
+from abbe.service.web.pages.diagnostics import HIDDEN, blanked, blanked_doc, blanked_line
 from abbe.service.web.pages.fleet import Asked, FleetLine, fleet_csv, fleet_lines
 from abbe.service.web.schemas import Device
 from abbe.service.web.view import View

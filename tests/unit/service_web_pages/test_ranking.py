@@ -12,7 +12,7 @@ from abbe.models.machine import Machine
 from abbe.models.volumetric import remove_rigid, volume_grid
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
-from abbe.service.web.pages.ranking import NODES, Ranked, ranking
+from abbe.service.web.pages.results import NODES, Ranked, ranking
 from tests.pages_world import solved_campaign
 
 POINTS_ALONE = ("EYY", "ECZ", "EXX", "C0Y")
