@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from abbe.models.machine import Machine as Machine
     from abbe.public.campaign import read_campaign as read_campaign
     from abbe.public.campaign import read_errors as read_errors
-    from abbe.public.discovery import Answer as Answer
+    from abbe.public.discovery import DiscoveryAnswer as DiscoveryAnswer
     from abbe.public.discovery import discover as discover
     from abbe.public.estimates import Estimate as Estimate
     from abbe.public.picture import Picture as Picture
-    from abbe.public.simulation import Instruments as Instruments
+    from abbe.public.simulation import SimulatedInstruments as SimulatedInstruments
     from abbe.public.simulation import simulate as simulate
     from abbe.public.solution import Deviation as Deviation
     from abbe.public.solution import Solution as Solution
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 _WHERE = {
     "AbbeError": "abbe.service.errors",
-    "Answer": "abbe.public.discovery",
+    "DiscoveryAnswer": "abbe.public.discovery",
     "Campaign": "abbe.service.campaign_data.campaign_folder",
     "CampaignPlan": "abbe.service.sequences.steps",
     "Circle": "abbe.service.sequences.recipes.bar_recipes",
@@ -61,7 +61,7 @@ _WHERE = {
     "Estimate": "abbe.public.estimates",
     "Form": "abbe.models.effects.effect",
     "Helix": "abbe.service.sequences.recipes.bar_recipes",
-    "Instruments": "abbe.public.simulation",
+    "SimulatedInstruments": "abbe.public.simulation",
     "Legendre": "abbe.models.functions.legendre",
     "Linear": "abbe.service.sequences.recipes.laser_recipes",
     "Machine": "abbe.models.machine",

@@ -16,7 +16,7 @@ U_REPEAT_MM = 1e-4
 
 
 @dataclass(frozen=True)
-class Figure:
+class VerificationFigure:
     """A measured figure, mm, its standard uncertainty, and the curve it comes from (position along the test, deviation; mm)."""
 
     value_mm: float
@@ -25,7 +25,7 @@ class Figure:
     deviation_mm: F1
 
 
-def diagonal_figure(run: RunData) -> Figure:
+def diagonal_figure(run: RunData) -> VerificationFigure:
     """Range of the mean of out and back along a body diagonal, with its uncertainty (ISO 230-6 style).
 
     The scatter of half the difference out - back about its mean (which is lost motion) gives the noise; the wavelength adds its share of
@@ -44,10 +44,10 @@ def diagonal_figure(run: RunData) -> Figure:
     half = np.array([(out[p] - back[p]) / 2 for p in both])
     scatter = float(np.std(half, ddof=1))  # of a mean of two readings, like the mean itself
     length = both[-1] - both[0]
-    return Figure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_WAVELENGTH * length)), np.array(both), mean)
+    return VerificationFigure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_WAVELENGTH * length)), np.array(both), mean)
 
 
-def helix_figure(run: RunData) -> Figure:
+def helix_figure(run: RunData) -> VerificationFigure:
     """Rms of the bar deviation after the cup offset and the bar length are fitted away; abscissa: path index.
 
     What is left is the machine's error about this centre, not the mounting. Uncertainty: the noise of the block means (second
@@ -60,4 +60,4 @@ def helix_figure(run: RunData) -> Figure:
     rms = float(np.sqrt(np.mean(left**2)))
     second = left[2:] - 2 * left[1:-1] + left[:-2]
     noise = float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6.0))
-    return Figure(rms, float(np.hypot(noise / np.sqrt(len(left)), U_REPEAT_MM)), np.arange(len(left), dtype=np.float64), left)
+    return VerificationFigure(rms, float(np.hypot(noise / np.sqrt(len(left)), U_REPEAT_MM)), np.arange(len(left), dtype=np.float64), left)

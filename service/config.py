@@ -28,7 +28,7 @@ Origin = Literal["default", "file", "environment"]
 
 
 @dataclass(frozen=True, slots=True)
-class Loaded:
+class LoadedMachine:
     """A machine file with everything that decides its values.
 
     Parameters
@@ -62,7 +62,7 @@ class _Environment(MachineFile, BaseSettings):
     model_config = SettingsConfigDict(env_prefix=PREFIX, env_nested_delimiter="__", extra="forbid")
 
 
-def load_machine(path: Path | str) -> Loaded:
+def load_machine(path: Path | str) -> LoadedMachine:
     """Read and check a machine file.
 
     Parameters
@@ -91,7 +91,7 @@ def load_machine(path: Path | str) -> Loaded:
         raise _config_error(path, err.errors(), from_environment) from None
     origins: dict[str, Origin] = dict.fromkeys((key for key, _ in _leaves(from_file)), "file")
     origins |= dict.fromkeys((key for key, _ in _leaves(from_environment)), "environment")
-    return Loaded(path, machine, origins)
+    return LoadedMachine(path, machine, origins)
 
 
 def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:

@@ -26,14 +26,14 @@ from abbe.service.audit.chain import Event
 from abbe.service.campaigns.builtin_recipes import parted
 from abbe.service.channel.messages import PROTOCOL, Begin, NeedsTold, RulesTold, ScheduleTold
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.core.campaigns import Campaigns
+from abbe.service.core.campaigns import CampaignJobs
 from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
-from abbe.service.core.jobs import JobBook
+from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders
 from abbe.service.core.push_recovery import OpenEnds
 from abbe.service.core.rights import may, may_measure
-from abbe.service.core.setup import Setup
-from abbe.service.core.snapshot import Moments
+from abbe.service.core.setup import ServiceSetup
+from abbe.service.core.snapshot import SnapshotSource
 from abbe.service.core.systemd import notify
 from abbe.service.core.table_watch import TableWatch
 from abbe.service.core.watch import BoardWatch, StateTeller, VerifiedWatch
@@ -46,7 +46,7 @@ from abbe.service.plant.gather import Gatherer
 from abbe.service.scheduler.alarm_manager import AlarmManager, Telling
 from abbe.service.scheduler.heartbeat import Station
 from abbe.service.scheduler.job import CheckJob
-from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.store import ServiceStore
@@ -78,7 +78,7 @@ EVERYWHERE = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - compared with, not
 class Service:
     """All parts of the running service, wired. The store is open and the port is taken, or this object does not exist."""
 
-    def __init__(self, setup: Setup, store: ServiceStore, listening: socket.socket, clock: Clock) -> None:
+    def __init__(self, setup: ServiceSetup, store: ServiceStore, listening: socket.socket, clock: Clock) -> None:
         self._setup = setup
         self._store = store
         self._clock = clock
@@ -95,13 +95,13 @@ class Service:
         desk = self._make_desk(book, watchers)
         job = CheckJob(setup.machine, setup.check(store), self._shelf, watchers, clock, desk.checked if desk is not None else None)
         recipes = tuple(dict.fromkeys([*setup.recipes, *(parted(schedule.recipe)[0] for schedule in setup.schedules)]))
-        self._jobs = JobBook(job.run, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed)
+        self._jobs = JobRegistry(job.run, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed)
         if setup.campaign is not None:
-            campaigns = Campaigns(setup.machine, setup.campaigns, setup.campaign(store), book, watchers)
+            campaigns = CampaignJobs(setup.machine, setup.campaigns, setup.campaign(store), book, watchers)
             self._jobs.full = campaigns.full(lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE))
-        terms = Terms(setup.maintenance, setup.ready(clock), errands=desk, carry=self._jobs.errand)
+        terms = LoopTerms(setup.maintenance, setup.ready(clock), errands=desk, carry=self._jobs.errand)
         self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._jobs, self._shelf, clock, terms)
-        moments = Moments(self.board, self._jobs, self._scheduler.next_due, clock)
+        moments = SnapshotSource(self.board, self._jobs, self._scheduler.next_due, clock)
         orders = self._make_orders(book, watchers)
         begin = self._begin((*recipes, *self._jobs.full.names))
         self._web = WebProcess(begin, listening, moments.now, self._jobs, clock, setup.live, orders)
@@ -252,7 +252,7 @@ class Service:
             await self._clock.sleep(watchdog_us / 2e6 if watchdog_us else 3600.0)
 
 
-def serve(setup: Setup, *, once: bool = False, clock: Clock | None = None) -> int:
+def serve(setup: ServiceSetup, *, once: bool = False, clock: Clock | None = None) -> int:
     """Run the service until SIGTERM or Ctrl-C; return the exit code: 0, or 1 if a check asked for by ``once`` did not pass.
 
     Raises
@@ -277,7 +277,7 @@ def serve(setup: Setup, *, once: bool = False, clock: Clock | None = None) -> in
     return 0 if passed else 1
 
 
-async def _main(setup: Setup, once: bool, clock: Clock, cut_off: threading.Timer, last_words: list[LastWords]) -> bool:
+async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threading.Timer, last_words: list[LastWords]) -> bool:
     stop = asyncio.Event()
 
     def on_signal(name: str) -> None:

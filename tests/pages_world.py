@@ -49,7 +49,7 @@ from abbe.service.web.core_link.board import Board
 from abbe.service.web.core_link.logtail import LogTail
 from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
-from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
+from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.process.serving import make_server
 from abbe.service.web.view import View
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
@@ -221,7 +221,7 @@ class Served:
     filled: Filled
     store: ServiceStore
     people: People
-    door: Door
+    door: Authenticator
     board: Board
     tail: LogTail
 
@@ -235,7 +235,7 @@ def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
         for name, role in USERS.items() if users else ():
             if store.user(name) is None:
                 people.add(name, role, PHRASE)
-        door = Door(store, people, AuditBook(store, filled.url), rate_hz=1e6, burst=1e6)
+        door = Authenticator(store, people, AuditBook(store, filled.url), rate_hz=1e6, burst=1e6)
         board = Board(filled.devices, clock)
         soon = datetime.now(UTC) + timedelta(hours=30)
         view = View(filled.machine, "0.1.0", board, store, lambda: [(s, soon) for s in filled.schedules], "", clock)

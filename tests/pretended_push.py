@@ -7,7 +7,7 @@ from typing import Any
 from abbe.drivers.cnc.tables import crc32
 from abbe.service.clock import Clock
 from abbe.service.push.book import StoreBook
-from abbe.service.push.states import S, State
+from abbe.service.push.states import PushState, S
 from abbe.service.storage.store import Store
 
 UP_TO_ACTIVE = (S.SNAPSHOT, S.VALIDATED, S.APPROVED, S.LEASED, S.STAGING, S.STAGED, S.ACTIVATING, S.PROBATION)
@@ -21,7 +21,7 @@ async def as_if_pushed(
     machine: str,
     doc: dict[str, Any],
     images: tuple[bytes, bytes],
-    states: tuple[State, ...],
+    states: tuple[PushState, ...],
     control: str = "",
 ) -> None:
     """Write the entries. ``images``: of the table that goes and of the one that comes; ``doc``: what is kept with the latter; ``control``:

@@ -10,7 +10,7 @@ from typing import Any
 from abbe.models.effects.effect import Effect
 from abbe.public.estimates import Estimate
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.discovery.discover import Job, Journal, prepare
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, prepare
 from abbe.service.discovery.discover import discover as run_discovery
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_words import UNITS
@@ -22,7 +22,7 @@ from abbe.service.report.discovery_pages import discovery_page, page_facts
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class DiscoveryAnswer:
     """What a discovery found. Made by `discover`.
 
     Attributes
@@ -43,8 +43,8 @@ class Answer:
     effects: dict[str, Estimate]
     gap: dict[str, dict[str, float]]
     next_measurement: dict[str, Any] | None
-    _job: Job
-    _journal: Journal
+    _job: DiscoveryJob
+    _journal: DiscoveryJournal
     _finding: dict[str, Any]
 
     def report(self, target: str | Path) -> None:
@@ -62,7 +62,7 @@ class Answer:
         return f"<abbe.Answer: {self.verdict}, {', '.join(self.effects) or 'no effect'}>"
 
 
-def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: ProgressSink | None = None) -> Answer:
+def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: ProgressSink | None = None) -> DiscoveryAnswer:
     """Find where measurement and simulation disagree, and name the missing effect.
 
     Parameters
@@ -81,10 +81,10 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     """
     known = catalogue()
     job = prepare(campaign, (*known, *checked(effects, {e.name for e in known})))
-    journal = Journal()
+    journal = DiscoveryJournal()
     finding = run_discovery(job, journal, search, progress or _silent)
     found = {e["label"]: Estimate(e["strength"], e["u_strength"], UNITS.get(e["unit"], e["unit"]), "observed") for e in finding["effects"]}
-    return Answer(finding["verdict"], found, finding["gaps"], finding["next_test"], job, journal, finding)
+    return DiscoveryAnswer(finding["verdict"], found, finding["gaps"], finding["next_test"], job, journal, finding)
 
 
 def _silent(_: Progress) -> None:

@@ -32,7 +32,7 @@ SETUP_S = 300.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Instruments:
+class SimulatedInstruments:
     """Standard deviations of what a simulated campaign draws.
 
     ``bar_noise_mm``, ``laser_noise_mm``: of one reading; ``cup_mm``: of each component of the place where a cup is mounted;
@@ -53,7 +53,7 @@ def simulate(
     *,
     effects: Mapping[str, float] | None = None,
     own_effects: tuple[Effect, ...] = (),
-    instruments: Instruments | None = None,
+    instruments: SimulatedInstruments | None = None,
     seed: int = 1,
 ) -> Campaign:
     """Simulate the runs of a plan on a machine with known errors, to first order.
@@ -69,7 +69,7 @@ def simulate(
         Label and signed strength in the effect's unit, e.g. ``{"backlash:X": 6.0}`` (µm). Non-linear parameters have their usual values.
     own_effects : tuple of Effect, optional
         Known beside the catalogue.
-    instruments : Instruments, optional
+    instruments : SimulatedInstruments, optional
     seed : int
         Equal seeds draw equal campaigns.
 
@@ -85,14 +85,14 @@ def simulate(
     ConfigError
         A recipe does not fit the machine.
     """
-    tools, rng = instruments or Instruments(), np.random.default_rng(seed)
+    tools, rng = instruments or SimulatedInstruments(), np.random.default_rng(seed)
     known = catalogue()
     known = (*known, *checked(own_effects, {e.name for e in known}))
     wanted = [_effect(label, strength, known) for label, strength in (effects or {}).items()]
     tests = plan.tests if isinstance(plan, CampaignPlan) else tuple(recipe.plan(machine) for recipe in plan)
     doc = machine_doc(NAME, machine)
     name = plan.name if isinstance(plan, CampaignPlan) else NAME
-    world = _World(machine, errors, tools, rng, float(rng.normal(0.0, tools.bar_length_mm)), {})
+    world = _SimulatedMachine(machine, errors, tools, rng, float(rng.normal(0.0, tools.bar_length_mm)), {})
     runs, clock_s = [], 0.0
     for test in tests:
         clock_s += SETUP_S if test.mounts else 0.0
@@ -112,12 +112,12 @@ def simulate(
 
 
 @dataclass(frozen=True)
-class _World:
+class _SimulatedMachine:
     """The machine and the instruments as drawn: one bar, and one place for each cup."""
 
     machine: Machine
     errors: ErrorMotions
-    tools: Instruments
+    tools: SimulatedInstruments
     rng: np.random.Generator
     bar_mm: float
     cups: dict[str, F1]
@@ -171,7 +171,7 @@ def _coefficient(effect: Effect, strength: float, values: Values) -> float:
     return float(brentq(above, -reach, reach, xtol=1e-12))
 
 
-def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, tools: Instruments) -> dict[str, Any]:
+def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, tools: SimulatedInstruments) -> dict[str, Any]:
     """An ``abbe-run/1`` object without readings."""
     rows = [_path_rows(step, begins_s, tools) for step in test.steps if isinstance(step, RecordPath)] or [_standing_rows(test, begins_s)]
     t_s, q_mm, feed, direction = rows[0]
@@ -185,7 +185,7 @@ _Rows = tuple[F1, F2, F1, F1]
 """Time, commanded positions, feed in mm/min, direction."""
 
 
-def _path_rows(step: RecordPath, begins_s: float, tools: Instruments) -> _Rows:
+def _path_rows(step: RecordPath, begins_s: float, tools: SimulatedInstruments) -> _Rows:
     """Rows along a polyline at constant feed; feed-in and feed-out are driven and not read."""
     points = np.asarray(step.points_mm)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

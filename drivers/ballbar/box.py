@@ -26,9 +26,9 @@ class Box:
 
     def __init__(self, name: str, talk: Conversation, serial_no: int | None) -> None:
         self.boot_id: int | None = None
-        self.settings: frames.Settings | None = None
+        self.settings: frames.BoxSettings | None = None
         self._name, self._talk, self._serial_no = name, talk, serial_no
-        self._first: frames.Settings | None = None
+        self._first: frames.BoxSettings | None = None
         self._max_rate_hz = 0
 
     @property

@@ -55,10 +55,10 @@ class Conversation:
             raise BadFrame(self._name, "identify", "an ACK came instead of the INFO", "is this a ball-bar box of protocol version 1?")
         return answer
 
-    async def settings(self) -> frames.Settings:
+    async def settings(self) -> frames.BoxSettings:
         """Ask how the box reads (firmware 1.1 and later); errors as for ``who``."""
         answer = await self._ask(frames.read_settings_command, "read settings")
-        if not isinstance(answer, frames.Settings):
+        if not isinstance(answer, frames.BoxSettings):
             raise BadFrame(self._name, "read settings", "an ACK came instead of the SETTINGS", "is the firmware really 1.1 or later?")
         return answer
 

@@ -301,7 +301,7 @@ class SerialBallBar:
         return "streaming" if self._streaming else "ready"
 
     @property
-    def settings(self) -> frames.Settings | None:
+    def settings(self) -> frames.BoxSettings | None:
         """Unit, range and zero of the box as it told them last; None before it was identified, and of firmware 1.0, which does not tell."""
         return self._box.settings
 

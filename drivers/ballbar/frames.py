@@ -52,7 +52,7 @@ class Ack:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class BoxSettings:
     """How the box reads: ``number`` counts the changes since it was switched on and stands in bits 8 to 15 of every sample's status.
 
     ``unit`` is ``NANOMETRE`` or ``TENTH_MICROINCH``; ``range_nm`` the stroke to either side; ``zero_nm`` what is taken off every reading.
@@ -73,7 +73,7 @@ class Bad:
     n_bytes: int
 
 
-Answer = Info | Ack | Settings
+Answer = Info | Ack | BoxSettings
 Frame = BarSample | Answer | Bad
 
 
@@ -121,7 +121,7 @@ def configure_command(tag: int, unit: int, range_nm: int, zero_nm: int) -> bytes
     return encode(CONFIGURE, _SETTINGS.pack(tag, 0, unit, range_nm, zero_nm))
 
 
-def reading_text(settings: Settings) -> str:
+def reading_text(settings: BoxSettings) -> str:
     """Say how a box reads, for errors."""
     unit = "nm" if settings.unit == NANOMETRE else "0.1 microinch"
     return f"unit {unit}, range {settings.range_nm / 1e6:g} mm, zero {settings.zero_nm} nm"
@@ -203,7 +203,7 @@ def _frame(kind: int, data: bytes, payload_at: int, n_bytes: int) -> Frame:
     if kind == ACK:
         return Ack(*_ACK.unpack_from(data, payload_at))
     if kind == SETTINGS:
-        return Settings(*_SETTINGS.unpack_from(data, payload_at))
+        return BoxSettings(*_SETTINGS.unpack_from(data, payload_at))
     if kind == INFO:
         tag, boot_id, serial_no, firmware, max_rate_hz, rate_hz, model = _INFO.unpack_from(data, payload_at)
         return Info(tag, boot_id, serial_no, firmware, max_rate_hz, rate_hz, model.rstrip(b"\x00").decode("ascii", "replace"))

@@ -25,7 +25,7 @@ _LOSS_FLOOR = 10_000  # samples: a burst at the very beginning is judged as if t
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class SampleRun:
     """Samples without a gap between them, after ``missing`` lost ones."""
 
     missing: int
@@ -43,7 +43,7 @@ class Reads:
 class SegmentEnd(Exception):  # noqa: N818 - an event, not a mistake
     """Nothing after this may be joined to what came before; ``runs`` is what was good until then."""
 
-    runs: list[Run]
+    runs: list[SampleRun]
 
 
 class SequenceRestart(SegmentEnd):
@@ -98,7 +98,7 @@ class SequenceTracker:
         """True when the run as it stands has lost more than 0.1 %."""
         return self.lost > _MAX_LOSS * (self.lost + self.accepted)
 
-    def accept(self, samples: list[BarSample]) -> list[Run]:
+    def accept(self, samples: list[BarSample]) -> list[SampleRun]:
         """Sort samples into runs without gaps; drop and count duplicates, latecomers and what cannot be.
 
         Raises
@@ -125,7 +125,7 @@ class SequenceTracker:
             raise
         return _frozen(runs)
 
-    def rest(self) -> list[Run]:
+    def rest(self) -> list[SampleRun]:
         """The sample that is still weighed when the stream has ended: given as it came, since nothing more will tell."""
         held, self._held = self._held, None
         runs: _Runs = []
@@ -234,5 +234,5 @@ class SequenceTracker:
         return (held, sample)
 
 
-def _frozen(runs: _Runs) -> list[Run]:
-    return [Run(missing, tuple(samples)) for missing, samples in runs]
+def _frozen(runs: _Runs) -> list[SampleRun]:
+    return [SampleRun(missing, tuple(samples)) for missing, samples in runs]

@@ -8,7 +8,7 @@ from collections import deque
 from contextlib import suppress
 
 from abbe.drivers.api import BarBatch, BarSample, BarTap
-from abbe.drivers.ballbar.sequence import Reads, Run, SegmentEnd, SequenceTracker
+from abbe.drivers.ballbar.sequence import Reads, SampleRun, SegmentEnd, SequenceTracker
 from abbe.drivers.errors import Backpressure, BadFrame, DriverError, LossyLine
 
 STOP_FILL = 0.8
@@ -106,7 +106,7 @@ class Stream:
             "keep the cable away from drives and motors, check its shield and plugs, then measure again",
         )
 
-    def _take(self, host_s: float, runs: list[Run], *, overran: bool) -> None:
+    def _take(self, host_s: float, runs: list[SampleRun], *, overran: bool) -> None:
         for run in runs:
             batch = BarBatch(host_s, run.samples, run.missing, self._boot_id, overran and bool(run.missing))
             if self.tap is not None:

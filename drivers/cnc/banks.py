@@ -8,7 +8,7 @@ from abbe.drivers.api import CompStatus
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.errors import BadFrame, DeviceFault, Refused
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.numbered import next_number, run_numbered
 from abbe.drivers.links.words import bytes_of, words_of
 
@@ -54,7 +54,7 @@ class Banks:
             raise Refused(self._name, "write bank", f"{len(image)} bytes are not an image of 1..{reg.BANK_REGISTERS} registers")
         words = words_of(image)
         for first in range(0, len(words), _WINDOW):
-            await self._session.link.write(base + first, words[first : first + _WINDOW], Op.NUMBERED)
+            await self._session.link.write(base + first, words[first : first + _WINDOW], ModbusOperation.NUMBERED)
 
     async def read(self, bank: int, n_bytes: int | None) -> bytes:
         """See ``ModbusController.read_bank``."""
@@ -73,7 +73,7 @@ class Banks:
     async def write_part(self, bank: int, first: int, data: bytes) -> None:
         """See ``ModbusController.write_part``."""
         base = self._part(bank, "write part of bank", first, len(data))
-        await self._session.link.write(base + first, words_of(data), Op.NUMBERED)
+        await self._session.link.write(base + first, words_of(data), ModbusOperation.NUMBERED)
 
     async def read_part(self, bank: int, first: int, n_bytes: int) -> bytes:
         """See ``ModbusController.read_part``."""
@@ -134,7 +134,7 @@ class Banks:
             raise Refused(self._name, operation, str(error)) from None
 
         async def write() -> None:
-            await self._session.link.write(reg.COMP_ADDRESS, words, Op.NUMBERED)
+            await self._session.link.write(reg.COMP_ADDRESS, words, ModbusOperation.NUMBERED)
 
         async def acknowledge() -> tuple[int, int]:
             nonlocal counts

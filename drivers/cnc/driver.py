@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from abbe.drivers.api import CompStatus, ControllerStatus, DeviceInfo, Point, TableFormat
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.banks import Banks
-from abbe.drivers.cnc.motion import Motion
+from abbe.drivers.cnc.motion import MotionCommands
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.links.modbus_link import ModbusLink
 
@@ -27,7 +27,7 @@ class ModbusController:
 
     def __init__(self, link: ModbusLink) -> None:
         self._session = ControllerSession(link)
-        self._motion = Motion(self._session)
+        self._motion = MotionCommands(self._session)
         self._banks = Banks(self._session)
         self.name = link.name
         self.incidents = link.incidents

@@ -11,7 +11,7 @@ from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.registers import Bit
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.numbered import next_number, run_numbered
 from abbe.drivers.links.shielded import run_to_end
 
@@ -22,7 +22,7 @@ _INTERLOCK = 2
 _STOP_S = 5.0
 
 
-class Motion:
+class MotionCommands:
     """Motion commands, path FIFO and feed hold of one controller.
 
     Parameters
@@ -78,7 +78,7 @@ class Motion:
 
     async def request_hold(self, level: int) -> None:
         """Write the level of HOLD_REQUEST. It is a level, not an event: writing it again changes nothing, so the link may repeat it."""
-        await self._session.link.write(reg.HOLD_ADDRESS, (level,), Op.LEVEL)
+        await self._session.link.write(reg.HOLD_ADDRESS, (level,), ModbusOperation.LEVEL)
 
     async def abort(self) -> None:
         """See ``ModbusController.abort``."""
@@ -103,7 +103,7 @@ class Motion:
     async def _hold_on_trouble(self) -> AsyncIterator[None]:
         try:
             yield
-        except (Refused, _Stopped):
+        except (Refused, _MotionStopped):
             raise  # nothing moves on our account
         except BaseException as error:
             # Cancelled, timed out, link lost, alarm: whatever the reason, the axes must not run on unattended.
@@ -143,7 +143,7 @@ class Motion:
                 raise Refused(self._name, operation, str(error)) from None
 
             async def write() -> None:
-                await self._session.link.write(reg.MOTION_ADDRESS, words, Op.NUMBERED)
+                await self._session.link.write(reg.MOTION_ADDRESS, words, ModbusOperation.NUMBERED)
 
             async def acknowledge() -> tuple[int, int]:
                 now = await self._session.status()
@@ -165,7 +165,7 @@ class Motion:
             if status.motion_done_seq == number:
                 return status
             if status.bits & Bit.FEED_HOLD:
-                raise _Stopped(self._name, "move", "stopped by feed hold", "resume or abort when it is safe")
+                raise _MotionStopped(self._name, "move", "stopped by feed hold", "resume or abort when it is safe")
             if status.motion_ack_seq != number:
                 detail = f"command {number} was overtaken by {status.motion_ack_seq}"
                 raise DeviceFault(self._name, "move", detail, "is another program moving this machine?")
@@ -185,7 +185,7 @@ class Motion:
             number = next_number((await self._session.status()).fifo_ack_seq)
 
             async def write() -> None:
-                await self._session.link.write(reg.FIFO_ADDRESS, reg.encode_fifo(number, points), Op.NUMBERED)
+                await self._session.link.write(reg.FIFO_ADDRESS, reg.encode_fifo(number, points), ModbusOperation.NUMBERED)
 
             async def acknowledge() -> tuple[int, int]:
                 now = await self._session.status()
@@ -209,5 +209,5 @@ def _with_notes(error: DriverError, former: BaseException) -> DriverError:
     return error
 
 
-class _Stopped(DeviceFault):
+class _MotionStopped(DeviceFault):
     """The controller is in feed hold already: asking for it once more could undo an abort that is under way."""

@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 from enum import IntFlag
 
 from abbe.drivers.api import CompStatus, ControllerStatus, Point
-from abbe.drivers.links.words import Block, Register, words_of
+from abbe.drivers.links.words import Register, RegisterBlock, words_of
 
 MAP_VERSION = 1
 COUNTS_PER_MM = 100_000  # 10 nm
 FEED_PER_MM_MIN = 100  # 0.01 mm/min
 MAX_CHUNK = 19
 
-IDENTITY = Block(
+IDENTITY = RegisterBlock(
     0,
     13,
     (
@@ -30,9 +30,9 @@ IDENTITY = Block(
         Register(12, "u16", "FIFO_SIZE"),
     ),
 )
-SEQLOCK = Block(5, 4, (Register(5, "u32", "BOOT_ID"), Register(7, "u32", "GEN")), lead=5)
+SEQLOCK = RegisterBlock(5, 4, (Register(5, "u32", "BOOT_ID"), Register(7, "u32", "GEN")), lead=5)
 
-STATUS = Block(
+STATUS = RegisterBlock(
     16,
     48,
     (
@@ -57,7 +57,7 @@ STATUS = Block(
     lead=16,
 )
 
-COMP_STATUS = Block(
+COMP_STATUS = RegisterBlock(
     208,
     16,
     (

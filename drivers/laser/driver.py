@@ -10,7 +10,7 @@ from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, Wr
 from abbe.drivers.laser import registers as reg
 from abbe.drivers.links.identity import check_clock, check_identity
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.numbered import next_number, run_numbered
 
 _POLL_S = 0.005
@@ -189,7 +189,7 @@ class ModbusLaser:
             number = next_number(acknowledged)
 
             async def write() -> None:
-                await self._link.write(reg.COMMAND_ADDRESS, (number, command, argument), Op.NUMBERED)
+                await self._link.write(reg.COMMAND_ADDRESS, (number, command, argument), ModbusOperation.NUMBERED)
 
             result = await run_numbered(self.name, operation, number, write, self._read_ack)
         if result:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from abbe.drivers.api import LaserReading
-from abbe.drivers.links.words import Block, Register
+from abbe.drivers.links.words import Register, RegisterBlock
 
 MAP_VERSION = 1
 
-IDENTITY = Block(
+IDENTITY = RegisterBlock(
     0,
     9,
     (
@@ -21,7 +21,7 @@ IDENTITY = Block(
     ),
 )
 
-READING = Block(
+READING = RegisterBlock(
     10,
     18,
     (
@@ -38,7 +38,7 @@ READING = Block(
     lead=10,
 )
 
-ACKNOWLEDGE = Block(43, 2, (Register(43, "u16", "CMD_ACK_SEQ"), Register(44, "u16", "CMD_RESULT")), lead=3)
+ACKNOWLEDGE = RegisterBlock(43, 2, (Register(43, "u16", "CMD_ACK_SEQ"), Register(44, "u16", "CMD_RESULT")), lead=3)
 
 COMMAND_ADDRESS = 40
 ZERO, CLEAR_BEAM, ENVIRONMENT = 1, 2, 3

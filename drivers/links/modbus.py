@@ -47,14 +47,14 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ModbusReply:
     """A reply that answers its request: the registers of a read, or the exception code."""
 
     registers: tuple[int, ...] = ()
     exception: int = 0
 
 
-class Wire:
+class ModbusWire:
     """At most one connection at a time to one unit.
 
     Parameters
@@ -107,7 +107,7 @@ class Wire:
         self._client = client
         self._keep_alive()
 
-    async def ask(self, request: Request, timeout_s: float) -> Answer:
+    async def ask(self, request: Request, timeout_s: float) -> ModbusReply:
         """Send a request once and wait for its answer.
 
         Raises
@@ -134,7 +134,7 @@ class Wire:
             raise LinkDown(self.name, str(request), str(trouble), "device and network on?") from trouble
         finally:
             self._deadline = None
-        return Answer(exception=reply.exception_code) if reply.isError() else Answer(tuple(reply.registers))
+        return ModbusReply(exception=reply.exception_code) if reply.isError() else ModbusReply(tuple(reply.registers))
 
     async def drop(self) -> None:
         """Close the connection, if there is one, and see it closed: a device that allows one socket must never see two."""

@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass
 
 from abbe.drivers.errors import BadFrame, LinkDown, ReplyTimeout
-from abbe.drivers.links.modbus import READ_HOLDING, READ_INPUT, WRITE, Answer, Request, Wire
+from abbe.drivers.links.modbus import READ_HOLDING, READ_INPUT, WRITE, ModbusReply, ModbusWire, Request
 from abbe.drivers.links.words import CANARY_WORDS
 
 _BABBLE_LIMIT = 5
@@ -34,7 +34,7 @@ class Canary:
     readable: int = 12
 
 
-class Line:
+class ModbusLine:
     """A wire with a memory of what went wrong on it.
 
     On RTU, after whatever was not answered as it should be: silence for a whole reply timeout, then the canary, and only then the next
@@ -42,7 +42,7 @@ class Line:
 
     Parameters
     ----------
-    wire : Wire
+    wire : ModbusWire
         The connection.
     timeout_s : float
         Longest wait for one reply.
@@ -50,7 +50,7 @@ class Line:
         Without one a disturbed RTU line is only waited silent.
     """
 
-    def __init__(self, wire: Wire, timeout_s: float, canary: Canary | None) -> None:
+    def __init__(self, wire: ModbusWire, timeout_s: float, canary: Canary | None) -> None:
         self._wire, self._timeout_s = wire, timeout_s
         self._canary = canary if wire.rtu else None
         self._name = wire.name
@@ -64,7 +64,7 @@ class Line:
         """Bytes that came when nothing was asked: noise, late replies, or a second master."""
 
     async def open(self) -> None:
-        """Make a new connection; errors as of ``Wire.open``."""
+        """Make a new connection; errors as of ``ModbusWire.open``."""
         self._known = None
         await self._wire.open(self._timeout_s if self._wire.rtu else _CONNECT * self._timeout_s)
 
@@ -94,8 +94,8 @@ class Line:
         skip = self._turn // 2 % (lead + 1)
         return Request(self._function(), request.address - skip, request.count + skip), skip
 
-    async def ask(self, request: Request) -> Answer:
-        """Send a request once; on RTU believe its answer only when the canary behind it is answered too. Errors as of ``Wire.ask``."""
+    async def ask(self, request: Request) -> ModbusReply:
+        """Send a request once; on RTU believe its answer only when the canary behind it is answered too. Errors as of the wire's."""
         answer = await self._asked(request)
         if self._canary is not None:
             await self._wire.gap()
@@ -105,7 +105,7 @@ class Line:
                 raise BadFrame(self._name, str(request), detail, "second master on the line, line noise, or a slow device?")
         return answer
 
-    async def _asked(self, request: Request) -> Answer:
+    async def _asked(self, request: Request) -> ModbusReply:
         try:
             return await self._wire.ask(request, self._timeout_s)
         except BaseException as error:

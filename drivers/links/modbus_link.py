@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
 from abbe.drivers.links.backoff import Backoff
 from abbe.drivers.links.incidents import Incidents
-from abbe.drivers.links.modbus import READ_HOLDING, WRITE, Answer, Request, Wire
-from abbe.drivers.links.modbus_line import Canary, Line
-from abbe.drivers.links.modbus_policy import BUSY_POLL_S, BUSY_S, POLICY, Op, meaning, waits
+from abbe.drivers.links.modbus import READ_HOLDING, WRITE, ModbusReply, ModbusWire, Request
+from abbe.drivers.links.modbus_line import Canary, ModbusLine
+from abbe.drivers.links.modbus_policy import BUSY_POLL_S, BUSY_S, POLICY, ModbusOperation, meaning, waits
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
-from abbe.drivers.links.words import Block
+from abbe.drivers.links.words import RegisterBlock
 
 MAX_READ = 125
 MAX_WRITE = 123
@@ -52,8 +52,8 @@ class ModbusLink:
         self.incidents = Incidents()
         self.connections = 0
         """How often the link was (re)connected: a change means that the device may have been restarted in between."""
-        self._wire = Wire(url)
-        self._line = Line(self._wire, timeout_s, canary)
+        self._wire = ModbusWire(url)
+        self._line = ModbusLine(self._wire, timeout_s, canary)
         self._canary = canary
         self._backoff = backoff or Backoff()
         self._heartbeat_s = heartbeat_s if canary is not None else None
@@ -120,13 +120,13 @@ class ModbusLink:
         """
         if not 1 <= count <= MAX_READ:
             raise ValueError(f"a Modbus read takes 1..{MAX_READ} registers, not {count}")
-        return await self._transact(Request(READ_HOLDING, address, count), Op.READ, min(lead, MAX_READ - count))
+        return await self._transact(Request(READ_HOLDING, address, count), ModbusOperation.READ, min(lead, MAX_READ - count))
 
-    async def read_block(self, block: Block) -> tuple[int, ...]:
+    async def read_block(self, block: RegisterBlock) -> tuple[int, ...]:
         """Read the registers of a block of a register map, in one request; errors as for ``read``."""
         return await self.read(block.base, block.count, lead=block.lead)
 
-    async def write(self, address: int, values: Sequence[int], op: Op = Op.TRIGGER) -> None:
+    async def write(self, address: int, values: Sequence[int], op: ModbusOperation = ModbusOperation.TRIGGER) -> None:
         """Write 1..123 registers (FC16); whether it may be sent again is said by ``op`` (drivers/links/modbus_policy.py).
 
         Raises
@@ -155,7 +155,7 @@ class ModbusLink:
             await self._wire.drop()
             self.incidents.closed()
 
-    async def _transact(self, request: Request, op: Op, lead: int = 0, patience_s: float = _PATIENCE_S) -> tuple[int, ...]:
+    async def _transact(self, request: Request, op: ModbusOperation, lead: int = 0, patience_s: float = _PATIENCE_S) -> tuple[int, ...]:
         await self._lock.acquire()
         # The exchange is a task of its own that keeps the lock: a caller who is cancelled goes at once, but a request that is already on
         # the wire is still waited for, so its reply can never meet the next request.
@@ -179,7 +179,7 @@ class ModbusLink:
         self._task = None
         self._lock.release()
 
-    async def _exchange(self, request: Request, op: Op, lead: int, patience_s: float) -> tuple[int, ...]:
+    async def _exchange(self, request: Request, op: ModbusOperation, lead: int, patience_s: float) -> tuple[int, ...]:
         repeats, clock = POLICY[op].repeats, asyncio.get_running_loop().time
         busy_until = clock() + BUSY_S
         while True:
@@ -202,7 +202,7 @@ class ModbusLink:
             self._on_wire = False
             await asyncio.sleep(BUSY_POLL_S)
 
-    async def _once(self, request: Request, patience_s: float) -> Answer:
+    async def _once(self, request: Request, patience_s: float) -> ModbusReply:
         await self._ready(patience_s)
         self._on_wire = True
         try:
@@ -248,4 +248,4 @@ class ModbusLink:
             self._asked_at = clock()
             if self._wire.up or not self._backoff.left_s():
                 with contextlib.suppress(DriverError):  # it is in the account already; the next request will say it too
-                    await self._transact(Request(READ_HOLDING, canary.address, len(canary.words)), Op.READ, patience_s=0.0)
+                    await self._transact(Request(READ_HOLDING, canary.address, len(canary.words)), ModbusOperation.READ, patience_s=0.0)

@@ -8,7 +8,7 @@ from enum import Enum
 from abbe.drivers.errors import DeviceFault, DriverError, LinkDown, Refused, ReplyTimeout
 
 
-class Op(Enum):
+class ModbusOperation(Enum):
     """What a request does to the device, as far as repeating it is concerned."""
 
     READ = "read"
@@ -22,7 +22,7 @@ class Op(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class RetryRule:
     """How one kind of request is treated.
 
     Parameters
@@ -41,11 +41,11 @@ class Rule:
 
 
 POLICY = {
-    Op.READ: Rule(repeats=1, after_busy=True, after_acknowledge=True),
-    Op.LEVEL: Rule(repeats=1, after_busy=True, after_acknowledge=True),
+    ModbusOperation.READ: RetryRule(repeats=1, after_busy=True, after_acknowledge=True),
+    ModbusOperation.LEVEL: RetryRule(repeats=1, after_busy=True, after_acknowledge=True),
     # 6 says that nothing was executed. 5 says that something may be under way: the acknowledge register decides, never the 5 itself.
-    Op.NUMBERED: Rule(repeats=0, after_busy=True, after_acknowledge=False),
-    Op.TRIGGER: Rule(repeats=0, after_busy=False, after_acknowledge=False),
+    ModbusOperation.NUMBERED: RetryRule(repeats=0, after_busy=True, after_acknowledge=False),
+    ModbusOperation.TRIGGER: RetryRule(repeats=0, after_busy=False, after_acknowledge=False),
 }
 
 BUSY_S = 1.0
@@ -87,7 +87,7 @@ def meaning(code: int) -> Meaning:
     return EXCEPTIONS.get(code, _UNKNOWN)
 
 
-def waits(op: Op, code: int) -> bool:
+def waits(op: ModbusOperation, code: int) -> bool:
     """Whether the request is sent again after this exception code, within ``BUSY_S``."""
     rule = POLICY[op]
     return (code == BUSY and rule.after_busy) or (code == ACKNOWLEDGE and rule.after_acknowledge)

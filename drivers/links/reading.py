@@ -22,7 +22,7 @@ _STOP_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class ReadPiece:
     """Bytes that arrived together. ``lost_before``: bytes that found no room just before them."""
 
     host_s: float
@@ -45,7 +45,7 @@ class Ring:
         self.highest = 0.0
         self.on_mark: Callable[[float], None] = lambda mark: None
         """Called in the reading thread when the fill rises to a mark of ``MARKS``; again only after the ring was nearly empty."""
-        self._pieces: deque[Piece] = deque()
+        self._pieces: deque[ReadPiece] = deque()
         self._bytes = 0
         self._lost = 0
         self._told = 0.0
@@ -65,7 +65,7 @@ class Ring:
                 self.lost_bytes += len(data)
                 fill = 1.0
             else:
-                self._pieces.append(Piece(host_s, data, self._lost))
+                self._pieces.append(ReadPiece(host_s, data, self._lost))
                 self._lost = 0
                 self._bytes += len(data)
                 fill = self._bytes / self.capacity
@@ -76,7 +76,7 @@ class Ring:
         for mark in marks:
             self.on_mark(mark)
 
-    def take(self, timeout_s: float) -> list[Piece] | None:
+    def take(self, timeout_s: float) -> list[ReadPiece] | None:
         """The oldest pieces, about 64 KiB; waits for the first. Empty after ``timeout_s``, None when nothing will come any more."""
         with self._news:
             if not self._pieces:
@@ -85,7 +85,7 @@ class Ring:
                 if not self._ended:
                     self._news.wait(timeout_s)
             self._idle = self._ended and not self._pieces
-            pieces: list[Piece] = []
+            pieces: list[ReadPiece] = []
             size = 0
             while self._pieces and size < _READ_BYTES:  # never all of a full ring: what is taken is out of the ring's sight
                 pieces.append(self._pieces.popleft())

@@ -43,7 +43,7 @@ class Register:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class RegisterBlock:
     """Registers that are read in one request, which makes them coherent.
 
     Parameters

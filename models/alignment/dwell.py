@@ -22,7 +22,7 @@ OVERSHOOT, OVERSHOOT_MM = 0.3, 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Stand:
+class Standstill:
     """One standstill: first and last sample (indices), their times, median of the readings."""
 
     first: int
@@ -38,7 +38,7 @@ def noise_of(y: F1) -> float:
     return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6.0))
 
 
-def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Stand, ...]:
+def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Standstill, ...]:
     """All standstills of a stream, in order.
 
     Two neighbouring samples are of one standstill if they differ by less than noise can.
@@ -55,7 +55,7 @@ def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Sta
     """
     limit = max(CLEAR * np.sqrt(2.0) * noise_of(y), RESOLVED * smallest_move)
     still = np.abs(np.diff(y)) <= limit
-    out: list[Stand] = []
+    out: list[Standstill] = []
     for first, last in _runs(still):
         found = _stand(t_s, y, first, last)
         if out and _goes_on(out[-1], found, limit):
@@ -64,12 +64,12 @@ def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Sta
     return tuple(s for s in out if s.last - s.first + 1 >= LEAST_SAMPLES and s.end_s - s.start_s >= least_s)
 
 
-def _goes_on(before: Stand, after: Stand, limit: float) -> bool:
+def _goes_on(before: Standstill, after: Standstill, limit: float) -> bool:
     return after.first - before.last <= 3 and abs(after.level - before.level) <= limit
 
 
-def _stand(t_s: F1, y: F1, first: int, last: int) -> Stand:
-    return Stand(first, last, float(t_s[first]), float(t_s[last]), float(np.median(y[first : last + 1])))
+def _stand(t_s: F1, y: F1, first: int, last: int) -> Standstill:
+    return Standstill(first, last, float(t_s[first]), float(t_s[last]), float(np.median(y[first : last + 1])))
 
 
 def _runs(still: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[tuple[int, int]]:
@@ -78,7 +78,7 @@ def _runs(still: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[tuple[
     return [(int(a), int(b)) for a, b in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True)]
 
 
-def sides(t_s: F1, y: F1, found: tuple[Stand, ...], smallest: float) -> F1:
+def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
     """From which side each standstill was approached: +1 from smaller readings, -1 from larger, 0 where nothing tells.
 
     The last sample before it that lies well off says so; what a controller overshoots by is less than that.
@@ -104,7 +104,7 @@ MATCHED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedDwell:
     """One planned standstill: where (mm along what is read), for how long, and how many readings the plan takes there one after the
     other."""
 
@@ -135,12 +135,12 @@ class Dwells:
 
     readings: tuple[DwellReading | None, ...]
     missing: tuple[int, ...]
-    extra: tuple[tuple[int, Stand], ...]
+    extra: tuple[tuple[int, Standstill], ...]
     odd: tuple[int, ...]
     noise: float
 
 
-def detect(t_s: F1, y: F1, planned: tuple[Planned, ...], *, settle_s: float, zero: float | None = None) -> Dwells:
+def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float, zero: float | None = None) -> Dwells:
     """Match the standstills of a stream to the planned ones, in order; what has no partner is named, never shifted.
 
     ``zero``: what the instrument shows at target 0, if it was zeroed there. If nobody knows, the offset between plan and stream is found
@@ -150,7 +150,7 @@ def detect(t_s: F1, y: F1, planned: tuple[Planned, ...], *, settle_s: float, zer
     ----------
     t_s, y : array, shape (n,)
         Sample times, and readings in the unit of the targets.
-    planned : tuple of Planned
+    planned : tuple of PlannedDwell
         In order; neighbours stand at different places.
     settle_s : float
         The first part of each standstill, in which the axes settle and nothing is read.
@@ -191,7 +191,7 @@ def detect(t_s: F1, y: F1, planned: tuple[Planned, ...], *, settle_s: float, zer
     return Dwells(tuple(readings), missing, _extra(found, pairs), odd, noise)
 
 
-def _check_jumps(found: tuple[Stand, ...], tolerance: float) -> None:
+def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
     """Two standstills with nothing between them are one, in which the reading jumped: counts were lost, everything after is off."""
     for before, after in pairwise(found):
         by = after.level - before.level
@@ -211,7 +211,7 @@ def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
     return False
 
 
-def _check_moves(found: tuple[Stand, ...], pairs: dict[int, int], targets: F1) -> None:
+def _check_moves(found: tuple[Standstill, ...], pairs: dict[int, int], targets: F1) -> None:
     """A step with nothing between two standstills is a short planned move, or lost counts."""
     taken = {s: k for k, s in pairs.items()}
     for s, (before, after) in enumerate(pairwise(found)):
@@ -230,7 +230,7 @@ def _check_moves(found: tuple[Stand, ...], pairs: dict[int, int], targets: F1) -
             raise ValueError(f"dwells: the reading jumped by {by:.4f} mm at {at_s:.1f} s, which nobody planned")
 
 
-def _extra(found: tuple[Stand, ...], pairs: dict[int, int]) -> tuple[tuple[int, Stand], ...]:
+def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[int, Standstill], ...]:
     """Standstills between (or before, or behind) those of the plan."""
     used = {s: k for k, s in pairs.items()}
     out, last = [], -1
@@ -241,7 +241,7 @@ def _extra(found: tuple[Stand, ...], pairs: dict[int, int]) -> tuple[tuple[int, 
     return tuple(out)
 
 
-def _matched(found: tuple[Stand, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
+def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
     """Planned number to number of the standstill; refuses where two explanations are as good.
 
     Without a zero, offsets are tried from the first and last few of both.
@@ -268,7 +268,7 @@ def _matched(found: tuple[Stand, ...], side: F1, targets: F1, zero: float | None
     return _told(best, found) if whole else best.pairs
 
 
-def _told(best: Match, found: tuple[Stand, ...]) -> dict[int, int]:
+def _told(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
     """The pairs, if no other explanation is as good."""
     if best.rival is None:
         return best.pairs
@@ -285,7 +285,7 @@ def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
     return 2 * sum(first[s] != second[s] for s in both) > len(both)
 
 
-def _readings(t_s: F1, y: F1, stand: Stand, plan: Planned, how: tuple[float, float]) -> list[DwellReading | None]:
+def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[float, float]) -> list[DwellReading | None]:
     """The standstill's readings: its time after settling, in as many equal parts as the plan reads there."""
     settle_s, noise = how
     at = np.arange(stand.first, stand.last + 1)
@@ -312,7 +312,7 @@ def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
     return DwellReading(float(kept.mean()), scatter * float(np.sqrt(related / kept.size)), float(t_s[0]), float(t_s[-1]), int(kept.size))
 
 
-def named(found: Dwells, planned: tuple[Planned, ...]) -> tuple[str, ...]:
+def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:
     """What of the program was not as planned, one line each; standstills count from 1."""
     lines = [f"standstill {k + 1} of {len(planned)} (at {planned[k].target:.3f} mm) is missing" for k in found.missing]
     for after, stand in found.extra:
@@ -322,9 +322,9 @@ def named(found: Dwells, planned: tuple[Planned, ...]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def merged(planned: list[Planned]) -> tuple[Planned, ...]:
+def merged(planned: list[PlannedDwell]) -> tuple[PlannedDwell, ...]:
     """Neighbours at one place are one standstill with the readings and the time of both."""
-    out: list[Planned] = []
+    out: list[PlannedDwell] = []
     for one in planned:
         if out and abs(out[-1].target - one.target) < 1e-6:
             out[-1] = replace(out[-1], seconds=out[-1].seconds + one.seconds, readings=out[-1].readings + one.readings)

@@ -155,7 +155,7 @@ def achievable(
     sources : ErrorSources, optional
         Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
     """
-    judge = _Judge(solution, random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
+    judge = _ResidualJudge(solution, random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
     rows = [judge.row("no table", 0), *judge.one_axis(counts), *judge.single_motions(counts, observable)]
     return (*rows, *(judge.grid(n, None) for n in grid_nodes))
 
@@ -170,12 +170,12 @@ def grid_row(
     sources: ErrorSources | None = None,
 ) -> Achievable:
     """What a 3-D grid of so many nodes per axis leaves; other parameters as `achievable`."""
-    judge = _Judge(solution, pairs or random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
+    judge = _ResidualJudge(solution, pairs or random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
     return judge.grid(nodes, compensable)
 
 
 @dataclass(frozen=True, eq=False)
-class _Judge:
+class _ResidualJudge:
     """What all kinds of table are judged with: the same pairs, the same sources of uncertainty, the same rounding."""
 
     solution: JointSolution

@@ -19,7 +19,7 @@ from abbe.models.geometry.chain import design
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.frame import RigidFree
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.mask import compensable_mask
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
@@ -195,7 +195,7 @@ def grid_table(
 
 
 def compensable_nodes(
-    solution: JointSolution, counts: tuple[int, int, int], *, inputs: Inputs | None = None, k: float | None = None
+    solution: JointSolution, counts: tuple[int, int, int], *, inputs: StatedInputs | None = None, k: float | None = None
 ) -> Mask:
     """Nodes at which the deviation is larger than its expanded uncertainty (`abbe.models.uncertainty.mask`), shape ``counts``.
 

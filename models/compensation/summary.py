@@ -16,7 +16,7 @@ from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.priors import U_WAVELENGTH
 from abbe.models.uncertainty.combined import variances
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 SCALE_NOTE = "at the machine's temperature while it was measured"
@@ -44,7 +44,7 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
     solution with a laser (`laser_scale`) and so within its sources; without one, scales carry its uncertainty all the same: none is known
     better.
     """
-    sources = error_sources(solution, replace(Inputs().as_measured(), u_wavelength=0.0))  # the wavelength is in ``common``
+    sources = error_sources(solution, replace(StatedInputs().as_measured(), u_wavelength=0.0))  # the wavelength is in ``common``
     slopes = {}
     for a in range(3):
         first, last = (float(v) for v in solution.machine.stroke_mm[a])

@@ -12,8 +12,8 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.case import CaseRun
 from abbe.models.discovery.noise import lone, unscaled
-from abbe.models.discovery.prediction import Solved, free_columns, left_over
-from abbe.models.discovery.whitened_problem import Scene
+from abbe.models.discovery.prediction import SolvedModel, free_columns, left_over
+from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.probability import f_above
 
 LAGS = 10
@@ -42,7 +42,9 @@ class _Noise:
     long: float
 
 
-def agreements(scene: Scene, solved: Solved, predicted_mm: Mapping[str, F1]) -> tuple[tuple[Agreement, ...], tuple[Unjudged, ...]]:
+def agreements(
+    scene: WhitenedProblem, solved: SolvedModel, predicted_mm: Mapping[str, F1]
+) -> tuple[tuple[Agreement, ...], tuple[Unjudged, ...]]:
     """How every run that only judges agrees with a solution without effects, the worst first.
 
     A run's whitened residual, reading by reading and in sums over blocks, which see what is smooth, is weighted by the inverse covariance
@@ -86,7 +88,7 @@ def _root(covariance: F2) -> F2:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _noise(scene: Scene, kind: str) -> _Noise | None:
+def _noise(scene: WhitenedProblem, kind: str) -> _Noise | None:
     """From what the fitted model leaves of the fitted runs of an instrument; None where it leaves too little to know."""
     res, leverage, use = (scene.by_run(v) for v in (scene.space.residual, scene.space.leverage, scene.use))
     mine = [k for k, name in enumerate(scene.kinds) if name == kind]
@@ -102,7 +104,7 @@ def _noise(scene: Scene, kind: str) -> _Noise | None:
     return _Noise(total / freedom, freedom, spread, max(long, 1.0))
 
 
-def _white(scene: Scene, solved: Solved, root: F2, run: CaseRun, predicted_mm: F1, seen: set[str]) -> tuple[F2, int]:
+def _white(scene: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, seen: set[str]) -> tuple[F2, int]:
     """Whitened residual of a run's readings that count, then what may move the prediction (columns, one standard deviation each).
 
     Also how many of these the run sets for itself; they are the last. One standard deviation is that of the noise as it was assumed: what

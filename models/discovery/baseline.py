@@ -12,8 +12,8 @@ from abbe.models.effects.path import Path
 from abbe.models.geometry.bases import Term, smooth_terms, term_values
 from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import Setup, linearise, predict
-from abbe.models.solvers.observe_kinematics import LOST, Places, with_tool
+from abbe.models.solvers.observe import SetupUnknowns, linearise, predict
+from abbe.models.solvers.observe_kinematics import LOST, AxisPlaces, with_tool
 from abbe.models.solvers.observe_setup import bar_length_name
 from abbe.models.solvers.priors import Priors, smooth_shapes, term_prior_sd
 
@@ -41,7 +41,7 @@ class Baseline:
 
     machine: Machine
     terms: tuple[Term, ...]
-    setup: Setup
+    setup: SetupUnknowns
     parts: F2
     names: tuple[str, ...]
     prior_sd: F1
@@ -93,7 +93,7 @@ class Baseline:
         full, machine = self._full(theta), with_tool(self.machine, run.tool_mm)
         off = []
         for axes in (run.axes_mm, path.centre_mm[None]):
-            places = Places.of(machine, self.terms, axes, np.zeros_like(axes))
+            places = AxisPlaces.of(machine, self.terms, axes, np.zeros_like(axes))
             off.append(places.deviation_mm(places.motions(full)))
         known = dict(zip(self.setup.names, full[len(self.terms) + LOST :], strict=True))
         cup = np.array([known.get(f"cup_{run.setup}_{a}", 0.0) for a in "xyz"])
@@ -116,7 +116,7 @@ def baseline_of(case: Case) -> Baseline:
             if "mirror_tilt" in case.includes:
                 sd |= {f"tilt_{p.setup}_{k}": TILT_RAD for k in "12"}
             sd[f"zero_{p.label}"] = ZERO_MM
-    setup = Setup(tuple(sorted(sd)), np.array([sd[k] for k in sorted(sd)]))
+    setup = SetupUnknowns(tuple(sorted(sd)), np.array([sd[k] for k in sorted(sd)]))
     own = [BAR if name.startswith(f"{BAR}_") else name for name in setup.names]
     ours = tuple(dict.fromkeys(own))
     parts = np.array([[float(name == o) for o in ours] for name in own]).reshape(len(own), len(ours))

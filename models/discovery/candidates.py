@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.projection import rows_of
-from abbe.models.discovery.whitened_problem import Scene
+from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Form, Values
 
 UNNAMED = "unnamed_"
@@ -44,7 +44,7 @@ class Pick:
         """Whether it is a generic rival."""
         return self.effect.name.startswith(UNNAMED)
 
-    def raw(self, scene: Scene) -> F2:
+    def raw(self, scene: WhitenedProblem) -> F2:
         """Columns, mm per unit of each coefficient, shape (n, k); those of the forms last."""
         parts = [scene.raw(self.effect.signal, self.key, self.values)]
         parts += [scene.raw(f.signal, self.key, self.values) for f in self.forms]
@@ -55,7 +55,7 @@ class Pick:
         """Label, non-linear parameters and forms: what its columns depend on."""
         return f"{self.label} {sorted(self.values.items())} {[f.name for f in self.forms]}"
 
-    def prior_sd(self, scene: Scene, columns: int) -> F1:
+    def prior_sd(self, scene: WhitenedProblem, columns: int) -> F1:
         """Prior standard deviation of each coefficient, shape (columns,)."""
         if self.label not in scene.widths:
             scene.widths[self.label] = int(self.effect.signal(scene.paths[:1], self.key, self.values)[0].shape[1])
@@ -166,7 +166,7 @@ def _gains(gram: np.ndarray, moment: F2, own: F2, prior_sd: F2) -> F1:
     return np.asarray(np.maximum((solved * moment).sum(axis=1), 0.0))
 
 
-def bank_of(scene: Scene, picks: Sequence[Pick]) -> Bank:
+def bank_of(scene: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
     """Columns of all candidates; those that no run sees are left out. What another bank of the scene still holds is not made again."""
     asked = [p.start for p in picks]
     held = [b for b in scene.banks if isinstance(b, Bank)]
@@ -202,7 +202,7 @@ PART = 20
 """So many candidates are whitened together: whitening takes several copies of what it is given."""
 
 
-def _groups(scene: Scene, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
+def _groups(scene: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
     """Start and group of each pick that some run sees."""
     blocks = [(p, raw) for p, raw in ((p, p.raw(scene)) for p in picks) if raw.any()]
     if not blocks:
@@ -223,7 +223,7 @@ def _groups(scene: Scene, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]
         yield p.start, _Group(short[at], own[at], gram, moment[at], float(np.log(np.maximum(sees, 2)).sum()))
 
 
-def gain_of(scene: Scene, pick: Pick, rows: F2) -> float:
+def gain_of(scene: WhitenedProblem, pick: Pick, rows: F2) -> float:
     """Chi-square that one pick takes away after ``rows`` of others were taken out too.
 
     With all digits: where the simulation leaves little of a column, seven of them put evidence of thousands off by several.
@@ -237,7 +237,7 @@ def gain_of(scene: Scene, pick: Pick, rows: F2) -> float:
     return float(_gains(gram[None], moment[None], np.einsum("nk,nk->k", columns, columns)[None], sd[None])[0])
 
 
-def whitened(scene: Scene, pick: Pick) -> tuple[F2, F2]:
+def whitened(scene: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
     """Whitened columns of a pick and what the simulation leaves of them, kept for as long as the scene."""
     name = pick.start
     if name not in scene.kept:
@@ -248,7 +248,7 @@ def whitened(scene: Scene, pick: Pick) -> tuple[F2, F2]:
     return scene.kept[name]
 
 
-def rows_for(scene: Scene, picks: Sequence[Pick]) -> F2:
+def rows_for(scene: WhitenedProblem, picks: Sequence[Pick]) -> F2:
     """Rows that take out several picks together, shape (k, n)."""
     if not picks:
         return np.zeros((0, scene.gap.size))

@@ -16,9 +16,9 @@ from abbe.models.discovery.finding import finding
 from abbe.models.discovery.noise import unscaled
 from abbe.models.discovery.prediction import predictions, solve
 from abbe.models.discovery.rivals import Rival, rivals_of
-from abbe.models.discovery.selection import Contest, Found, dropped, selected, weighed
+from abbe.models.discovery.selection import Contest, Selection, dropped, selected, weighed
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extra_variance
-from abbe.models.discovery.whitened_problem import Scene, Tangent, linearised, quieted, scene_of, taken_out
+from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, quieted, scene_of, taken_out
 from abbe.models.effects.effect import Effect
 
 # Effects of the scatter beside those of the mean: found in what the mean leaves, then kept away from the search for the mean.
@@ -30,7 +30,7 @@ MOST_GATED = 0.35
 """... unless they are more than this share of all readings."""
 
 
-def scattered(scene: Scene, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
+def scattered(scene: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
     """What the scatter of the readings shows once simulation and ``picks`` are taken out; lone readings of lasers are in it again."""
     solved = solve(scene, picks)
     model = scene.tangent.raw @ (solved.theta - scene.theta)
@@ -44,7 +44,7 @@ def scattered(scene: Scene, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...
     return extra_variance(scene.paths, tuple(scene.by_run(white * valid)), sigma, leverage=leverage, colours=scene.colours)
 
 
-def without(scene: Scene, findings: Sequence[VarianceFinding]) -> Scene:
+def without(scene: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
     """The scene whose mean is free of the findings: a vibration's waves are taken out run by run, loud readings do not count."""
     waves, use = [scene.also], scene.use
     for f in findings:
@@ -62,7 +62,7 @@ def without(scene: Scene, findings: Sequence[VarianceFinding]) -> Scene:
     return taken_out(scene)
 
 
-def _waves(scene: Scene, axis: int, frequency_hz: float) -> F2:
+def _waves(scene: WhitenedProblem, axis: int, frequency_hz: float) -> F2:
     """Sine and cosine of unknown size and phase in every ball-bar run, mm."""
     out = np.zeros((scene.gap.size, 2 * sum(k == "bar" for k in scene.kinds)))
     start = column = 0
@@ -75,16 +75,16 @@ def _waves(scene: Scene, axis: int, frequency_hz: float) -> F2:
     return out
 
 
-def _slow(scene: Scene, axis: int, v_mm_s: float) -> F1:
+def _slow(scene: WhitenedProblem, axis: int, v_mm_s: float) -> F1:
     return np.concatenate([(np.abs(p.at.v_mm_s[:, axis]) < GATE * v_mm_s) * float(p.kind == "bar") for p in scene.paths])
 
 
-def _moment(scene: Scene, t0_s: float, width_s: float) -> F1:
+def _moment(scene: WhitenedProblem, t0_s: float, width_s: float) -> F1:
     return np.concatenate([(np.abs(p.at.t_s - t0_s) < 1.5 * width_s) * float(p.kind == "bar") for p in scene.paths])
 
 
 Progress = Callable[[str, float], None]
-Search = tuple[Scene, Contest, list[Found], tuple[VarianceFinding, ...]]
+Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
 """A rival takes a name's place when it explains more by this chi-square: as much as a new name has to beat one that is there."""
 ROUNDS = 3
@@ -122,7 +122,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     return finding(scene, plain, found, loud, solved, rivals, (before, after))
 
 
-def searched(scene: Scene, effects: tuple[Effect, ...], tell: Progress) -> Search:
+def searched(scene: WhitenedProblem, effects: tuple[Effect, ...], tell: Progress) -> Search:
     """Mean, then scatter, then again with the noise and the exact simulation that the findings leave, until they stay the same."""
     contest = Contest.of(scene, effects)
     found, loud = selected(contest), tuple[VarianceFinding, ...]()
@@ -141,7 +141,7 @@ def searched(scene: Scene, effects: tuple[Effect, ...], tell: Progress) -> Searc
     return scene, contest, sorted(found, key=lambda f: -f.score), loud
 
 
-def fairly(contest: Contest, found: list[Found]) -> tuple[list[Found], list[list[Rival]]]:
+def fairly(contest: Contest, found: list[Selection]) -> tuple[list[Selection], list[list[Rival]]]:
     """The names with their rivals; a rival that explains more once both have their freedoms of form takes the name's place.
 
     The search compares names before their forms, so that a bent effect may have let the wrong one of two near kin in.
@@ -158,12 +158,12 @@ def fairly(contest: Contest, found: list[Found]) -> tuple[list[Found], list[list
     return found, [_rivals(contest, found, i) for i in range(len(found))]
 
 
-def _rivals(contest: Contest, found: list[Found], i: int) -> list[Rival]:
+def _rivals(contest: Contest, found: list[Selection], i: int) -> list[Rival]:
     """Of one name; none of a structure without a name."""
     return [] if found[i].pick.unnamed else rivals_of(contest, found, i)
 
 
-def _labels(found: list[Found], loud: tuple[VarianceFinding, ...]) -> set[str]:
+def _labels(found: list[Selection], loud: tuple[VarianceFinding, ...]) -> set[str]:
     return {f.pick.label for f in found} | {f.label for f in loud}
 
 
@@ -173,7 +173,7 @@ def _merged(old: tuple[VarianceFinding, ...], new: tuple[VarianceFinding, ...]) 
     return (*old, *(f for f in new if f.label not in known))
 
 
-def settled(scene: Scene, picks: list[Pick]) -> Scene:
+def settled(scene: WhitenedProblem, picks: list[Pick]) -> WhitenedProblem:
     """The scene linearised about the simulation that fits together with the picks, with the noise that they leave."""
     if not picks:
         return quieted(scene, ())

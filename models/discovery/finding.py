@@ -12,19 +12,19 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.agreement import agreements
 from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict, Where
 from abbe.models.discovery.candidates import Pick
-from abbe.models.discovery.experiment.design import Suspect, propose
+from abbe.models.discovery.experiment.design import SuspectEffect, propose
 from abbe.models.discovery.experiment.unnamed import propose_unnamed
 from abbe.models.discovery.generic.unnamed_structures import is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
 from abbe.models.discovery.localization import locate
-from abbe.models.discovery.prediction import Solved, left_over, predictions
+from abbe.models.discovery.prediction import SolvedModel, left_over, predictions
 from abbe.models.discovery.rivals import EXCLUDED, Rival
-from abbe.models.discovery.selection import Found
+from abbe.models.discovery.selection import Selection
 from abbe.models.discovery.signal_localization import where_of_signal
 from abbe.models.discovery.unnamed import Structure, lacking, structures, told_of
 from abbe.models.discovery.unseen import unseen
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
-from abbe.models.discovery.whitened_problem import Scene
+from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Family
 from abbe.models.probability import chi2_above
 
@@ -66,7 +66,7 @@ def shape_of(pick: Pick, u: Mapping[str, float]) -> dict[str, tuple[float, float
     return {name: (v, float(np.hypot(u[name], TIME_TRUE_TO_FORM * v)) if name in times else u[name]) for name, v in values.items()}
 
 
-def strength_of(scene: Scene, pick: Pick, c: F1, cov: F2) -> tuple[float, float]:
+def strength_of(scene: WhitenedProblem, pick: Pick, c: F1, cov: F2) -> tuple[float, float]:
     """Strength and its standard uncertainty, in the effect's unit, from its coefficients (forms last) and their covariance.
 
     Four parts of the uncertainty: that of the coefficients (the non-linear parameters free), that of the form, what the present simulation
@@ -95,7 +95,7 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
     return out
 
 
-def as_plain(scene: Scene, pick: Pick, *, offset: bool = True) -> F2:
+def as_plain(scene: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
     """Coefficients of the plain effect that comes nearest to the effect with its forms, per coefficient, shape (plain, all).
 
     Only forms that carry part of the size itself count: an amplitude that changes along the axis, other courses of a warming up, what a
@@ -215,9 +215,14 @@ class _Told:
 
 
 def finding(
-    scene: Scene, plain: Scene, found: Sequence[Found], loud: Sequence[VarianceFinding], solved: Solved, rivals: Sequence[Sequence[Rival]],
+    scene: WhitenedProblem,
+    plain: WhitenedProblem,
+    found: Sequence[Selection],
+    loud: Sequence[VarianceFinding],
+    solved: SolvedModel,
+    rivals: Sequence[Sequence[Rival]],
     predicted: tuple[dict[str, F1], dict[str, F1]],
-) -> Discovery:  # fmt: skip
+) -> Discovery:
     """Everything that was found, for the one who asked.
 
     Parameters
@@ -263,7 +268,11 @@ def finding(
 
 
 def _told(
-    scene: Scene, found: Sequence[Found], loud: Sequence[VarianceFinding], solved: Solved, rivals: Sequence[Sequence[Rival]]
+    scene: WhitenedProblem,
+    found: Sequence[Selection],
+    loud: Sequence[VarianceFinding],
+    solved: SolvedModel,
+    rivals: Sequence[Sequence[Rival]],
 ) -> _Told:
     """Which findings are named, which have no name, which are only what another one leaves."""
     companions = _companions(scene, found, solved)
@@ -284,18 +293,18 @@ def _told(
     return _Told(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))
 
 
-def _needed(scene: Scene, solved: Solved, which: Sequence[int]) -> dict[int, float | None]:
+def _needed(scene: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
     """Rms of the holdout runs without each effect over that with all of them, by its number (`NamedEffect.needed`)."""
     seen = {r.path.setup for r in scene.runs}
     judges = [r for r in scene.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:
         return dict.fromkeys(which)
 
-    def rms(solution: Solved) -> float:
+    def rms(solution: SolvedModel) -> float:
         read = predictions(scene, solution)
         return float(np.sqrt(np.nanmean(np.concatenate([left_over(r, read[r.path.label], seen) for r in judges]) ** 2)))
 
-    def less(i: int) -> Solved:
+    def less(i: int) -> SolvedModel:
         return replace(solved, coefficients=tuple(np.zeros_like(c) if k == i else c for k, c in enumerate(solved.coefficients)))
 
     whole = rms(solved)
@@ -314,7 +323,7 @@ def _verdict(named: float, unnamed: float) -> Verdict:
     return "unknown" if unnamed > named else "named"
 
 
-def _p_value(found: Sequence[Found], loud: Sequence[VarianceFinding], lack: Where | None) -> float:
+def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: Where | None) -> float:
     """Of a lack of fit, the smallest of its table.
 
     Else a bound on how often noise alone would give the strongest finding: chi-square of its parameters times the starts compared.
@@ -326,7 +335,7 @@ def _p_value(found: Sequence[Found], loud: Sequence[VarianceFinding], lack: Wher
     return min(1.0, *bounds) if bounds else 1.0
 
 
-def _companions(scene: Scene, found: Sequence[Found], solved: Solved) -> dict[int, int]:
+def _companions(scene: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
     """Findings that are only what another one's formula leaves of its true form: which, and of which."""
     power = []
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
@@ -340,7 +349,7 @@ def _companions(scene: Scene, found: Sequence[Found], solved: Solved) -> dict[in
     return out
 
 
-def _named(scene: Scene, found: Found, solved: Solved, i: int, rivals: Sequence[Rival]) -> NamedEffect:
+def _named(scene: WhitenedProblem, found: Selection, solved: SolvedModel, i: int, rivals: Sequence[Rival]) -> NamedEffect:
     pick, c, cov = solved.picks[i], solved.coefficients[i], solved.covariance[i]
     strength, u = strength_of(scene, pick, c, cov)
     shape = shape_of(pick, solved.shape_u[i])
@@ -357,22 +366,22 @@ def _of_scatter(f: VarianceFinding) -> NamedEffect:
     return NamedEffect(f.name, f.key, f.strength, u, shape, c, np.array([[u * u]]), f.evidence, where=f.where)
 
 
-def _next_test(scene: Scene, kept: Sequence[int], solved: Solved, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
+def _next_test(scene: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
     """What tells the most doubtful name from its rivals best."""
     for i in kept:
         if not rivals[i]:
             continue
         pick = solved.picks[i]
         plain = as_plain(scene, pick) @ solved.coefficients[i]
-        leader = Suspect(pick.effect, pick.key, pick.values, plain)
-        others = tuple(Suspect(r.pick.effect, r.pick.key, r.pick.values) for r in rivals[i][:3])
+        leader = SuspectEffect(pick.effect, pick.key, pick.values, plain)
+        others = tuple(SuspectEffect(r.pick.effect, r.pick.key, r.pick.values) for r in rivals[i][:3])
         test = propose(scene.case, leader, others, {k: c.sd_mm for k, c in scene.colours.items()})
         if test is not None:
             return test
     return None
 
 
-def gaps_of(scene: Scene, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:
+def gaps_of(scene: WhitenedProblem, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:
     """Of every role with at least one reading that counts."""
     out = {}
     for role in ("identify", "holdout"):

@@ -18,7 +18,7 @@ from abbe.models.discovery.answer import Agreement, Where
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.localization import locate
 from abbe.models.discovery.noise import CLEARLY
-from abbe.models.discovery.whitened_problem import Scene
+from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.machine import AXES
 from abbe.models.probability import f_above
 
@@ -45,7 +45,7 @@ class Floor:
     freedom: float
 
 
-def floors(scene: Scene) -> dict[str, Floor]:
+def floors(scene: WhitenedProblem) -> dict[str, Floor]:
     """Noise of each instrument: of its repeats, where they say clearly less than what the fit left; that may hold what is missing."""
     out = {}
     for kind, colour in scene.colours.items():
@@ -75,7 +75,9 @@ def repeat_steps(case: Case, kind: str) -> F1:
     return np.concatenate(steps) if steps else np.zeros(0)
 
 
-def lack_of_fit(scene: Scene, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]) -> Where | None:
+def lack_of_fit(
+    scene: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
+) -> Where | None:
     """Where a solution without effects leaves more than noise; None: nowhere.
 
     Parameters

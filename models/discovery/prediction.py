@@ -12,7 +12,7 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.candidates import Pick, with_values
 from abbe.models.discovery.case import CaseRun
-from abbe.models.discovery.whitened_problem import Scene, ordered
+from abbe.models.discovery.whitened_problem import WhitenedProblem, ordered
 from abbe.models.effects.effect import Signal
 
 STEPS = 2
@@ -21,7 +21,7 @@ LONGEST_STEP = 0.3
 
 
 @dataclass(frozen=True)
-class Solved:
+class SolvedModel:
     """Unknowns of the simulation and of the effects from the identify runs, with usual sizes as priors.
 
     Attributes
@@ -40,7 +40,7 @@ class Solved:
     shape_u: tuple[Mapping[str, float], ...]
 
 
-def solve(scene: Scene, picks: Sequence[Pick]) -> Solved:
+def solve(scene: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
     """Joint fit of simulation and effects, their non-linear parameters included (Gauss-Newton, inside their bounds)."""
     picks = tuple(picks)
     raw, first, second = _steps(scene, picks)
@@ -56,10 +56,10 @@ def solve(scene: Scene, picks: Sequence[Pick]) -> Solved:
         k = r.shape[1]
         shape_u.append({q.name: float(np.sqrt(cov[k + j, k + j])) for j, q in enumerate(pick.effect.shape)})
     linear = tuple(c[: r.shape[1], : r.shape[1]] for c, r in zip(second.covariance, raw, strict=True))
-    return Solved(picks, first.theta, second.theta_covariance, first.coefficients, linear, tuple(shape_u))
+    return SolvedModel(picks, first.theta, second.theta_covariance, first.coefficients, linear, tuple(shape_u))
 
 
-def _steps(scene: Scene, picks: Sequence[Pick]) -> tuple[list[F2], Solved, Solved]:
+def _steps(scene: WhitenedProblem, picks: Sequence[Pick]) -> tuple[list[F2], SolvedModel, SolvedModel]:
     """Columns of the picks, the fit at their non-linear parameters, and the fit in which those may move too."""
     raw = [p.raw(scene) for p in picks]
     sd = [p.prior_sd(scene, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
@@ -84,7 +84,7 @@ def _moved(pick: Pick, change: F1, covariance: F2) -> Pick:
     return pick if values == dict(pick.values) else with_values(pick, values)
 
 
-def _slopes(scene: Scene, pick: Pick, coefficients: F1) -> F2:
+def _slopes(scene: WhitenedProblem, pick: Pick, coefficients: F1) -> F2:
     """What the reading changes by with each non-linear parameter, by central differences, shape (n, parameters)."""
     out = np.zeros((scene.gap.size, len(pick.effect.shape)))
     for j, q in enumerate(pick.effect.shape):
@@ -95,7 +95,7 @@ def _slopes(scene: Scene, pick: Pick, coefficients: F1) -> F2:
     return out
 
 
-def _fit(scene: Scene, raw: Sequence[F2], sd: Sequence[F1]) -> Solved:
+def _fit(scene: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> SolvedModel:
     base, n, tangent, sd_mm = scene.base, scene.base.size, scene.tangent, scene.sd_mm()[:, None]
     white = scene.white(np.column_stack([scene.gap + tangent.raw @ scene.theta, *raw]))
     more = white[:, 1:]
@@ -109,10 +109,10 @@ def _fit(scene: Scene, raw: Sequence[F2], sd: Sequence[F1]) -> Solved:
     at = n + np.concatenate([[0], np.cumsum([r.shape[1] for r in raw])]).astype(int)
     parts = [slice(i, j) for i, j in pairwise(at)]
     blocks = tuple(inverse[p, p] for p in parts)
-    return Solved((), x[:n], inverse[:n, :n], tuple(x[p] for p in parts), blocks, ())
+    return SolvedModel((), x[:n], inverse[:n, :n], tuple(x[p] for p in parts), blocks, ())
 
 
-def predictions(scene: Scene, solved: Solved) -> dict[str, F1]:
+def predictions(scene: WhitenedProblem, solved: SolvedModel) -> dict[str, F1]:
     """Reading of every run of the case, mm, sealed ones too. Set-ups that no identify run shares: cup and length at nominal."""
     runs = ordered(scene.case.runs)
     data = [r.data() for r in runs]
@@ -130,7 +130,7 @@ def predictions(scene: Scene, solved: Solved) -> dict[str, F1]:
     return {r.path.label: o for r, o in zip(runs, out, strict=True)}
 
 
-def _width(signal: Signal, scene: Scene, pick: Pick) -> int:
+def _width(signal: Signal, scene: WhitenedProblem, pick: Pick) -> int:
     return int(signal(scene.paths, pick.key, pick.values)[0].shape[1])
 
 

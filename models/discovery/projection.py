@@ -15,7 +15,7 @@ ROWS = 2048
 
 
 @dataclass(frozen=True)
-class Space:
+class SignalSpace:
     """Whitened readings and what has been taken out of them.
 
     What takes out the unknowns is T = [root @ columns^T @ diag(weight); rows], shape (p + k, n): M = 1 - T^T T; with flat priors M is a
@@ -40,12 +40,12 @@ class Space:
     moment: F1
 
     @classmethod
-    def nothing(cls, n: int) -> Space:
+    def nothing(cls, n: int) -> SignalSpace:
         """Nothing is taken out of n readings that are all zero."""
         return cls(np.zeros(n), np.zeros((n, 0)), np.ones(n), np.zeros((0, 0)), np.zeros((0, n)), np.zeros(0))
 
     @classmethod
-    def of(cls, y: F1, columns: F2, gram: F2, prior_sd: F1, weight: F1 | None = None) -> Space:
+    def of(cls, y: F1, columns: F2, gram: F2, prior_sd: F1, weight: F1 | None = None) -> SignalSpace:
         """Take out ``columns`` (n, p) times ``weight``, with ``gram`` of these products, whose unknowns have independent priors."""
         scaled = gram * prior_sd[:, None] * prior_sd
         scaled.flat[:: len(gram) + 1] += 1.0
@@ -90,7 +90,7 @@ class Space:
         """What taking out more columns (n, k) adds to T, shape (k, n)."""
         return rows_of(self.left(columns), columns, prior_sd)
 
-    def without(self, columns: F2, prior_sd: F1) -> Space:
+    def without(self, columns: F2, prior_sd: F1) -> SignalSpace:
         """The space with more columns taken out."""
         rows = self.rows(columns, prior_sd)
         return replace(self, more=np.concatenate([self.more, rows]), moment=np.concatenate([self.moment, rows @ self.y]))

@@ -9,7 +9,7 @@ from scipy import optimize
 
 from abbe.models.arrays import F2
 from abbe.models.discovery.candidates import Pick, gain_of, with_values
-from abbe.models.discovery.whitened_problem import Scene
+from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Parameter
 
 SWEEPS = 2
@@ -18,7 +18,7 @@ NEAR = 0.02
 """A structure without a name is refined within this share of its parameters' range."""
 
 
-def refined(scene: Scene, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
+def refined(scene: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
     """Best values near those of ``pick`` (one parameter after the other, between the neighbouring starts), and the gain there."""
     best = gain_of(scene, pick, rows)
     if not pick.effect.shape:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from abbe.models.arrays import F2
 from abbe.models.discovery.candidates import Pick, gain_of
 from abbe.models.discovery.refine import refined
-from abbe.models.discovery.selection import FORM_LEAST, Contest, Found, others
+from abbe.models.discovery.selection import FORM_LEAST, Contest, Selection, others
 
 EXCLUDED = 12.0
 """A rival that explains less by this much chi-square, after its price, is excluded."""
@@ -26,7 +26,7 @@ class Rival:
     share: float
 
 
-def rivals_of(contest: Contest, found: Sequence[Found], i: int) -> list[Rival]:
+def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Rival]:
     """Names that the readings do not exclude in place of pick ``i``, the nearest first; variants of the same name are not rivals."""
     picks = [f.pick for f in found]
     rows = others(contest.scene, picks, i)

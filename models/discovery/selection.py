@@ -12,7 +12,7 @@ from abbe.models.arrays import F2
 from abbe.models.discovery.candidates import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of
 from abbe.models.discovery.generic.unnamed_structures import generic_rivals
 from abbe.models.discovery.refine import refined
-from abbe.models.discovery.whitened_problem import Scene
+from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect
 
 MOST_EFFECTS = 5
@@ -36,7 +36,7 @@ FORM_SHARE, FORM_PRICE = 0.6, 6.0
 
 
 @dataclass(frozen=True)
-class Found:
+class Selection:
     """A pick with the chi-square it took away given all others, and what is left of that after its price."""
 
     pick: Pick
@@ -67,14 +67,14 @@ def form_price(logs: float) -> float:
 class Contest:
     """The search over one scene: its bank of named candidates, the price of each label's columns, how many labels there are."""
 
-    scene: Scene
+    scene: WhitenedProblem
     banks: list[Bank]
     widths: dict[str, float]
     labels: int
     readings: int
 
     @classmethod
-    def of(cls, scene: Scene, effects: Sequence[Effect]) -> Contest:
+    def of(cls, scene: WhitenedProblem, effects: Sequence[Effect]) -> Contest:
         """All starts of all effects of the mean that the present simulation does not hold."""
         bank = bank_of(scene, starts_of(competing(effects, scene.case.includes)))
         widths = {p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)}
@@ -103,24 +103,24 @@ class Contest:
             self.widths[key] = float(np.log(np.maximum((columns > 1e-5 * columns.max()).sum(axis=0), 2)).sum())
         return self.widths[key]
 
-    def shortlist(self, rows: F2, without: Sequence[str], most: int = SHORTLIST) -> list[Found]:
+    def shortlist(self, rows: F2, without: Sequence[str], most: int = SHORTLIST) -> list[Selection]:
         """Best candidate of each label on the grid, best labels first."""
-        best: dict[str, Found] = {}
+        best: dict[str, Selection] = {}
         for bank in self.banks:
             for pick, gain in zip(bank.picks, bank.gains(self.scene.space.y, rows), strict=True):
                 if pick.label not in without and (pick.label not in best or gain > best[pick.label].gain):
-                    best[pick.label] = Found(pick, float(gain), float(gain) - self.price(pick))
+                    best[pick.label] = Selection(pick, float(gain), float(gain) - self.price(pick))
         return sorted(best.values(), key=lambda f: (-f.score, f.pick.label))[:most]
 
-    def next(self, picks: Sequence[Pick], rows: F2, without: Sequence[str] = (), beat: float = 0.0) -> Found | None:
+    def next(self, picks: Sequence[Pick], rows: F2, without: Sequence[str] = (), beat: float = 0.0) -> Selection | None:
         """The best new name after refinement whose score is above ``beat``, or None."""
-        tried: list[Found] = []
+        tried: list[Selection] = []
         for candidate in self.shortlist(rows, [*without, *(p.label for p in picks)]):
             most = max([beat, *(f.score for f in tried)])
             if candidate.gain < HOPELESS * most - 20.0 or candidate.score < -30.0:
                 continue
             pick, gain = refined(self.scene, candidate.pick, rows)
-            tried.append(Found(pick, gain, gain - self.price(pick)))
+            tried.append(Selection(pick, gain, gain - self.price(pick)))
         good = [f for f in tried if f.score > beat]
         if not good:
             return None
@@ -148,7 +148,7 @@ class Contest:
         return best
 
 
-def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFECTS) -> list[Found]:
+def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFECTS) -> list[Selection]:
     """All effects that are worth their price, with back-steps after every addition."""
     picks, scene = list(start), contest.scene
     for _ in range(3 * most):
@@ -166,7 +166,7 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
     return weighed(contest, dropped(contest, picks))
 
 
-def others(scene: Scene, picks: Sequence[Pick], i: int) -> F2:
+def others(scene: WhitenedProblem, picks: Sequence[Pick], i: int) -> F2:
     """Rows of all picks but one."""
     return rows_for(scene, [p for j, p in enumerate(picks) if j != i])
 
@@ -196,7 +196,7 @@ def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
         beat = both - contest.price(a) - contest.price(b)
         others_of_kind = contest.shortlist(rows, [a.label, b.label, *(p.label for p in rest)], most=len(contest.widths))
         one = (refined(contest.scene, f.pick, rows) for f in others_of_kind if f.pick.effect.name == a.effect.name)
-        tried = [Found(pick, gain, gain - contest.price(pick)) for pick, gain in one]
+        tried = [Selection(pick, gain, gain - contest.price(pick)) for pick, gain in one]
         best = max(tried, key=lambda f: f.score, default=None)
         if best is not None and best.score > beat:
             return joined(contest, [*rest, best.pick])
@@ -214,10 +214,10 @@ def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
     return picks
 
 
-def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Found]:
+def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
     """Each pick with what it takes away beside all others, in the order of the picks."""
     out = []
     for i, pick in enumerate(picks):
         gain = gain_of(contest.scene, pick, others(contest.scene, picks, i))
-        out.append(Found(pick, gain, gain - contest.price(pick)))
+        out.append(Selection(pick, gain, gain - contest.price(pick)))
     return out

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from abbe.models.discovery.answer import Where
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed, where_of
-from abbe.models.discovery.selection import Found
+from abbe.models.discovery.selection import Selection
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 
 TITLES = {"unnamed_burst": "short disturbance of the reading", "unnamed_place": "readings of the laser off near one place"}
@@ -25,7 +25,7 @@ class Structure:
     where: Where
 
 
-def structures(case: Case, found: Sequence[Found], loud: Sequence[VarianceFinding]) -> tuple[Structure, ...]:
+def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFinding]) -> tuple[Structure, ...]:
     """Those among the effects of the mean (``found``) and of the scatter (``loud``), by evidence."""
     out = [
         Structure(f.pick.label, f.pick.effect.title, f.score / 2.0, where_of(f.pick.effect, f.pick.key, f.pick.values, case))

@@ -13,7 +13,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.baseline import Baseline
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.noise import Colour, level, lone, unscaled
-from abbe.models.discovery.projection import ROWS, Space
+from abbe.models.discovery.projection import ROWS, SignalSpace
 from abbe.models.effects.effect import Signal, Values
 from abbe.models.effects.path import Path
 
@@ -31,7 +31,7 @@ FITTED = 3.0
 
 
 @dataclass(frozen=True)
-class Scene:
+class WhitenedProblem:
     """Identify runs, stacked in the order of time.
 
     Attributes
@@ -56,7 +56,7 @@ class Scene:
     theta: F1
     colours: Mapping[str, Colour]
     tangent: Tangent
-    space: Space
+    space: SignalSpace
     also: F2
     kept: dict[str, tuple[F2, F2]] = field(default_factory=dict)
     banks: WeakSet[object] = field(default_factory=WeakSet)
@@ -148,20 +148,22 @@ def ordered(runs: Sequence[CaseRun]) -> tuple[CaseRun, ...]:
     return tuple(sorted(runs, key=lambda r: (float(r.path.at.t_s[0]), r.path.label)))
 
 
-def scene_of(case: Case, base: Baseline) -> Scene:
+def scene_of(case: Case, base: Baseline) -> WhitenedProblem:
     """Fit the present simulation to the identify runs and take it out."""
     runs = ordered(case.of("identify"))
     use = np.concatenate([r.valid.astype(float) for r in runs])
     paths, n = tuple(r.path for r in runs), use.size
     tangent = Tangent.of(Slopes.of(runs, base), use, [p.n for p in paths], [p.kind for p in paths], FIRST_NOISE)
-    scene = Scene(case, base, runs, paths, np.zeros(n), use, np.zeros(base.size), FIRST_NOISE, tangent, Space.nothing(n), np.zeros((n, 0)))
+    scene = WhitenedProblem(
+        case, base, runs, paths, np.zeros(n), use, np.zeros(base.size), FIRST_NOISE, tangent, SignalSpace.nothing(n), np.zeros((n, 0))
+    )
     scene = replace(scene, gap=np.concatenate([r.data().deviation_mm for r in runs]))
     for _ in range(STEPS):
         scene = linearised(scene, np.zeros((n, 0)), np.zeros(0))
     return quieted(scene, ())
 
 
-def linearised(scene: Scene, extra: F2, extra_sd: F1) -> Scene:
+def linearised(scene: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedProblem:
     """One step towards the exact simulation, together with columns of effects (mm per unit, n x k) that stay outside of it."""
     base, tangent = scene.base, scene.tangent
     data = [r.data() for r in scene.runs]
@@ -182,18 +184,18 @@ def linearised(scene: Scene, extra: F2, extra_sd: F1) -> Scene:
     return replace(scene, theta=theta, gap=gap, paths=paths, kept={}, banks=WeakSet())
 
 
-def taken_out(scene: Scene) -> Scene:
+def taken_out(scene: WhitenedProblem) -> WhitenedProblem:
     """The same with its space made anew from gap, columns and noise."""
     y = scene.white(scene.gap[:, None])[:, 0]
     tangent = scene.tangent
     scene.kept.clear()
-    space = Space.of(y, tangent.columns, tangent.blend(scene.colours), scene.base.prior_sd * WIDE, 1.0 / scene.sd_mm())
+    space = SignalSpace.of(y, tangent.columns, tangent.blend(scene.colours), scene.base.prior_sd * WIDE, 1.0 / scene.sd_mm())
     if scene.also.shape[1]:
         space = space.without(scene.white(scene.also), np.full(scene.also.shape[1], LOUDEST_MM))
     return replace(scene, space=space, kept={}, banks=WeakSet())
 
 
-def quieted(scene: Scene, found: Sequence[tuple[F2, F1]]) -> Scene:
+def quieted(scene: WhitenedProblem, found: Sequence[tuple[F2, F1]]) -> WhitenedProblem:
     """The same with the noise that is left once the effects ``found`` (raw columns, prior sd) are taken out too."""
     for _ in range(ROUNDS):
         scene = taken_out(scene)

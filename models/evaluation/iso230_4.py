@@ -24,7 +24,7 @@ ZONE_POINTS = 2000
 
 
 @dataclass(frozen=True, slots=True)
-class Circle:
+class CircularTest:
     """One path around a circle: angle from the plane's first axis to its second, rad, and length minus nominal radius, mm, shape (n,)."""
 
     angle_rad: F1
@@ -78,7 +78,7 @@ class BothWays:
     at_rad: float
 
 
-def circular(path: Circle) -> OnePath:
+def circular(path: CircularTest) -> OnePath:
     """Evaluate one path."""
     centre, left = _centred([path])
     radius = centre[2]
@@ -96,7 +96,7 @@ def circular(path: Circle) -> OnePath:
     )
 
 
-def both_ways(forward: Circle, backward: Circle) -> BothWays:
+def both_ways(forward: CircularTest, backward: CircularTest) -> BothWays:
     """Evaluate two paths of one set-up, about their common least squares centre.
 
     H compares the means of the same degree of both paths, where both have readings.
@@ -116,7 +116,7 @@ def both_ways(forward: Circle, backward: Circle) -> BothWays:
     return BothWays(float(np.ptp(both)), float(apart[k]), float((k + 0.5) * 2.0 * np.pi / BINS))
 
 
-def centred(path: Circle) -> F1:
+def centred(path: CircularTest) -> F1:
     """Radial deviation about the least squares circle, mm, shape (n,): what a polar picture shows."""
     return _centred([path])[1][0]
 
@@ -125,14 +125,14 @@ def _columns(angle_rad: F1) -> F2:
     return np.column_stack([np.cos(angle_rad), np.sin(angle_rad), np.ones(angle_rad.size)])
 
 
-def _centred(paths: list[Circle]) -> tuple[F1, list[F1]]:
+def _centred(paths: list[CircularTest]) -> tuple[F1, list[F1]]:
     """Common least squares circle (a, b, c) of the paths, and what is left of each."""
     a = _columns(np.concatenate([p.angle_rad for p in paths]))
     found = np.linalg.lstsq(a, np.concatenate([p.deviation_mm for p in paths]), rcond=None)[0]
     return found, [np.asarray(p.deviation_mm - _columns(p.angle_rad) @ found) for p in paths]
 
 
-def zone_mm(path: Circle) -> float:
+def zone_mm(path: CircularTest) -> float:
     """Smallest difference of the radii of two concentric circles around all readings: a linear programme in centre and two radii."""
     left = centred(path)
     keep = _extremes(left)

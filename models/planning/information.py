@@ -33,7 +33,7 @@ SEARCH_VALUES = 120
 
 
 @dataclass(frozen=True)
-class Problem:
+class PlanningProblem:
     """Machine, instruments and priors of a plan, and the unknowns that all mountings share (names and prior sd)."""
 
     machine: Machine
@@ -49,17 +49,17 @@ class Problem:
         return len(self.names)
 
 
-def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | None = None) -> Problem:
+def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | None = None) -> PlanningProblem:
     """Set up what a plan is about; ``order``: highest Legendre order of the error motions."""
     priors, terms = priors or Priors(), smooth_terms(order)
     bars = [bar_length_name(r) for r in sorted(tools.bar_lengths_mm)]
     names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *bars, LASER_SCALE, BAR_SCALE)
     rest = [priors.backlash_mm] * 3 + [tools.u_bar_length_mm] * len(bars) + [tools.u_wavelength]
     rest.append(tools.inputs.u_bar_temperature_k * tools.inputs.bar_expansion_per_k)
-    return Problem(machine, tools, priors, terms, names, np.concatenate([term_prior_sd(machine, terms, priors), rest]))
+    return PlanningProblem(machine, tools, priors, terms, names, np.concatenate([term_prior_sd(machine, terms, priors), rest]))
 
 
-def mounting_information(what: Problem, tests: tuple[Measurement, ...]) -> F2:
+def mounting_information(what: PlanningProblem, tests: tuple[Measurement, ...]) -> F2:
     """Information of all tests of one mounting on the shared unknowns, shape (size, size), in units of their priors."""
     runs = _search_runs(what, tests)
     setup = setup_unknowns(runs, what.priors)
@@ -74,7 +74,7 @@ def mounting_information(what: Problem, tests: tuple[Measurement, ...]) -> F2:
     return np.asarray(a.T @ a - cross.T @ linalg.solve(b.T @ b + np.eye(len(own)), cross, assume_a="pos"))
 
 
-def _search_runs(what: Problem, tests: tuple[Measurement, ...]) -> tuple[RunData, ...]:
+def _search_runs(what: PlanningProblem, tests: tuple[Measurement, ...]) -> tuple[RunData, ...]:
     """The runs of one mounting, one after the other: drifts go on while it stands."""
     runs: list[RunData] = []
     for test in tests:
@@ -84,7 +84,7 @@ def _search_runs(what: Problem, tests: tuple[Measurement, ...]) -> tuple[RunData
     return tuple(runs)
 
 
-def _sigma(what: Problem, run: RunData) -> F1:
+def _sigma(what: PlanningProblem, run: RunData) -> F1:
     """Standard uncertainty of each value; fewer points than block means count for more, so that the run tells as much as it will."""
     tools = what.tools
     if run.kind == "laser":
@@ -94,7 +94,7 @@ def _sigma(what: Problem, run: RunData) -> F1:
     return np.full(n, np.hypot(tools.bar_noise_mm / np.sqrt(raw / values), tools.floor_mm) * np.sqrt(n / values))
 
 
-def _shared_columns(what: Problem, run: RunData, full: F2, setup_names: tuple[str, ...]) -> F2:
+def _shared_columns(what: PlanningProblem, run: RunData, full: F2, setup_names: tuple[str, ...]) -> F2:
     first = len(what.terms) + 3
     out = np.zeros((full.shape[0], what.size))
     out[:, :first] = full[:, :first]
@@ -112,7 +112,7 @@ def factor(information: F2) -> F2:
     return np.asarray(np.sqrt(value)[:, None] * vector.T)
 
 
-def field_rows(what: Problem, share: float, nodes: int) -> F2:
+def field_rows(what: PlanningProblem, share: float, nodes: int) -> F2:
     """Deviation free of rigid motion at the nodes of the inner volume per unit of every shared unknown, shape (nodes^3 * 3, size), mm."""
     box = what.machine.centre_mm[:, None] + share * (what.machine.stroke_mm - what.machine.centre_mm[:, None])
     grid = volume_grid(box, nodes)
@@ -123,7 +123,7 @@ def field_rows(what: Problem, share: float, nodes: int) -> F2:
     return np.asarray(out * what.prior_sd)
 
 
-def scale_temperature_mm2(what: Problem, rows: F2) -> F1:
+def scale_temperature_mm2(what: PlanningProblem, rows: F2) -> F1:
     """Variance that scales of unknown temperature leave at each node of ``rows`` (`field_rows`), rigid motion free, shape (nodes,), mm^2.
 
     As in the budget of a solution (`abbe.models.uncertainty.sources`): each axis by itself too long by expansion times temperature. No

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from abbe.models.solvers.priors import U_WAVELENGTH
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 
 BAR_LENGTHS_MM = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 """Bars that exist as a bar with extensions."""
@@ -56,7 +56,7 @@ class Instruments:
         How long set-ups take.
     max_feed_mm_min : float
         Fastest feed of any measurement on the machine.
-    inputs : Inputs
+    inputs : StatedInputs
         How well temperatures of bars and scales are known; default: as in the budget of a solution.
     """
 
@@ -69,7 +69,7 @@ class Instruments:
     u_wavelength: float = U_WAVELENGTH
     setup: SetupMinutes = field(default_factory=SetupMinutes)
     max_feed_mm_min: float = 6000.0
-    inputs: Inputs = field(default_factory=Inputs)
+    inputs: StatedInputs = field(default_factory=StatedInputs)
 
     def __post_init__(self) -> None:
         """Refuse what no instrument has, in one line."""

@@ -15,7 +15,7 @@ import numpy as np
 from abbe.models.machine import AXES, Machine
 from abbe.models.planning.candidates import candidates, opening
 from abbe.models.planning.goal import COVERAGE, Goal, limit, minutes_needed, shortest
-from abbe.models.planning.information import Problem, field_rows, problem, scale_temperature_mm2, uncertainty_mm
+from abbe.models.planning.information import PlanningProblem, field_rows, problem, scale_temperature_mm2, uncertainty_mm
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
 from abbe.models.planning.search import Chosen, Search
@@ -26,7 +26,7 @@ from abbe.models.solvers.priors import Priors
 # What a planned campaign cannot tell, in words, before anything is measured.
 
 
-def not_observable(what: Problem, runs: Iterable[RunData]) -> tuple[str, ...]:
+def not_observable(what: PlanningProblem, runs: Iterable[RunData]) -> tuple[str, ...]:
     """Sentences about what the runs of a plan leave open, with cause and cure, in the words of the solver's own report.
 
     First what would stay hidden in the work with this tool, then what only another tool would show, then what to add.
@@ -51,7 +51,7 @@ def not_observable(what: Problem, runs: Iterable[RunData]) -> tuple[str, ...]:
     return (*out, *(a.text for a in found.advice))
 
 
-__all__ = ["Plan", "Step", "laid_out", "plan_campaign", "uncertainty_mm"]
+__all__ = ["Plan", "PlanStep", "laid_out", "plan_campaign", "uncertainty_mm"]
 
 PLAN_ORDER = 8
 """Legendre order of the error motions a plan is judged with; orders above 6 fade in the prior."""
@@ -61,7 +61,7 @@ PASSES = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class PlanStep:
     """One measurement of a plan.
 
     Attributes
@@ -93,7 +93,7 @@ class Plan:
     ----------
     machine : Machine
     tools : Instruments
-    steps : tuple of Step
+    steps : tuple of PlanStep
         In the order of measuring: what gains most per minute comes first.
     runs : tuple of RunData
         What a perfect machine would record, deviations zero: positions, directions, times, weights of the block means.
@@ -111,7 +111,7 @@ class Plan:
 
     machine: Machine
     tools: Instruments
-    steps: tuple[Step, ...]
+    steps: tuple[PlanStep, ...]
     runs: tuple[RunData, ...]
     u_before_mm: tuple[float, float]
     u_temperature_mm: float = 0.0
@@ -203,11 +203,11 @@ def laid_out(search: Search, chosen: Chosen, goal_mm: float | None = None) -> Pl
     return Plan(machine, tools, steps, runs, before, float(np.sqrt(stated.max())), not_observable(search.what, runs))
 
 
-def _steps(search: Search, chosen: Chosen) -> tuple[Step, ...]:
+def _steps(search: Search, chosen: Chosen) -> tuple[PlanStep, ...]:
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     stated = scale_temperature_mm2(search.what, rows)
     total = np.eye(search.what.size)
-    steps: list[Step] = []
+    steps: list[PlanStep] = []
     until = 0.0
     for number, name in enumerate(_in_order(search, chosen), start=1):
         tests = chosen[name]
@@ -215,7 +215,7 @@ def _steps(search: Search, chosen: Chosen) -> tuple[Step, ...]:
             minutes = search.cost_min(test, tests[:k])
             until += minutes
             worst, mean = uncertainty_mm(total + search.mounting(tests[: k + 1]), rows, stated)
-            steps.append(Step(_label(test, number, k), f"S{number}", test, minutes, until, worst, mean))
+            steps.append(PlanStep(_label(test, number, k), f"S{number}", test, minutes, until, worst, mean))
         total += search.mounting(tests)
     return tuple(steps)
 

@@ -16,7 +16,7 @@ from scipy import linalg
 
 from abbe.models.arrays import F1, F2
 from abbe.models.planning.candidates import bars_that_fit
-from abbe.models.planning.information import Problem, factor, field_rows, mounting_information
+from abbe.models.planning.information import PlanningProblem, factor, field_rows, mounting_information
 from abbe.models.planning.instruments import SetupMinutes
 from abbe.models.planning.measurements import HelixTest, LineTest, Measurement, machine_seconds
 
@@ -49,7 +49,7 @@ def extra_minutes(minutes: SetupMinutes, machine_min: float, test: Measurement, 
 class Search:
     """Searches one problem; keeps every mounting's information, because the same ones are asked for again and again."""
 
-    what: Problem
+    what: PlanningProblem
     candidates: tuple[Measurement, ...]
     share: float = 0.8
     tick: Callable[[float], None] = lambda _: None

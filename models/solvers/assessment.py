@@ -16,14 +16,22 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from abbe.models.machine import Machine
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.observability.cures import Campaign
+from abbe.models.solvers.observability.cures import CampaignLayout
 from abbe.models.solvers.observability.free import hidden_free
 from abbe.models.solvers.observability.hidden import Advice, HiddenGroup, picture
-from abbe.models.solvers.observability.parameters import Correlation, Motion, Parameter, correlations, hidden_terms, motions, parameters
+from abbe.models.solvers.observability.parameters import (
+    Correlation,
+    MotionStatus,
+    ParameterStatus,
+    correlations,
+    hidden_terms,
+    motions,
+    parameters,
+)
 from abbe.models.solvers.observability.rank import (
-    Columns,
+    CampaignColumns,
     Knowledge,
-    Seen,
+    SeenInformation,
     campaign_columns,
     compressed,
     stated_knowledge,
@@ -50,7 +58,7 @@ class Observability:
     machine, terms, model
         Nominal machine; coefficients of its error motions that count for the rank; all coefficients of the model (a solution carries higher
         orders along, for honest uncertainties).
-    seen : Seen
+    seen : SeenInformation
         Rank, effective rank, condition, null space (unit columns).
     reachable : int
         Rank that no run with the same tools could exceed: the whole deviation vector everywhere (math.md 4.6, "upper bound").
@@ -70,14 +78,14 @@ class Observability:
     machine: Machine
     terms: tuple[Term, ...]
     model: tuple[Term, ...]
-    seen: Seen
+    seen: SeenInformation
     reachable: int
     known: tuple[str, ...]
     hidden: tuple[HiddenGroup, ...]
     advice: tuple[Advice, ...]
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[ParameterStatus, ...]
     correlations: tuple[Correlation, ...]
-    motions: tuple[Motion, ...]
+    motions: tuple[MotionStatus, ...]
     knowing: Knowing
     volume: Volume
     number: Number
@@ -167,7 +175,7 @@ def observability_of(solution: JointSolution, known: Knowledge | None = None) ->
     return _report(_Model(s.machine, s.terms, s.order), s.data, columns, beliefs, known)
 
 
-def motions_of(solution: JointSolution) -> tuple[Motion, ...]:
+def motions_of(solution: JointSolution) -> tuple[MotionStatus, ...]:
     """Every error motion of a solution judged, as in its whole report, without the report's other parts."""
     p = len(solution.terms)
     root = solution.prior_root[:p]
@@ -201,14 +209,16 @@ class _Model:
     order: int
 
 
-def _report(model: _Model, runs: tuple[RunData, ...], columns: Columns, beliefs: _Beliefs, known: Knowledge | None) -> Observability:
+def _report(
+    model: _Model, runs: tuple[RunData, ...], columns: CampaignColumns, beliefs: _Beliefs, known: Knowledge | None
+) -> Observability:
     machine, p = model.machine, len(model.terms)
     counted = [i for i, t in enumerate(model.terms) if t.order <= model.order]
     terms = tuple(model.terms[i] for i in counted)
     few = compressed(replace(columns, machine=columns.machine[:, counted]))
     known = stated_knowledge(terms, runs, columns.setup_names) if known is None else known
     seen, prior_sd = what_is_seen(few, known), np.linalg.norm(beliefs.prior_root, axis=1)
-    found = picture(Campaign(machine, terms, runs, few, known), seen, prior_sd[counted])
+    found = picture(CampaignLayout(machine, terms, runs, few, known), seen, prior_sd[counted])
     names = (*(t.name for t in model.terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
     secret = hidden_terms(terms, seen.null_space)
     knowing = _knowing(beliefs, p)

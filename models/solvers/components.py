@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from abbe.models.arrays import F1, F2
-from abbe.models.solvers.information import Sums
+from abbe.models.solvers.information import InformationSums
 from abbe.models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
 
 NOISE_SD = 2.0
@@ -43,7 +43,7 @@ class Components:
 
 
 @dataclass(frozen=True)
-class Posterior:
+class ComponentPosterior:
     """Solution for given components, in units of each unknown's prior standard deviation.
 
     ``x`` (p,) most probable values; ``cov`` (p, p); ``log_evidence`` of the readings (constants left out).
@@ -54,14 +54,14 @@ class Posterior:
     log_evidence: float
 
 
-def blend(sums: Sums, c: Components, half: F1) -> tuple[F2, F1, float]:
+def blend(sums: InformationSums, c: Components, half: F1) -> tuple[F2, F1, float]:
     """Information, moment and sum of squares over all instruments in units of the prior: (p, p), (p,), scalar."""
     w = np.exp(-c.eta)
     gram = np.tensordot(w, sums.gram, 1) * (half[:, None] * half)
     return gram, (w @ sums.moment) * half, float(w @ sums.square)
 
 
-def posterior(sums: Sums, c: Components, model: SizeModel) -> Posterior:
+def posterior(sums: InformationSums, c: Components, model: SizeModel) -> ComponentPosterior:
     """Most probable unknowns, their covariance and the evidence."""
     gram, moment, square = blend(sums, c, c.half(model))
     np.fill_diagonal(gram, gram.diagonal() + 1.0)
@@ -72,10 +72,10 @@ def posterior(sums: Sums, c: Components, model: SizeModel) -> Posterior:
     cov = inverse + inverse.T
     np.fill_diagonal(cov, inverse.diagonal())
     log_det = 2.0 * float(np.log(low.diagonal()).sum())
-    return Posterior(x, cov, -0.5 * (float(sums.count @ c.eta) + log_det + square - float(z @ z)))
+    return ComponentPosterior(x, cov, -0.5 * (float(sums.count @ c.eta) + log_det + square - float(z @ z)))
 
 
-def slope(sums: Sums, c: Components, model: SizeModel, p: Posterior) -> tuple[F1, F2]:
+def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPosterior) -> tuple[F1, F2]:
     """Gradient of the log evidence and its expected information with respect to (psi, eta)."""
     half = c.half(model)
     h, kinds = model.design.shape[1], range(c.eta.size)
@@ -99,7 +99,7 @@ def slope(sums: Sums, c: Components, model: SizeModel, p: Posterior) -> tuple[F1
     return gradient, info
 
 
-def _seen(sums: Sums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
+def _seen(sums: InformationSums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
     """Information of each instrument times the covariance; all together they are I - S, so the last one costs nothing."""
     used = np.flatnonzero(sums.count > 0)
     out = [np.zeros_like(cov) for _ in w]
@@ -112,7 +112,7 @@ def _seen(sums: Sums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
 
 
 @dataclass(frozen=True)
-class Found:
+class FittedComponents:
     """Most probable components, their covariance (psi first, then eta), and log evidence plus log hyperprior."""
 
     components: Components
@@ -120,11 +120,11 @@ class Found:
     value: float
 
 
-def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
-    """Most probable components from a start; ``sums`` about the independent unknowns of the model (`Sums.turned`)."""
+def estimate(sums: InformationSums, model: SizeModel, start: Components) -> FittedComponents:
+    """Most probable components from a start; ``sums`` about the independent unknowns of the model (`InformationSums.turned`)."""
     weight = np.concatenate([model.sd, np.full(start.eta.size, NOISE_SD)]) ** -2.0
 
-    def objective(c: Components) -> tuple[float, Posterior]:
+    def objective(c: Components) -> tuple[float, ComponentPosterior]:
         p = posterior(sums, c, model)
         return p.log_evidence - 0.5 * float(weight @ np.concatenate([c.psi, c.eta]) ** 2), p
 
@@ -147,7 +147,7 @@ def estimate(sums: Sums, model: SizeModel, start: Components) -> Found:
         gain, c, value, p = better - value, trial, better, found
         if gain < TOLERANCE:
             break
-    return Found(c, np.asarray(linalg.inv(info)), value)
+    return FittedComponents(c, np.asarray(linalg.inv(info)), value)
 
 
 def _positive(info: F2, least: float) -> F2:
@@ -161,7 +161,7 @@ def _moved(c: Components, step: F1) -> Components:
     return Components(c.psi + step[: c.psi.size], np.maximum(c.eta + step[c.psi.size :], LEAST_ETA))
 
 
-def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeModel, Found]:
+def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
     """The same with the correlation length of the error motions, by climbing over `LENGTHS` from the model's own.
 
     ``sums`` about the unknowns in units of their typical size.
@@ -183,7 +183,7 @@ def fit_length(sums: Sums, model: SizeModel, start: Components) -> tuple[SizeMod
     return models[at], found[at]
 
 
-def cautious(model: SizeModel, found: Found) -> tuple[SizeModel, Components]:
+def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Components]:
     """Prior of the error motions as it may well be, where the most probable one would promise too much.
 
     Three remedies; where readings are plenty none of them changes anything.

@@ -21,14 +21,14 @@ Field = Callable[[F2], F3]
 
 
 @dataclass(frozen=True)
-class Rows:
+class DesignRows:
     """Readings of one experiment per unit of the machine's parameters, shape (n, p), and of its set-up unknowns, shape (n, k)."""
 
     machine: F2
     setup: F2
 
 
-def bar_rows(field: Field, points_mm: F2, centre_mm: F1) -> Rows:
+def bar_rows(field: Field, points_mm: F2, centre_mm: F1) -> DesignRows:
     """Linearised ball-bar about one cup, eq (8) of Yang: n . (delta - delta0); set-up: cup offset (3) and bar length (1).
 
     Parameters
@@ -40,10 +40,10 @@ def bar_rows(field: Field, points_mm: F2, centre_mm: F1) -> Rows:
     d = points_mm - centre_mm
     n = d / np.linalg.norm(d, axis=1, keepdims=True)
     seen = np.einsum("ni,nik->nk", n, field(points_mm) - field(centre_mm[None]))
-    return Rows(seen, np.concatenate([-n, np.ones((len(n), 1))], axis=1))
+    return DesignRows(seen, np.concatenate([-n, np.ones((len(n), 1))], axis=1))
 
 
-def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> Rows:
+def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> DesignRows:
     """Displacement along a beam since the first record (left out, it is zero by definition); set-up: mirror tilts in two directions.
 
     Parameters
@@ -56,14 +56,14 @@ def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> Rows:
     """
     f = field(path_mm)
     d = path_mm[1:] - path_mm[0]
-    return Rows(np.einsum("i,nik->nk", beam, f[1:] - f[0]), d @ across.T)
+    return DesignRows(np.einsum("i,nik->nk", beam, f[1:] - f[0]), d @ across.T)
 
 
-def vector_rows(field: Field, points_mm: F2) -> Rows:
+def vector_rows(field: Field, points_mm: F2) -> DesignRows:
     """The whole deviation vector at points (the upper bound of what any instrument can tell), no set-up unknowns."""
     f = field(points_mm)
     flat = f.reshape(-1, f.shape[2])
-    return Rows(flat, np.zeros((flat.shape[0], 0)))
+    return DesignRows(flat, np.zeros((flat.shape[0], 0)))
 
 
 def stacked(parts: list[F2], setups: list[tuple[F2, tuple[int, ...]]]) -> tuple[F2, F2]:

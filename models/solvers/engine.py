@@ -12,10 +12,10 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term
 from abbe.models.machine import Machine
 from abbe.models.solvers import robust
-from abbe.models.solvers.components import Components, Posterior, blend, cautious, estimate, fit_length, posterior
-from abbe.models.solvers.information import I1, KINDS, Grams, Readings, Sums, grams, sums, total
+from abbe.models.solvers.components import ComponentPosterior, Components, blend, cautious, estimate, fit_length, posterior
+from abbe.models.solvers.information import I1, KINDS, Grams, InformationSums, PlannedReadings, grams, sums, total
 from abbe.models.solvers.observations import RunData, nominal_reading
-from abbe.models.solvers.observe import Setup, predict, run_design, setup_unknowns
+from abbe.models.solvers.observe import SetupUnknowns, predict, run_design, setup_unknowns
 from abbe.models.solvers.order import folds
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
 from abbe.models.solvers.residual_tests import inflation
@@ -92,7 +92,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Noise:
+class InstrumentNoise:
     """Expected noise per instrument before the fit: one raw reading, least of an averaged value, what repeats say (None: nothing)."""
 
     sigma_mm: dict[str, float]
@@ -101,18 +101,18 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Problem:
+class CampaignProblem:
     """A campaign: unknowns with their reference sizes, and the linearised readings in units of noise and size."""
 
     machine: Machine
     runs: tuple[RunData, ...]
     terms: tuple[Term, ...]
-    setup: Setup
+    setup: SetupUnknowns
     names: tuple[str, ...]
     sizes: SizeModel
-    noise: Noise
+    noise: InstrumentNoise
     sigma: F1
-    readings: Readings
+    readings: PlannedReadings
 
     def predicted(self, theta: F1) -> F1:
         """Exact readings of all runs, mm."""
@@ -129,7 +129,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Fit:
+class CampaignFit:
     """The settled solution: unknowns, components, weights of the readings, whitened residuals, normal equations per fold."""
 
     theta: F1
@@ -137,22 +137,22 @@ class Fit:
     prior_sd: F1
     sizes: SizeModel
     components: Components
-    posterior: Posterior
+    posterior: ComponentPosterior
     weight: F1
     size: F1
     residual_mm: F1
     thinning: F1
-    parts: tuple[Sums, ...]
+    parts: tuple[InformationSums, ...]
 
 
-def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None, floor_mm: dict[str, float] | None) -> Noise:
+def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None, floor_mm: dict[str, float] | None) -> InstrumentNoise:
     """What the caller states, else what repeats tell, else the makers' figures."""
     repeats = {kind: repeat_noise_mm(runs, kind) for kind in KINDS}
     sigma = {k: (sigma_mm or {}).get(k) or repeats[k] or DEFAULT_SIGMA_MM[k] for k in KINDS}
-    return Noise(sigma, {k: max((floor_mm or {}).get(k, 0.0), RESOLUTION_MM) for k in KINDS}, repeats)
+    return InstrumentNoise(sigma, {k: max((floor_mm or {}).get(k, 0.0), RESOLUTION_MM) for k in KINDS}, repeats)
 
 
-def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: Noise) -> Problem:
+def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: InstrumentNoise) -> CampaignProblem:
     """Linearise all runs about the perfect machine."""
     setup = setup_unknowns(runs, priors, machine)
     rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
@@ -165,11 +165,11 @@ def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], 
     n = [r.deviation_mm.size for r in runs]
     rows = [np.repeat(v, n).astype(np.int64) for v in (np.arange(len(runs)), folds(runs), [KINDS.index(r.kind) for r in runs])]
     names = tuple(t.name for t in terms) + rest
-    readings = Readings(a, np.zeros(len(sigma)), rows[0], rows[1], rows[2])
-    return Problem(machine, runs, terms, setup, names, sizes, noise, sigma, readings)
+    readings = PlannedReadings(a, np.zeros(len(sigma)), rows[0], rows[1], rows[2])
+    return CampaignProblem(machine, runs, terms, setup, names, sizes, noise, sigma, readings)
 
 
-def settle(problem: Problem, say: Progress) -> Fit:
+def settle(problem: CampaignProblem, say: Progress) -> CampaignFit:
     """Iterate weights, components and the exact model until nothing moves."""
     r = problem.readings
     gram, measured, sizes = grams(r), problem.measured, problem.sizes
@@ -179,7 +179,7 @@ def settle(problem: Problem, say: Progress) -> Fit:
     dirty = False
     for step in range(ROUNDS):
         z = (measured - problem.predicted(sizes.typical * x)) / problem.sigma + r.a @ x
-        whole = total(sums(Readings(r.a, z, r.run, r.fold, r.kind), gram, weight))
+        whole = total(sums(PlannedReadings(r.a, z, r.run, r.fold, r.kind), gram, weight))
         if step == 1 or (dirty and step == GENTLE):
             sizes, found = fit_length(whole, sizes, c)
             c = found.components
@@ -212,7 +212,7 @@ def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
     return hard
 
 
-def _spread(problem: Problem, whole: Sums, c: Components, sizes: SizeModel) -> F1:
+def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, sizes: SizeModel) -> F1:
     """Standard deviation of each residual in units of its noise: what the fit took of it is missing."""
     information, _, _ = blend(whole.turned(sizes.root, sizes.blocks), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
@@ -221,12 +221,12 @@ def _spread(problem: Problem, whole: Sums, c: Components, sizes: SizeModel) -> F
     return np.asarray(np.sqrt(np.maximum(1.0 - h / np.exp(c.eta)[problem.readings.kind], 0.05)))
 
 
-def _finish(problem: Problem, x: F1, weight: F1, c: Components, gram: Grams) -> Fit:
+def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Grams) -> CampaignFit:
     """Last solution with the exact residuals; neighbours that are alike count as fewer readings."""
     r, typical = problem.readings, problem.sizes.typical
     residual = problem.measured - problem.predicted(typical * x)
     z = residual / problem.sigma + r.a @ x
-    parts = sums(Readings(r.a, z, r.run, r.fold, r.kind), gram, weight)
+    parts = sums(PlannedReadings(r.a, z, r.run, r.fold, r.kind), gram, weight)
     size = residual / problem.sigma / np.exp(0.5 * c.eta)[r.kind] / _spread(problem, total(parts), c, problem.sizes)
     thinning = _thinning(problem, size, weight)
     parts = tuple(s.thinned(thinning) for s in parts)
@@ -239,9 +239,9 @@ def _finish(problem: Problem, x: F1, weight: F1, c: Components, gram: Grams) -> 
     cov = root @ p.cov @ root.T
     theta = root @ p.x
     left = problem.measured - problem.predicted(theta)
-    return Fit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, thinning, parts)
+    return CampaignFit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, thinning, parts)
 
 
-def _thinning(problem: Problem, size: F1, weight: F1) -> F1:
+def _thinning(problem: CampaignProblem, size: F1, weight: F1) -> F1:
     per_run = problem.split(np.where(weight > 0.5, size, 0.0))
     return np.array([inflation(tuple(z for z, run in zip(per_run, problem.runs, strict=True) if run.kind == kind)) for kind in KINDS])

@@ -15,7 +15,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.solvers.identifiability import Identifiability, analyse
-from abbe.models.solvers.least_squares import Estimate, solve_map
+from abbe.models.solvers.least_squares import ParameterEstimate, solve_map
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors, bar_length_sd
 
@@ -35,7 +35,7 @@ class HelixSolution:
 
     Attributes
     ----------
-    estimate : Estimate
+    estimate : ParameterEstimate
         Six parameters (mm/mm, rad; ISO signs, workpiece coordinates), set-up (mm), and with `fit_run` lost motion (mm).
     identifiability : Identifiability
         Of the readings without any prior, columns of unit length.
@@ -43,7 +43,7 @@ class HelixSolution:
         What was fitted beside the machine.
     """
 
-    estimate: Estimate
+    estimate: ParameterEstimate
     identifiability: Identifiability
     unknowns: Unknowns
 
@@ -131,7 +131,7 @@ def fit_helix(
     count = counts[unknowns]
     names = (LINEAR + SETUP)[:count]
     prior = np.array([np.inf] * 9 + [u_length_mm])[:count]
-    task = _Task(names, points_mm - centre_mm, radius_mm, helix_design(points_mm, centre_mm, unknowns), prior)
+    task = _HelixTask(names, points_mm - centre_mm, radius_mm, helix_design(points_mm, centre_mm, unknowns), prior)
     return HelixSolution(_fit(task, deviation_mm, np.full(len(deviation_mm), sigma_mm)), analyse(names, task.a), unknowns)
 
 
@@ -162,13 +162,13 @@ def fit_run(run: RunData, *, sigma_mm: float, priors: Priors | None = None) -> H
     lost = -0.5 * run.sign * d / np.linalg.norm(d, axis=1, keepdims=True)
     length = bar_length_sd(run.u_length_mm, run.length_calibrated, priors)
     prior = np.array([np.inf] * 9 + [length] + [priors.backlash_mm] * 3)
-    task = _Task(LINEAR + SETUP + LOST, d, run.radius_mm, np.concatenate([ten, lost], axis=1), prior)
+    task = _HelixTask(LINEAR + SETUP + LOST, d, run.radius_mm, np.concatenate([ten, lost], axis=1), prior)
     estimate = _fit(task, run.deviation_mm, sigma_mm / np.sqrt(run.weight_n))
     return HelixSolution(estimate, analyse(LINEAR + SETUP, ten), "ten")
 
 
 @dataclass(frozen=True)
-class _Task:
+class _HelixTask:
     """Unknowns of a fit: names, points relative to the nominal cup, bar length, design and prior standard deviations."""
 
     names: tuple[str, ...]
@@ -178,13 +178,13 @@ class _Task:
     prior_sd: F1
 
 
-def _fit(task: _Task, deviation_mm: F1, sigma: F1) -> Estimate:
+def _fit(task: _HelixTask, deviation_mm: F1, sigma: F1) -> ParameterEstimate:
     """Gauss-Newton on the exact bar length, then widened by what the misfit demands."""
     if len(deviation_mm) < len(task.names):
         raise ValueError(f"helix: {len(deviation_mm)} readings cannot carry {len(task.names)} unknowns")
     linear = task.names == LINEAR  # the paper's fit is linear; a cup offset bends the sphere
     theta, y = np.zeros(len(task.names)), deviation_mm
-    estimate: Estimate | None = None
+    estimate: ParameterEstimate | None = None
     for _ in range(1 if linear else 4):
         y = deviation_mm - _exact(task, theta) + task.a @ theta
         estimate = solve_map(task.names, task.a, y, sigma, task.prior_sd)
@@ -196,7 +196,7 @@ def _fit(task: _Task, deviation_mm: F1, sigma: F1) -> Estimate:
     return estimate
 
 
-def _demanded_variance(estimate: Estimate) -> float:
+def _demanded_variance(estimate: ParameterEstimate) -> float:
     """How much more variance than stated the misfit demands: what six linear parameters cannot follow is no white noise.
 
     Neighbouring residuals of a real machine are alike, so n readings are worth n (1 - r) / (1 + r), r their correlation at lag one (the
@@ -210,7 +210,7 @@ def _demanded_variance(estimate: Estimate) -> float:
     return float(estimate.chi2 / estimate.dof * (1 + r) / (1 - r))
 
 
-def _exact(task: _Task, theta: F1) -> F1:
+def _exact(task: _HelixTask, theta: F1) -> F1:
     """Bar length minus radius for given parameters; lost motion, small and of either sign, stays linear."""
     offset = theta[6:9] if theta.size > 6 else np.zeros(3)
     length = theta[9] if theta.size > 9 else 0.0

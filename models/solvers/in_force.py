@@ -20,7 +20,7 @@ LEAD_IN_MM = 1.0
 
 
 @dataclass(frozen=True)
-class InForce:
+class AppliedTables:
     """A table that was in force while runs were measured.
 
     Attributes

@@ -18,7 +18,7 @@ KINDS = ("bar", "laser")
 
 
 @dataclass(frozen=True)
-class Readings:
+class PlannedReadings:
     """Whitened, scaled readings of all runs on top of each other.
 
     Attributes
@@ -39,7 +39,7 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Sums:
+class InformationSums:
     """Normal equations per kind of instrument: A^T W A (k, p, p), A^T W y (k, p), y^T W y (k,), sum of weights (k,)."""
 
     gram: F3
@@ -47,23 +47,23 @@ class Sums:
     square: F1
     count: F1
 
-    def minus(self, other: Sums) -> Sums:
+    def minus(self, other: InformationSums) -> InformationSums:
         """What is left without a part of the readings."""
-        return Sums(self.gram - other.gram, self.moment - other.moment, self.square - other.square, self.count - other.count)
+        return InformationSums(self.gram - other.gram, self.moment - other.moment, self.square - other.square, self.count - other.count)
 
-    def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> Sums:
+    def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> InformationSums:
         """The same about other unknowns: the old ones are ``root`` @ the new ones; ``root`` is the unit matrix but for its blocks."""
         gram = self.gram.copy()
         for at in blocks:
             gram[:, :, at] = gram[:, :, at] @ root[np.ix_(at, at)]
         for at in blocks:
             gram[:, at, :] = root[np.ix_(at, at)].T @ gram[:, at, :]
-        return Sums(gram, self.moment @ root, self.square, self.count)
+        return InformationSums(gram, self.moment @ root, self.square, self.count)
 
-    def thinned(self, factor: F1) -> Sums:
+    def thinned(self, factor: F1) -> InformationSums:
         """As if there were fewer independent readings by ``factor``, shape (k,): alike neighbours tell the same thing twice."""
         f: F1 = 1.0 / factor
-        return Sums(self.gram * f[:, None, None], self.moment * f[:, None], self.square * f, self.count * f)
+        return InformationSums(self.gram * f[:, None, None], self.moment * f[:, None], self.square * f, self.count * f)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Grams:
     parts: NDArray[np.float64]
 
 
-def grams(r: Readings) -> Grams:
+def grams(r: PlannedReadings) -> Grams:
     """Gram matrices of all folds and kinds of instrument."""
     folds, p = int(r.fold.max()) + 1, r.a.shape[1]
     out = np.zeros((folds, len(KINDS), p, p))
@@ -87,7 +87,7 @@ def grams(r: Readings) -> Grams:
     return Grams(out)
 
 
-def sums(r: Readings, g: Grams, weight: F1) -> tuple[Sums, ...]:
+def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...]:
     """Normal equations of every fold for given weights of the readings (1: as it is, 0: not used), shape (n,)."""
     found = []
     for f in range(g.parts.shape[0]):
@@ -102,13 +102,13 @@ def sums(r: Readings, g: Grams, weight: F1) -> tuple[Sums, ...]:
             moment.append((w * y) @ r.a[at])
             square.append(float(w @ y**2))
             count.append(float(w.sum()))
-        found.append(Sums(gram, np.array(moment), np.array(square), np.array(count)))
+        found.append(InformationSums(gram, np.array(moment), np.array(square), np.array(count)))
     return tuple(found)
 
 
-def total(parts: tuple[Sums, ...]) -> Sums:
+def total(parts: tuple[InformationSums, ...]) -> InformationSums:
     """All folds together."""
-    return Sums(
+    return InformationSums(
         np.sum([s.gram for s in parts], axis=0),
         np.sum([s.moment for s in parts], axis=0),
         np.sum([s.square for s in parts], axis=0),

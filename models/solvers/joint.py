@@ -16,14 +16,14 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
-from abbe.models.solvers.engine import Fit, Problem, Progress, build, expected_noise, settle
+from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Progress, build, expected_noise, settle
 from abbe.models.solvers.identifiability import Identifiability, combinations_of, taking_part
 from abbe.models.solvers.information import KINDS, total
-from abbe.models.solvers.least_squares import Estimate
+from abbe.models.solvers.least_squares import ParameterEstimate
 from abbe.models.solvers.observability.free import hidden_free
 from abbe.models.solvers.observability.rank import campaign_columns, compressed, stated_knowledge, what_is_seen
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import Setup, with_tool
+from abbe.models.solvers.observe import SetupUnknowns, with_tool
 from abbe.models.solvers.order import RIGID6, OrderChoice, choose, term_levels
 from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residual_tests import ResidualTest, residual_tests
@@ -51,7 +51,7 @@ class JointSolution:
 
     Attributes
     ----------
-    estimate : Estimate
+    estimate : ParameterEstimate
         Smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns. Its covariance holds the noise as it was
         estimated and the uncertainty of the estimated sizes.
     tool_count : int
@@ -83,12 +83,12 @@ class JointSolution:
 
     machine: Machine
     terms: tuple[Term, ...]
-    estimate: Estimate
+    estimate: ParameterEstimate
     identifiability: Identifiability
     runs: tuple[RunFit, ...]
     tool_count: int
     data: tuple[RunData, ...]
-    setup: Setup
+    setup: SetupUnknowns
     prior_sd: F1
     information: F2
     prior_root: F2
@@ -190,7 +190,7 @@ def _six() -> tuple[Term, ...]:
     return tuple(t for t in smooth_terms(1) if t.order == 0 or t.component == t.axis)
 
 
-def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderChoice | None) -> JointSolution:
+def _solution(problem: CampaignProblem, fit: CampaignFit, model: str, order: int, choice: OrderChoice | None) -> JointSolution:
     whole, c = total(fit.parts), fit.components
     information = np.tensordot(np.exp(-c.eta), whole.gram, 1) / np.outer(fit.sizes.typical, fit.sizes.typical)
     factor = np.exp(0.5 * c.eta)
@@ -218,17 +218,17 @@ def _solution(problem: Problem, fit: Fit, model: str, order: int, choice: OrderC
     )
 
 
-def _estimate(problem: Problem, fit: Fit) -> Estimate:
-    """The solution as an `Estimate`; its noise was estimated, so no factor is left to widen it by."""
+def _estimate(problem: CampaignProblem, fit: CampaignFit) -> ParameterEstimate:
+    """The solution as an `ParameterEstimate`; its noise was estimated, so no factor is left to widen it by."""
     effective = float(len(problem.names) - np.trace(fit.posterior.cov))
     noise = np.exp(0.5 * fit.components.eta)[problem.readings.kind] * problem.sigma
     chi2 = float(fit.weight @ (fit.residual_mm / noise) ** 2)
     share = np.clip(1.0 - fit.covariance.diagonal() / fit.prior_sd**2, 0.0, 1.0)
     dof = max(float(fit.weight.sum()) - effective, 1.0)
-    return Estimate(problem.names, fit.theta, fit.covariance, fit.residual_mm, chi2, dof, 1.0, share)
+    return ParameterEstimate(problem.names, fit.theta, fit.covariance, fit.residual_mm, chi2, dof, 1.0, share)
 
 
-def _rank(problem: Problem, order: int) -> Identifiability:
+def _rank(problem: CampaignProblem, order: int) -> Identifiability:
     """What the runs see of the terms up to ``order``, by the rule of the report: lost motion, and what nobody states of a set-up, is free.
 
     The orders above are held by their prior. Combinations are in units of typical sizes.
@@ -243,13 +243,13 @@ def _rank(problem: Problem, order: int) -> Identifiability:
     return Identifiability(len(names), seen.rank, seen.effective_rank, seen.condition, hidden, involved)
 
 
-def _fits(problem: Problem, fit: Fit) -> tuple[RunFit, ...]:
+def _fits(problem: CampaignProblem, fit: CampaignFit) -> tuple[RunFit, ...]:
     noise = np.exp(0.5 * fit.components.eta)[problem.readings.kind] * problem.sigma
     parts = zip(problem.runs, problem.split(fit.residual_mm), problem.split(noise), strict=True)
     return tuple(RunFit(r.label, r.kind, v, float(np.sqrt(np.mean(v**2))), float(np.sqrt(np.mean(s**2)))) for r, v, s in parts)
 
 
-def _outliers(problem: Problem, fit: Fit) -> tuple[Outlier, ...]:
+def _outliers(problem: CampaignProblem, fit: CampaignFit) -> tuple[Outlier, ...]:
     found = []
     for run, size, weight in zip(problem.runs, problem.split(fit.size), problem.split(fit.weight), strict=True):
         found += [Outlier(run.label, int(i), float(size[i]), float(weight[i])) for i in np.flatnonzero(weight < 1.0)]

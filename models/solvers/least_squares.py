@@ -1,7 +1,7 @@
 """Weighted linear least squares with an explicit prior, full covariance, and what the data alone can tell.
 
-The prior is part of the statement, never hidden: `Estimate.data_share` says for every parameter how much of its information came from the
-data. Parameters that live on the prior alone are named by `abbe.models.solvers.identifiability`.
+The prior is part of the statement, never hidden: `ParameterEstimate.data_share` says for every parameter how much of its information came
+from the data. Parameters that live on the prior alone are named by `abbe.models.solvers.identifiability`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from abbe.models.arrays import F1, F2
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """Solution of one linear problem.
 
     Attributes
@@ -53,7 +53,7 @@ class Estimate:
         return float(np.sqrt(self.covariance[i, i]))
 
 
-def solve_map(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> Estimate:
+def solve_map(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> ParameterEstimate:
     """Most probable parameters of ``y = a @ theta + noise`` with independent zero-mean normal priors.
 
     Parameters
@@ -81,7 +81,7 @@ def solve_map(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> 
     chi2 = float(((residual * w) ** 2).sum())
     dof = max(float(y.size) - effective, 1.0)
     factor = max(1.0, chi2 / dof)
-    return Estimate(names, x * scale, cov * np.outer(scale, scale) * factor, residual, chi2, dof, factor, np.clip(share, 0.0, 1.0))
+    return ParameterEstimate(names, x * scale, cov * np.outer(scale, scale) * factor, residual, chi2, dof, factor, np.clip(share, 0.0, 1.0))
 
 
 def _check(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> None:

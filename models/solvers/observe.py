@@ -16,11 +16,11 @@ from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import Term
 from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe_kinematics import LOST, Places, with_tool
-from abbe.models.solvers.observe_setup import Setup, bar_length_name, perpendicular, setup_unknowns
+from abbe.models.solvers.observe_kinematics import LOST, AxisPlaces, with_tool
+from abbe.models.solvers.observe_setup import SetupUnknowns, bar_length_name, perpendicular, setup_unknowns
 
 __all__ = [
-    "Setup",
+    "SetupUnknowns",
     "bar_normals",
     "linearise",
     "perpendicular",
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> F1:
+def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns, theta: F1) -> F1:
     """Reading of a run for given unknowns, exact, shape (n,), mm: bar length minus radius, or displacement minus nominal.
 
     Parameters
@@ -41,7 +41,7 @@ def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setu
         Nominal machine; terms of its error motions.
     run : RunData
         Where the axes were commanded to; its readings are not looked at.
-    setup : Setup
+    setup : SetupUnknowns
         Set-up unknowns of the campaign (`setup_unknowns`); one that has no name there is taken as zero.
     theta : array, shape (terms + 3 + set-up,)
         Coefficients (mm, rad), lost motion (mm), set-up unknowns.
@@ -49,17 +49,17 @@ def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setu
     return _of(machine, terms, run, setup, theta).reading()
 
 
-def run_jacobian(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> F2:
+def run_jacobian(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns, theta: F1) -> F2:
     """Exact analytic derivative of `predict` at given unknowns, shape (n, terms + 3 + set-up); parameters as there."""
     return _of(machine, terms, run, setup, theta).jacobian()
 
 
-def run_design(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup) -> F2:
+def run_design(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns) -> F2:
     """Linearised reading per unit of every unknown: `run_jacobian` of the perfect machine in a perfect set-up."""
     return run_jacobian(machine, terms, run, setup, np.zeros(len(terms) + LOST + len(setup.names)))
 
 
-def linearise(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> tuple[F1, F2]:
+def linearise(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns, theta: F1) -> tuple[F1, F2]:
     """`predict` and `run_jacobian` at once, for a step of an iteration."""
     at = _of(machine, terms, run, setup, theta)
     return at.reading(), at.jacobian()
@@ -92,17 +92,17 @@ class _SetupValues:
         return out
 
 
-def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setup, theta: F1) -> _Bar | _Laser:
+def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns, theta: F1) -> _Bar | _Laser:
     n_machine = len(terms) + LOST
     if theta.shape != (n_machine + len(setup.names),):
         raise ValueError(f"run {run.label}: {theta.size} unknowns given, {n_machine + len(setup.names)} expected")
     machine = with_tool(machine, run.tool_mm)
     known = _SetupValues({name: i for i, name in enumerate(setup.names)}, theta[n_machine:])
-    places = Places.of(machine, terms, run.axes_mm, run.sign)
+    places = AxisPlaces.of(machine, terms, run.axes_mm, run.sign)
     if run.kind == "laser":
         return _Laser(run, places, known, places.motions(theta))
     assert run.centre_mm is not None
-    cup = Places.of(machine, terms, run.centre_mm[None], np.zeros((1, 3)))
+    cup = AxisPlaces.of(machine, terms, run.centre_mm[None], np.zeros((1, 3)))
     return _Bar(run, places, known, places.motions(theta), cup, cup.motions(theta), run.t_s - setup.start_s.get(run.setup, run.t_s[0]))
 
 
@@ -115,10 +115,10 @@ class _Bar:
     """
 
     run: RunData
-    places: Places
+    places: AxisPlaces
     known: _SetupValues
     motions: F3
-    cup: Places
+    cup: AxisPlaces
     cup_motions: F3
     since_s: F1
 
@@ -160,7 +160,7 @@ class _Laser:
     """
 
     run: RunData
-    places: Places
+    places: AxisPlaces
     known: _SetupValues
     motions: F3
 

@@ -22,7 +22,7 @@ def with_tool(machine: Machine, tool_mm: F1 | None) -> Machine:
 
 
 @dataclass(frozen=True)
-class Places:
+class AxisPlaces:
     """Commanded positions of one machine and tool with everything about them that no unknown changes.
 
     Attributes
@@ -45,7 +45,7 @@ class Places:
     column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
     @classmethod
-    def of(cls, machine: Machine, terms: tuple[Term, ...], axes_mm: F2, sign: F2) -> Places:
+    def of(cls, machine: Machine, terms: tuple[Term, ...], axes_mm: F2, sign: F2) -> AxisPlaces:
         """Evaluate the terms' functions at commanded positions (n, 3)."""
         column = np.array([6 * t.axis + t.component for t in terms], dtype=np.intp)
         return cls(machine, axes_mm, sign, term_values(terms, axes_mm, machine.stroke_mm), column)

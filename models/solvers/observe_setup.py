@@ -42,7 +42,7 @@ BAR_DIGITS = 2
 
 
 @dataclass(frozen=True)
-class Setup:
+class SetupUnknowns:
     """Names and prior standard deviations of the set-up unknowns of a campaign; when each ball-bar set-up was first read, s."""
 
     names: tuple[str, ...]
@@ -50,7 +50,7 @@ class Setup:
     start_s: Mapping[str, float] = field(default_factory=dict)
 
 
-def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine | None = None) -> Setup:
+def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine | None = None) -> SetupUnknowns:
     """Set-up unknowns of a set of runs, named as the module says.
 
     Runs with the same nominal radius share one bar; where they state its length differently, the widest statement is believed. Runs with
@@ -74,7 +74,7 @@ def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine |
             sd |= _bar_unknowns(run, sd, priors, spans[run.setup])
         else:
             sd |= _laser_unknowns(run, priors)
-    return Setup(tuple(sd), np.array(list(sd.values())), {name: start for name, (start, _) in spans.items()})
+    return SetupUnknowns(tuple(sd), np.array(list(sd.values())), {name: start for name, (start, _) in spans.items()})
 
 
 def _bar_unknowns(run: RunData, known: Mapping[str, float], priors: Priors, span_s: tuple[float, float]) -> dict[str, float]:

@@ -10,7 +10,7 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
 from abbe.models.solvers.components import Components
-from abbe.models.solvers.information import I1, Sums, total
+from abbe.models.solvers.information import I1, InformationSums, total
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import SizeModel
 
@@ -52,7 +52,7 @@ def term_levels(terms: tuple[Term, ...], rest: int) -> I1:
     return np.array(own + [-1] * rest, dtype=np.int64)
 
 
-def truncated_evidence(sums: Sums, c: Components, model: SizeModel, level: I1) -> tuple[tuple[int, ...], F1]:
+def truncated_evidence(sums: InformationSums, c: Components, model: SizeModel, level: I1) -> tuple[tuple[int, ...], F1]:
     """Log evidence of every truncation of the model; constants that all levels share are left out.
 
     A truncated model has no Legendre coefficients above its level; the others keep their prior covariance.
@@ -89,7 +89,7 @@ def _without_setup(gram: F2, moment: F1, root: F2, level: I1) -> tuple[F2, F1, f
     return gram[np.ix_(terms, terms)] - half[:, :-1].T @ half[:, :-1], moment[terms] - half[:, :-1].T @ z, fixed
 
 
-def choose(parts: tuple[Sums, ...], c: Components, model: SizeModel, level: I1) -> OrderChoice:
+def choose(parts: tuple[InformationSums, ...], c: Components, model: SizeModel, level: I1) -> OrderChoice:
     """Score all levels on held-out folds (their set-up unknowns integrated out), or by evidence where fewer than 3 folds exist.
 
     log p(held-out | others) = log p(all) - log p(others). Sizes and noise are those of all readings; the unknowns themselves never see

@@ -20,7 +20,7 @@ from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from abbe.models.machine import Machine
 from abbe.models.solvers.evidence import OUTLIER_SHARE, Part, Posterior, conditional, scatter, together
 from abbe.models.solvers.observations import RunData, block_average, nominal_reading
-from abbe.models.solvers.observe import Setup, run_design, setup_unknowns
+from abbe.models.solvers.observe import SetupUnknowns, run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
 
 WIDE = Priors(
@@ -56,7 +56,7 @@ LARGE_MM = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Suspect:
+class SuspectRun:
     """A run that does not fit the others.
 
     Attributes
@@ -101,14 +101,14 @@ class _Model:
 
     machine: Machine
     terms: tuple[Term, ...]
-    setup: Setup
+    setup: SetupUnknowns
     scale: F1
 
     def design(self, run: RunData) -> F2:
         return run_design(self.machine, self.terms, _shortened(run), self.setup) * self.scale
 
 
-def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG) -> tuple[Suspect, ...]:
+def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG) -> tuple[SuspectRun, ...]:
     """Runs that contradict the others, worst first; each is set aside before the next is looked for.
 
     Parameters
@@ -120,7 +120,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
     """
     if len(runs) < 2:
         return ()
-    left, found = _prepared(machine, runs), list[Suspect]()
+    left, found = _prepared(machine, runs), list[SuspectRun]()
     while len(left) > 1 and len(found) < len(runs) // 2:
         worst = _worst(left, limit)
         if worst is None:
@@ -202,7 +202,7 @@ def _part(a: F2, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1
     return Part(a[~drop] / sigma, y[~drop] / sigma, log_sigma)
 
 
-def _worst(runs: Sequence[_Run], limit: float) -> Suspect | None:
+def _worst(runs: Sequence[_Run], limit: float) -> SuspectRun | None:
     as_is = together([r.as_is for r in runs]).log_evidence
     found = [_judged(run, [r.as_is for r in runs if r is not run], as_is) for run in runs]
     found = [s for s in found if s.gain > limit and (s.cause != "other" or s.misfit_mm > max(GROSS * s.expected_mm, GROSS_MM))]
@@ -212,7 +212,7 @@ def _worst(runs: Sequence[_Run], limit: float) -> Suspect | None:
     return replace(worst, tied=tuple(s.run for s in found if s.run != worst.run and worst.gain - s.gain < limit))
 
 
-def _judged(run: _Run, rest: list[Part], as_is: float) -> Suspect:
+def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
     """A run taken to be wrong in the way that explains the campaign best."""
     others = together(rest)
     best, cause = others.log_evidence + together([run.as_is]).log_evidence, "other"
@@ -220,7 +220,7 @@ def _judged(run: _Run, rest: list[Part], as_is: float) -> Suspect:
         if others.log_evidence + log_p > best + NAMED * (cause == "other"):
             best, cause = others.log_evidence + log_p, name
     misfit, expected = _misfit(others, run)
-    return Suspect(run.label, cause, best - as_is, misfit, expected)
+    return SuspectRun(run.label, cause, best - as_is, misfit, expected)
 
 
 def _swapped(run: RunData) -> dict[str, RunData]:

@@ -17,7 +17,7 @@ STEEL_PER_K = 11.5e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class StatedInputs:
     """Stated standard uncertainties that no reading of the campaign can show.
 
     Attributes
@@ -69,11 +69,11 @@ class Inputs:
         if self.orders_above < 0 or not self.repeatability_dof > 0:
             raise ValueError("uncertainty inputs: orders_above must be 0 or more, repeatability_dof above 0")
 
-    def as_measured(self) -> Inputs:
+    def as_measured(self) -> StatedInputs:
         """The same for a machine whose scales are as warm as while it was measured: without the temperature of the scales."""
         return replace(self, u_scale_temperature_k=0.0)
 
-    def of_the_data_alone(self) -> Inputs:
+    def of_the_data_alone(self) -> StatedInputs:
         """The same without everything that is only stated: what is left is the covariance of the solution itself."""
         return replace(
             self,

@@ -14,7 +14,7 @@ FEWEST = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Repeatability:
+class RepeatabilityEstimate:
     """Scatter of equal approaches.
 
     ``machine_mm``: standard deviation of the machine along the instrument, sensor noise taken out; ``reading_mm``: of the readings as they
@@ -26,7 +26,7 @@ class Repeatability:
     dof: float
 
 
-def machine_repeatability(runs: tuple[RunData, ...], kind: str, sensor_mm: float) -> Repeatability | None:
+def machine_repeatability(runs: tuple[RunData, ...], kind: str, sensor_mm: float) -> RepeatabilityEstimate | None:
     """Pooled standard deviation of readings of one instrument at equal positions, approached in equal directions, in one set-up.
 
     Zero and drift of every run are taken out first. None: too little was repeated.
@@ -63,7 +63,7 @@ def machine_repeatability(runs: tuple[RunData, ...], kind: str, sensor_mm: float
     variance = float(np.sum((left - known @ fit) ** 2) / dof)
     averaged = np.concatenate([1.0 / r.weight_n for r in chosen])[repeated]
     machine = variance - sensor_mm**2 * float(averaged.mean())
-    return Repeatability(float(np.sqrt(max(machine, 0.0))), float(np.sqrt(variance)), float(dof))
+    return RepeatabilityEstimate(float(np.sqrt(max(machine, 0.0))), float(np.sqrt(variance)), float(dof))
 
 
 def _places(runs: list[RunData]) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:

@@ -21,7 +21,7 @@ from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import run_design
 from abbe.models.solvers.priors import Priors, term_prior_sd
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.response import Response, response
 
 # What error motions of higher order than the chosen one may still do: the price of a smooth model.
@@ -108,7 +108,7 @@ FROM_READINGS = frozenset({"bar_noise", "laser_noise", "estimated_sizes"})
 
 
 LASER_SCALE = "laser_scale"
-"""Unknown of the solution that stands for the wavelength, held by its prior; a solution without it gets `Inputs.u_wavelength`."""
+"""Unknown of the solution that stands for the wavelength, held by its prior; a solution without it gets `StatedInputs.u_wavelength`."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class ErrorSources:
     """
 
     solution: JointSolution
-    inputs: Inputs
+    inputs: StatedInputs
     terms: tuple[Term, ...]
     coefficients: F1
     sources: tuple[Source, ...]
@@ -165,21 +165,21 @@ class ErrorSources:
         raise KeyError(name)
 
 
-def error_sources(solution: JointSolution, inputs: Inputs | None = None) -> ErrorSources:
+def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -> ErrorSources:
     """The sources of uncertainty of a solution.
 
     Parameters
     ----------
     solution : JointSolution
-    inputs : Inputs, optional
+    inputs : StatedInputs, optional
         Stated inputs; default: the documented ones.
 
     Returns
     -------
     ErrorSources
-        Without the stated inputs (`Inputs.of_the_data_alone`) the sources add up to ``solution.term_covariance``.
+        Without the stated inputs (`StatedInputs.of_the_data_alone`) the sources add up to ``solution.term_covariance``.
     """
-    inputs = inputs or Inputs()
+    inputs = inputs or StatedInputs()
     r = response(solution)
     n = len(solution.terms)
     found = [*_noise(r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
@@ -222,7 +222,7 @@ def _compressed(factor: F2) -> F2:
     return np.asarray(linalg.qr(factor.T, mode="r")[0][: factor.shape[0]].T)
 
 
-def _noise(r: Response, inputs: Inputs) -> list[Source]:
+def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
     """Scatter of the readings per instrument, the machine's repeatability told apart, and that sizes were estimated at all."""
     out = []
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
@@ -268,7 +268,7 @@ def _prior_source(name: str, is_term: bool) -> str:
     return "wavelength" if name == LASER_SCALE else "setup"
 
 
-def _calibration(solution: JointSolution, r: Response, inputs: Inputs) -> list[Source]:
+def _calibration(solution: JointSolution, r: Response, inputs: StatedInputs) -> list[Source]:
     """Errors that all readings of one instrument share: the laser's wavelength, the bar's temperature."""
     out = []
     lasers = any(run.kind == "laser" for run in solution.data)
@@ -289,7 +289,7 @@ def _travel(run: RunData) -> F1:
     return np.asarray((run.axes_mm - run.axes_mm[0]) @ run.beam)
 
 
-def _temperature(solution: JointSolution, inputs: Inputs) -> list[Source]:
+def _temperature(solution: JointSolution, inputs: StatedInputs) -> list[Source]:
     """Scales warmer than thought: a linear positioning error of each axis, alpha u_T times the travel from the start of its stroke.
 
     Written as the term of Legendre order 1, whose function is twice the share of the stroke (`abbe.models.geometry.bases.term_values`).

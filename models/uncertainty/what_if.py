@@ -28,7 +28,7 @@ Kind = Literal["rms", "largest", "range"]
 
 
 @dataclass(frozen=True)
-class Figure:
+class ForecastFigure:
     """A figure of the deviation.
 
     ``per_unit``: what it is made of, per unit of each coefficient, shape (m, k, P) with k components a place. ``kind``: root mean square
@@ -41,7 +41,7 @@ class Figure:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class Forecast:
     """A figure before and after, and what is gained: mean over the draws and standard uncertainty, mm."""
 
     name: str
@@ -53,10 +53,10 @@ class Outcome:
     u_gain_mm: float
 
 
-def volume_figures(known: KnownField, nodes: int = 6) -> list[Figure]:
+def volume_figures(known: KnownField, nodes: int = 6) -> list[ForecastFigure]:
     """Volumetric error: rms and largest length over an even grid of the strokes, best-fit rigid motion removed."""
     d = known.per_unit(volume_grid(known.machine.stroke_mm, nodes))
-    return [Figure("volume_rms", "rms", d), Figure("volume_max", "largest", d)]
+    return [ForecastFigure("volume_rms", "rms", d), ForecastFigure("volume_max", "largest", d)]
 
 
 def expected_rms(known: KnownField, nodes: int) -> tuple[float, float]:
@@ -76,7 +76,7 @@ def expected_rms(known: KnownField, nodes: int) -> tuple[float, float]:
     return float(np.sqrt(max(square - u * u, 0.0))), u
 
 
-def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions: int = 11) -> list[Figure]:
+def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions: int = 11) -> list[ForecastFigure]:
     """Range of the deviation along each of the four body diagonals, so far from the ends of the strokes (ISO 230-6 style)."""
     box = known.machine.stroke_mm + np.array([clearance_mm, -clearance_mm])
     out = []
@@ -84,21 +84,21 @@ def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions
         start, end = diagonal_ends(box, name)
         along = (end - start) / np.linalg.norm(end - start)
         d = known.per_unit(straight_line(start, end, positions, back=False))
-        out.append(Figure(f"diagonal_{name}", "range", np.einsum("i,mip->mp", along, d)[:, None, :]))
+        out.append(ForecastFigure(f"diagonal_{name}", "range", np.einsum("i,mip->mp", along, d)[:, None, :]))
     return out
 
 
-def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: float = 3.0, positions: int = 180) -> Figure:
+def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: float = 3.0, positions: int = 180) -> ForecastFigure:
     """Rms reading of a ball-bar along the helix about a cup, centre and length of the bar fitted away."""
     at = helix_points(centre_mm, radius_mm, turns=turns, n=positions, law="area", axis=2)
     n = (at - centre_mm) / radius_mm
     reading = np.einsum("mi,mip->mp", n, known.per_unit(at))
     free = np.concatenate([n, np.ones((len(n), 1))], axis=1)
     left = reading - free @ np.linalg.lstsq(free, reading, rcond=None)[0]
-    return Figure("helix_rms", "rms", left[:, None, :])
+    return ForecastFigure("helix_rms", "rms", left[:, None, :])
 
 
-def what_if(known: KnownField, taken_off: F1, figures: Sequence[Figure], *, draws: int = DRAWS, seed: int = SEED) -> list[Outcome]:
+def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure], *, draws: int = DRAWS, seed: int = SEED) -> list[Forecast]:
     """Figures as the machine is, and as it would be with a part of what the solution says corrected.
 
     Parameters
@@ -107,7 +107,7 @@ def what_if(known: KnownField, taken_off: F1, figures: Sequence[Figure], *, draw
         The solution.
     taken_off : array, shape (P,)
         Coefficients of the correction: the estimate of some motions (`KnownField.estimate_of`), mean linear errors (`KnownField.linear`).
-    figures : sequence of Figure
+    figures : sequence of ForecastFigure
         What to ask.
     draws, seed : int
         Monte Carlo trials; equal seeds give equal numbers.
@@ -117,15 +117,15 @@ def what_if(known: KnownField, taken_off: F1, figures: Sequence[Figure], *, draw
     return [_outcome(f, truth, truth - taken_off[:, None]) for f in figures]
 
 
-def _outcome(figure: Figure, before: F2, after: F2) -> Outcome:
+def _outcome(figure: ForecastFigure, before: F2, after: F2) -> Forecast:
     first, last = _sizes(figure, before), _sizes(figure, after)
     gain = first - last
     means = [float(v.mean()) for v in (first, last, gain)]
     spreads = [float(v.std(ddof=1)) for v in (first, last, gain)]
-    return Outcome(figure.name, means[0], spreads[0], means[1], spreads[1], means[2], spreads[2])
+    return Forecast(figure.name, means[0], spreads[0], means[1], spreads[1], means[2], spreads[2])
 
 
-def _sizes(figure: Figure, coefficients: F2) -> F1:
+def _sizes(figure: ForecastFigure, coefficients: F2) -> F1:
     """The figure for each column of coefficients, shape (draws,)."""
     m, k, p = figure.per_unit.shape
     values = (figure.per_unit.reshape(m * k, p) @ coefficients).reshape(m, k, -1)
@@ -135,7 +135,7 @@ def _sizes(figure: Figure, coefficients: F2) -> F1:
     return np.asarray(np.sqrt(square.mean(axis=0) if figure.kind == "rms" else square.max(axis=0)))
 
 
-def check_figures(known: KnownField, cup: tuple[F1, float] | None = None) -> list[Figure]:
+def check_figures(known: KnownField, cup: tuple[F1, float] | None = None) -> list[ForecastFigure]:
     """Everything that a check measures and a map shows: volume, body diagonals, helix about ``cup`` (centre, radius) where there is one."""
     out = [*volume_figures(known), *diagonal_figures(known)]
     return out if cup is None else [*out, helix_figure(known, *cup)]

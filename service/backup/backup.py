@@ -38,7 +38,7 @@ SERVER_HELP = "copy it with pg_dump --format=custom, bring it back with pg_resto
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class BackupSource:
     """What is backed up.
 
     Parameters
@@ -72,7 +72,7 @@ def sqlite_file(url: str, what: str) -> Path:
     return Path(str(parsed.database))
 
 
-def back_up(source: Source, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> dict[str, Any]:
+def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> dict[str, Any]:
     """Make a backup: a new folder (0700, files 0600) that is there as a whole or not at all. Nothing is interrupted by it.
 
     Everything that was on the disk when this was called is in it: samples first, for they leave their segment only when the database has
@@ -80,7 +80,7 @@ def back_up(source: Source, target: Path, utcnow: Callable[[], datetime], *, wit
 
     Parameters
     ----------
-    source : Source
+    source : BackupSource
         What.
     target : Path
         New folder.
@@ -130,7 +130,7 @@ def _new_folder(target: Path) -> Path:
     return part
 
 
-def _fill(part: Path, database: Path, source: Source, utcnow: Callable[[], datetime], *, with_key: bool) -> dict[str, Any]:
+def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[], datetime], *, with_key: bool) -> dict[str, Any]:
     made = utcnow().isoformat(timespec="seconds")
     segments = _segments(part / CAPTURE, source)
     copy_online(database, part / DATABASE)
@@ -157,7 +157,7 @@ def _fill(part: Path, database: Path, source: Source, utcnow: Callable[[], datet
     return doc
 
 
-def _segments(folder: Path, source: Source) -> int:
+def _segments(folder: Path, source: BackupSource) -> int:
     """Copy what the capture holds; a segment that goes away meanwhile is in the database, which is copied after it."""
     own = segment_folder(source.url, source.capture)
     found = [path for one in (own, *other_folders(source.url, source.capture, own)) for path in sorted(one.glob("run-*"))]
@@ -177,7 +177,7 @@ def _segments(folder: Path, source: Source) -> int:
     return copied
 
 
-def _audit(part: Path, source: Source, *, with_key: bool) -> dict[str, Any]:
+def _audit(part: Path, source: BackupSource, *, with_key: bool) -> dict[str, Any]:
     """Copy the audit's files: heads after the database, so that none is missing, and none beyond what the copied database holds."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)

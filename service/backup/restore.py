@@ -12,7 +12,7 @@ from pathlib import Path
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base, this_account
 from abbe.service.audit.chain import Event
-from abbe.service.backup.backup import Source, sqlite_file
+from abbe.service.backup.backup import BackupSource, sqlite_file
 from abbe.service.backup.backup_files import CAPTURE, DATABASE, HEADS, KEY, Backup, audit_faults, read_backup
 from abbe.service.capture.settings import segment_folder
 from abbe.service.errors import BackupRefused
@@ -50,7 +50,9 @@ class _Places:
         return [path for path in (*database, self.capture, self.key, self.heads) if path.exists()]
 
 
-def restore(folder: Path, into: Source, utcnow: Callable[[], datetime], *, replace: bool = False, key_file: Path | None = None) -> Restored:
+def restore(
+    folder: Path, into: BackupSource, utcnow: Callable[[], datetime], *, replace: bool = False, key_file: Path | None = None
+) -> Restored:
     """Bring a backup back.
 
     Everything is proved on a copy beside the place before anything there is touched; what was there is renamed, not deleted; the database
@@ -60,7 +62,7 @@ def restore(folder: Path, into: Source, utcnow: Callable[[], datetime], *, repla
     ----------
     folder : Path
         The backup.
-    into : Source
+    into : BackupSource
         Where to.
     utcnow : callable
         Clock.
@@ -98,7 +100,7 @@ def restore(folder: Path, into: Source, utcnow: Callable[[], datetime], *, repla
     return Restored(backup, database, records, len(backup.segments), aside)
 
 
-def _free(into: Source, database: Path, *, replace: bool) -> _Places:
+def _free(into: BackupSource, database: Path, *, replace: bool) -> _Places:
     """Where everything goes, if it may."""
     if not database.parent.is_dir():
         raise BackupRefused(f"folder {database.parent} does not exist", "create it, or give another --store")

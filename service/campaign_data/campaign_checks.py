@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.plausibility import Suspect, suspects
+from abbe.models.solvers.plausibility import SuspectRun, suspects
 from abbe.service.campaign_data.campaign_issue import Finding
 from abbe.service.campaign_data.copied_runs import copies
 from abbe.service.campaign_data.run_geometry import geometry
@@ -181,7 +181,7 @@ def check_readings(machine: Machine, data: Sequence[RunData]) -> list[Finding]:
     return [_suspect(s, alone=len(found) == 1) for s in found]
 
 
-def _suspect(s: Suspect, *, alone: bool) -> Finding:
+def _suspect(s: SuspectRun, *, alone: bool) -> Finding:
     gross = s.misfit_mm > OTHER_RATIO * s.expected_mm and s.misfit_mm > OTHER_MM
     if s.tied:
         who = " or ".join(("it", *(f"run {name}" for name in s.tied)))
@@ -196,5 +196,5 @@ def _suspect(s: Suspect, *, alone: bool) -> Finding:
     return Finding(s.run, what, "look at its residuals; measure it again, or leave it out (--without)", False)
 
 
-def _misfit(s: Suspect) -> str:
+def _misfit(s: SuspectRun) -> str:
     return f"off by {s.misfit_mm * 1e3:.2g} µm rms where {s.expected_mm * 1e3:.2g} are expected"

@@ -30,7 +30,7 @@ STILL_MOUNTED = "cup and bar may still be mounted: take them out before anything
 
 
 @dataclass(frozen=True, slots=True)
-class Readings:
+class PlaceReadings:
     """One pass over the places: commanded positions, shape (n, 3), and readings, shape (n,), mm."""
 
     places_mm: F2
@@ -60,7 +60,7 @@ class BarPlaces:
     def __post_init__(self) -> None:
         self.centre_mm, self.radius_mm = hemisphere(self.site.machine, (0.5, 0.5, 0.35), 0.6)
 
-    async def read(self, what: str) -> Readings:
+    async def read(self, what: str) -> PlaceReadings:
         """Read all places with the table in force, as a campaign of its own.
 
         Raises
@@ -81,9 +81,9 @@ class BarPlaces:
         if not all(columns["valid"]):
             raise MeasurementFault("the ball-bar did not read at every place", "check the bar, then begin again")
         places = np.stack([columns[f"{a}_mm"] for a in "xyz"], axis=1)
-        return Readings(places, np.asarray(columns["deviation_mm"], dtype=np.float64))
+        return PlaceReadings(places, np.asarray(columns["deviation_mm"], dtype=np.float64))
 
-    def directions(self, readings: Readings) -> F2:
+    def directions(self, readings: PlaceReadings) -> F2:
         """Unit vectors from the cup to the tool, shape (n, 3)."""
         out = readings.places_mm - np.array(self.centre_mm)
         return np.asarray(out / np.linalg.norm(out, axis=1)[:, None], dtype=np.float64)

@@ -17,7 +17,7 @@ from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching, check_interlocks
 from abbe.service.sequences.journal import DONE, RUN, Journal
 from abbe.service.sequences.path_resume import Onward
-from abbe.service.sequences.preconditions import Expected, check_expected
+from abbe.service.sequences.preconditions import ExpectedTable, check_expected
 from abbe.service.sequences.resume_plan import Attempt, Rewind, anew, end_of, remounted, rest_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import CampaignPlan, TestPlan
@@ -147,7 +147,7 @@ class Resumed:
     used: frozenset[tuple[str, int]]
     mounted_us: dict[str, int]
     said: tuple[str, ...]
-    expected: Expected | None = None
+    expected: ExpectedTable | None = None
 
 
 @dataclass
@@ -162,7 +162,7 @@ class Conduct:
     control: Control
     watching: Watching
     journal: Journal
-    expected: Expected
+    expected: ExpectedTable
     confirm: Confirm = nobody
     mountings: dict[str, int] = field(default_factory=dict)
     used: set[tuple[str, int]] = field(default_factory=set)

@@ -16,7 +16,7 @@ import numpy as np
 
 from abbe.drivers.api import ControllerStatus, LaserReading, Point
 from abbe.models.alignment.clock import ClockFit, fit_clock
-from abbe.models.alignment.dwell import DwellReading, Dwells, Planned, detect, merged, named
+from abbe.models.alignment.dwell import DwellReading, Dwells, PlannedDwell, detect, merged, named
 from abbe.models.alignment.lag import Lag, fit_lag
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
@@ -41,7 +41,7 @@ U_DELAY_S = 2e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ListenRequest:
     """One reading of the recipe: where, in what direction."""
 
     target_mm: Point
@@ -58,7 +58,7 @@ class Heard:
     statuses: list[ControllerStatus] = field(default_factory=list)
 
 
-def wanted(test: TestPlan) -> list[Wanted]:
+def wanted(test: TestPlan) -> list[ListenRequest]:
     """The readings of a laser test, in order.
 
     Raises
@@ -66,14 +66,14 @@ def wanted(test: TestPlan) -> list[Wanted]:
     MeasurementFault
         Not a test of single laser readings.
     """
-    here, out = None, list[Wanted]()
+    here, out = None, list[ListenRequest]()
     beam = np.array(next((s.beam for s in test.steps if isinstance(s, MountLaser)), test.setup.get("nominal_beam", (0.0, 0.0, 0.0))))
     for step in test.steps:
         if isinstance(step, MoveTo):
             here = step.target_mm
         elif isinstance(step, ReadLaser) and here is not None:
             first = out[0].target_mm if out else here
-            out.append(Wanted(here, step.direction, float(beam @ np.subtract(here, first)), step.settle_s))
+            out.append(ListenRequest(here, step.direction, float(beam @ np.subtract(here, first)), step.settle_s))
     if len(out) < 2:
         raise MeasurementFault(
             f"test {test.label} has no single laser readings", "listening takes laser tests; measure the others by themselves"
@@ -156,9 +156,9 @@ async def _hear(session: Session, quiet_s: float) -> Heard:
             return heard
 
 
-def _detected(test: TestPlan, heard: Heard, plan: list[Wanted]) -> tuple[Dwells, tuple[Planned, ...]]:
+def _detected(test: TestPlan, heard: Heard, plan: list[ListenRequest]) -> tuple[Dwells, tuple[PlannedDwell, ...]]:
     t, y = _stream(heard)
-    planned = merged([Planned(one.along_mm, one.settle_s + LASER_DWELL_S) for one in plan])
+    planned = merged([PlannedDwell(one.along_mm, one.settle_s + LASER_DWELL_S) for one in plan])
     try:
         return detect(t, y, planned, settle_s=plan[0].settle_s, zero=0.0), planned
     except ValueError as error:
@@ -212,7 +212,7 @@ def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: 
     return [float(t) for t in np.interp(np.arange(last + 1.0), at, times)]
 
 
-def _record(one: Wanted, reading: DwellReading | None, middle_s: float, heard: Heard, times: Callable[[F1], F1]) -> dict[str, Any]:
+def _record(one: ListenRequest, reading: DwellReading | None, middle_s: float, heard: Heard, times: Callable[[F1], F1]) -> dict[str, Any]:
     """A record as the sequencer makes it, of one standstill; of one that nobody saw the nominal place, marked as missing."""
     near = min(heard.readings, key=lambda r: abs(r.device_us * 1e-6 - middle_s))
     told: dict[str, Any] = {"displacement_tenth_nm": round(one.along_mm / MM_PER_COUNT), "missing": True}

@@ -29,7 +29,7 @@ from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted
 from abbe.service.sequences.interlocks import COMPENSATION_ON
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
 from abbe.service.sequences.needed import check_devices
-from abbe.service.sequences.preconditions import Expected
+from abbe.service.sequences.preconditions import ExpectedTable
 from abbe.service.sequences.resume_plan import Attempt
 from abbe.service.sequences.runner import Runner, Tick
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
@@ -171,7 +171,7 @@ async def _conduct(
 ) -> Conduct:
     """The journal's first line, and what the campaign is carried through with."""
     comp = await session.controller.comp_status()
-    expected = Expected(comp.boot_id, comp.bank_crc[comp.active_bank])
+    expected = ExpectedTable(comp.boot_id, comp.bank_crc[comp.active_bank])
     if manner.resumed is not None and manner.resumed.expected is not None:
         expected = manner.resumed.expected  # the table may have been changed since it was looked at: while a question stood
     begun = {"plan": plan_hash(plan), "source": manner.source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}

@@ -12,7 +12,7 @@ from abbe.models.machine import AXES
 from abbe.models.planning.goal import COVERAGE
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, feed_mm_min
-from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, Step, plan_campaign
+from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, PlanStep, plan_campaign
 from abbe.service.campaigns.plan_instruments import at_this_machine
 from abbe.service.errors import ConfigError
 from abbe.service.events import Progress, ProgressSink, ignore_progress
@@ -33,7 +33,7 @@ BOUND_NOTE = (
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedCampaign:
     """A plan with what the sequencer makes of it: recipes, campaign, dry run of every test, and the recipe file's text.
 
     ``notes``: what a person has to know before it runs.
@@ -54,7 +54,7 @@ def plan_for(
     goal_um: float | None = None,
     tools: Instruments | None = None,
     progress: ProgressSink = ignore_progress,
-) -> Planned:
+) -> PlannedCampaign:
     """Plan a campaign for a machine.
 
     Raises
@@ -82,10 +82,10 @@ def plan_for(
     campaign = paced(CampaignPlan(name, tuple(r.plan(site.machine) for r in recipes)), site.max_feed_mm_min)
     dry = dry_run_campaign(site.machine, campaign, site.max_feed_mm_min)
     note = f"for {site.name}, {plan.minutes:.0f} minutes with set-ups; expected worst U {_um(COVERAGE * plan.u_worst_mm)} um"
-    return Planned(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*said, *plan.doubts))
+    return PlannedCampaign(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*said, *plan.doubts))
 
 
-def recipe_of(step: Step, tools: Instruments) -> Recipe:
+def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:
     """The sequencer's recipe for a planned measurement with these instruments."""
     test: Measurement = step.test
     feed = feed_mm_min(tools, test)
@@ -157,7 +157,7 @@ def step_rows(plan: Plan) -> list[tuple[str, ...]]:
     return rows
 
 
-def plan_page(site: Site, planned: Planned) -> str:
+def plan_page(site: Site, planned: PlannedCampaign) -> str:
     """A page with the picture of the set-ups and what each measurement buys."""
     plan = planned.plan
     paths = [
@@ -181,7 +181,7 @@ def _mount_mm(test: Measurement, path_mm: F2) -> F1:
     return np.array(test.centre_mm) if isinstance(test, HelixTest) else path_mm[0]
 
 
-def plan_doc(planned: Planned) -> dict[str, Any]:
+def plan_doc(planned: PlannedCampaign) -> dict[str, Any]:
     """The plan for programs, micrometres and minutes."""
     plan, goal = planned.plan, planned.plan.goal
     steps = [

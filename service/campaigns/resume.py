@@ -27,7 +27,7 @@ from abbe.service.runs.codec import decode_json
 from abbe.service.runs.columns import LASER_CHANNEL
 from abbe.service.sequences.interlocks import BEAM_BITS, MOVING, check_interlocks, check_ours
 from abbe.service.sequences.journal import BEGUN, ENDED, HAND, RUN
-from abbe.service.sequences.preconditions import Expected, check_expected
+from abbe.service.sequences.preconditions import ExpectedTable, check_expected
 from abbe.service.sequences.resume_plan import anew, remounted
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
@@ -106,7 +106,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     lines = read_journal(store, campaign)
     _same_plan(store, campaign, lines, site, plan)
     comp = await session.controller.comp_status()
-    expected = Expected(lines.begun["boot_id"], lines.begun["table_crc"])
+    expected = ExpectedTable(lines.begun["boot_id"], lines.begun["table_crc"])
     check_expected(expected, comp.boot_id, comp.bank_crc[comp.active_bank])
     said = [f"campaign {campaign.name!r}: same plan, same machine, same run of the controller, same table"]
     status = await session.controller.status()

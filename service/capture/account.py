@@ -8,7 +8,7 @@ from typing import Any
 
 from abbe.service.capture.drafts import BAR, GAPS, Drafter, gap_of
 from abbe.service.capture.ingest import chunk_of
-from abbe.service.capture.ledger import FLAG_MASK, Gap, Ledger
+from abbe.service.capture.ledger import FLAG_MASK, Ledger, SampleGap
 from abbe.service.capture.records import CHUNK, CLOSE, GAP, Record
 from abbe.service.capture.scan import Scan
 from abbe.service.runs.codec import decode_bar, decode_json
@@ -44,7 +44,7 @@ def ledger_of(chunks: list[ChunkRecord], streams: dict[int, int] | None = None) 
     for chunk in chunks:
         if chunk.channel == GAPS:
             for doc in decode_json(chunk.payload):
-                ledger.add_gap(Gap.of(doc))
+                ledger.add_gap(SampleGap.of(doc))
     return ledger
 
 
@@ -97,18 +97,18 @@ def settle(store: Store, run_id: int, held: Scan) -> Ledger:
     return ledger
 
 
-def _holes(ledger: Ledger, held: Scan) -> list[Gap]:
-    found = [Gap(stream, first, last, DAMAGED, None, None) for stream, first, last in ledger.unaccounted()]
+def _holes(ledger: Ledger, held: Scan) -> list[SampleGap]:
+    found = [SampleGap(stream, first, last, DAMAGED, None, None) for stream, first, last in ledger.unaccounted()]
     ends = ledger.ends()
     for record in held.records:
         if record.kind == CLOSE:  # it says up to where everything had been made safe
             stream, seq = decode_json(record.payload)[0].get("durable", {}).get(BAR, (0, -1))
             if seq >= ends.get(stream, 0):
-                found.append(Gap(stream, ends.get(stream, 0), seq, DAMAGED, None, None))
+                found.append(SampleGap(stream, ends.get(stream, 0), seq, DAMAGED, None, None))
                 ends[stream] = seq + 1
     if held.tail_bytes and not held.closed:
         stream = max(ends, default=0)
-        found.append(Gap(stream, ends.get(stream, 0), None, TORN, None, None))
+        found.append(SampleGap(stream, ends.get(stream, 0), None, TORN, None, None))
     return found
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from abbe.drivers.api import BarBatch, BarSample
-from abbe.service.capture.ledger import OVERRUN_BIT, Gap, Ledger
+from abbe.service.capture.ledger import OVERRUN_BIT, Ledger, SampleGap
 from abbe.service.capture.records import CHUNK, CLOSE, GAP, OPEN, Record
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_json, encode_bar, encode_json
 
@@ -103,9 +103,9 @@ class Drafter:
         at = self._stream if stream in (None, self._stream.number) else _Stream(int(stream or 0))
         if last is not None and last < at.next_seq:  # nobody knows: the numbers went back
             last = None
-        return self.gap_record(Gap(max(0, at.number), at.next_seq, last, cause, at.last_us, after_us))
+        return self.gap_record(SampleGap(max(0, at.number), at.next_seq, last, cause, at.last_us, after_us))
 
-    def gap_record(self, gap: Gap) -> Record:
+    def gap_record(self, gap: SampleGap) -> Record:
         """The record of a gap."""
         record = self._json(GAP, GAPS, [gap.doc()])
         return replace(record, stream=gap.stream, first_seq=gap.first, count=gap.missing)
@@ -172,9 +172,9 @@ class Drafter:
         return number
 
 
-def gap_of(record: Record) -> Gap:
+def gap_of(record: Record) -> SampleGap:
     """The gap that a record tells of."""
-    return Gap.of(decode_json(record.payload)[0])
+    return SampleGap.of(decode_json(record.payload)[0])
 
 
 def _count(batches: list[BarBatch]) -> int:

@@ -15,7 +15,7 @@ OVERRUN_BIT = 1 << 2
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class SampleGap:
     """Samples that are missing, and all that is known about it.
 
     Parameters
@@ -47,9 +47,9 @@ class Gap:
         return asdict(self)
 
     @staticmethod
-    def of(doc: dict[str, Any]) -> Gap:
+    def of(doc: dict[str, Any]) -> SampleGap:
         """From a JSON object."""
-        return Gap(*(doc[name] for name in Gap.__dataclass_fields__))
+        return SampleGap(*(doc[name] for name in SampleGap.__dataclass_fields__))
 
 
 @dataclass(slots=True)
@@ -57,7 +57,7 @@ class Ledger:
     """Account of one run's sequence numbers. Samples and gaps come in any order; `unaccounted` says what no entry covers."""
 
     flagged: dict[str, int] = field(default_factory=dict)
-    gaps: list[Gap] = field(default_factory=list)
+    gaps: list[SampleGap] = field(default_factory=list)
     invalid: int = 0
     _stored: dict[int, list[list[int]]] = field(default_factory=dict)
 
@@ -79,7 +79,7 @@ class Ledger:
         else:
             spans.append([first, last])
 
-    def add_gap(self, gap: Gap) -> None:
+    def add_gap(self, gap: SampleGap) -> None:
         """Book samples that are missing."""
         self.gaps.append(gap)
 

@@ -15,7 +15,7 @@ from typing import Any
 from abbe.drivers.api import BarBatch
 from abbe.service.capture.account import joined, streams_doc
 from abbe.service.capture.drafts import Drafter, Item
-from abbe.service.capture.ledger import Gap
+from abbe.service.capture.ledger import SampleGap
 from abbe.service.capture.records import CHUNK, GAP, Record
 from abbe.service.capture.reserve import Reserve
 from abbe.service.capture.segment import Segment
@@ -233,6 +233,6 @@ class CaptureLog:
                 self._published(record.channel, *self.durable[record.channel])
 
     @property
-    def gaps(self) -> list[Gap]:
+    def gaps(self) -> list[SampleGap]:
         """Gaps so far."""
         return list(self.drafter.ledger.gaps)

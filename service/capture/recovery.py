@@ -133,14 +133,14 @@ def _got(handle: int) -> bool:
     return True
 
 
-__all__ = ["DAMAGED", "Recovered", "ledger_of", "read_segment", "recover_segments"]
+__all__ = ["DAMAGED", "RecoveredRun", "ledger_of", "read_segment", "recover_segments"]
 
 MOST_RUNS = 2**31
 """No database has a row of this number; a damaged segment may name it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Recovered:
+class RecoveredRun:
     """What was done about one segment.
 
     Parameters
@@ -164,7 +164,7 @@ class Recovered:
     text: str
 
 
-def recover_segments(store: Store, settings: CaptureSettings) -> list[Recovered]:
+def recover_segments(store: Store, settings: CaptureSettings) -> list[RecoveredRun]:
     """Take over what a killed process, a power cut or a locked database left in segments. Blocks; call it before anything is measured.
 
     Raises
@@ -194,7 +194,7 @@ class _Runs:
         return self._found[number]
 
 
-def _in_folder(store: Store, folder: Path, settings: CaptureSettings, *, only_ours: bool) -> list[Recovered]:
+def _in_folder(store: Store, folder: Path, settings: CaptureSettings, *, only_ours: bool) -> list[RecoveredRun]:
     """Take over what lies in one folder; in one that may be another database's, only what names a run of this one."""
     if not folder.is_dir() or not any(folder.glob(f"*{SUFFIX}")):
         return []
@@ -203,7 +203,7 @@ def _in_folder(store: Store, folder: Path, settings: CaptureSettings, *, only_ou
         return []
     with held_alone(folder / LOCK_NAME) as alone:
         if not alone:
-            return [Recovered(0, "", 0, 0, f"another process is taking over what is in {folder}; it was left to it")]
+            return [RecoveredRun(0, "", 0, 0, f"another process is taking over what is in {folder}; it was left to it")]
         paths = [path for path in sorted(folder.glob(f"*{SUFFIX}")) if not only_ours or _is_ours(path, known)]
         known = _Runs(store)  # anew: another process may have closed some meanwhile
         found = (_recover_one(store, path, known, settings) for path in paths)
@@ -239,7 +239,7 @@ def _read(path: Path) -> Scan:
     return scan(path.read_bytes())  # not mapped: a file that is cut meanwhile, or a bad sector, would kill the process
 
 
-def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettings) -> Recovered | None:
+def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettings) -> RecoveredRun | None:
     number = path.stem.rpartition("-")[2]
     if not number.isdecimal() or path.name != segment_path(path.parent, int(number)).name:
         return _aside(path, CONFLICT, None, "it has the name of no segment")
@@ -261,7 +261,7 @@ def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettin
         return _give_up(store, path, run, error)
 
 
-def _take_over(store: Store, path: Path, run: RunRecord | None, settings: CaptureSettings) -> Recovered | None:
+def _take_over(store: Store, path: Path, run: RunRecord | None, settings: CaptureSettings) -> RecoveredRun | None:
     held = _read(path)
     if run is None or not _belongs(held, run):
         return _aside(path, ORPHAN, None, "it belongs to no run of this database")
@@ -275,10 +275,10 @@ def _take_over(store: Store, path: Path, run: RunRecord | None, settings: Captur
     if not _closed(store, run, text, ledger, capture):
         return None
     put_away(path, held, keep=settings.keep)
-    return Recovered(run.id, _name(run), added, held.tail_bytes, f"run {_name(run)}: {text}")
+    return RecoveredRun(run.id, _name(run), added, held.tail_bytes, f"run {_name(run)}: {text}")
 
 
-def _of_closed(store: Store, path: Path, run: RunRecord, held: Scan, settings: CaptureSettings) -> Recovered | None:
+def _of_closed(store: Store, path: Path, run: RunRecord, held: Scan, settings: CaptureSettings) -> RecoveredRun | None:
     """A run that was closed before the process could delete the file, or that somebody else closed without it."""
     if settings.keep:
         return None
@@ -305,7 +305,7 @@ def _closed(store: Store, run: RunRecord, text: str, ledger: Ledger | None, capt
     return True
 
 
-def _give_up(store: Store, path: Path, run: RunRecord | None, error: Exception) -> Recovered | None:
+def _give_up(store: Store, path: Path, run: RunRecord | None, error: Exception) -> RecoveredRun | None:
     """Nothing is overwritten and nothing deleted; the run is closed with the reason, so that the machine can be used."""
     why = f"{error.code}: {error}" if isinstance(error, AbbeError) else repr(error)
     done = _aside(path, CONFLICT, run, why)
@@ -317,7 +317,7 @@ def _give_up(store: Store, path: Path, run: RunRecord | None, error: Exception) 
     return done
 
 
-def _aside(path: Path, suffix: str, run: RunRecord | None, why: str) -> Recovered:
+def _aside(path: Path, suffix: str, run: RunRecord | None, why: str) -> RecoveredRun:
     try:
         where = f"it was set aside as {set_aside(path, suffix).name}"
     except OSError as error:
@@ -326,8 +326,8 @@ def _aside(path: Path, suffix: str, run: RunRecord | None, why: str) -> Recovere
     return _told(run, f"{about}{path.name} was not taken over: {why}; {where}")
 
 
-def _told(run: RunRecord | None, text: str) -> Recovered:
-    return Recovered(0 if run is None else run.id, "" if run is None else _name(run), 0, 0, text)
+def _told(run: RunRecord | None, text: str) -> RecoveredRun:
+    return RecoveredRun(0 if run is None else run.id, "" if run is None else _name(run), 0, 0, text)
 
 
 def _name(run: RunRecord) -> str:

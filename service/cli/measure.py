@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from abbe.models.machine import Machine
-    from abbe.service.config import Loaded
+    from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import MachineFile
     from abbe.service.devices.session import Session
     from abbe.service.events import ProgressSink
@@ -114,7 +114,7 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
     return f"check {number}: {result.verdict}: {result.text}"
 
 
-def _said_before(loaded: Loaded, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
+def _said_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
     """What the machine file lacks for this plan is refused; an expired certificate and a timetable that cannot be kept are told.
 
     With a controller `measure` refuses it, after what an interrupted push left there is taken back.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from abbe.service.papers.check import Outcome
-    from abbe.service.papers.row import Row, Status
+    from abbe.service.papers.row import PaperRow, Status
     from abbe.service.papers.run import PaperResult
 
 WIDTH = 120
@@ -99,7 +99,7 @@ def show(found: Sequence[PaperResult], console: Console) -> None:
     _wrapped(console, LEGEND)
 
 
-def _numbers(console: Console, title: str, rows: Sequence[Row], notes: dict[str, int]) -> None:
+def _numbers(console: Console, title: str, rows: Sequence[PaperRow], notes: dict[str, int]) -> None:
     from abbe.service.papers.words import lines
 
     cells = [

@@ -10,7 +10,7 @@ import typer
 from abbe.service.cli.common import JsonOption, print_json, print_table
 
 if TYPE_CHECKING:
-    from abbe.service.campaigns.plan import Planned
+    from abbe.service.campaigns.plan import PlannedCampaign
 
 HEADINGS = ("no", "label", "measurement", "min", "until min", "worst U µm", "mean U µm")
 
@@ -69,7 +69,7 @@ def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None,
         taken.append(target.resolve())
 
 
-def _print(planned: Planned, out: Path | None, picture: Path | None) -> None:
+def _print(planned: PlannedCampaign, out: Path | None, picture: Path | None) -> None:
     from abbe.service.campaigns.plan import BOUND_NOTE, goal_words, step_rows, temperature_words
 
     print_table(HEADINGS, step_rows(planned.plan), f"{planned.plan.minutes:.0f} minutes, set-ups included")

@@ -16,9 +16,9 @@ from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
 from abbe.service.clock import Clock
 from abbe.service.push.book import read_entries
-from abbe.service.push.candidate import Candidate, Column, Evidence, Scene, Seal
+from abbe.service.push.candidate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence
 from abbe.service.push.entries import facts
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.push.validate import content_digest
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -58,7 +58,7 @@ def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: Tab
     columns = tuple(_column(promise, a, i) for a in range(3) for i in range(3))
     blank = Candidate(site.name, MAP_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
     digest = content_digest(blank)
-    return replace(blank, digest=digest, seal=Seal(SIGNER, digest))
+    return replace(blank, digest=digest, seal=EvidenceSeal(SIGNER, digest))
 
 
 def _column(promise: Promise, a: int, i: int) -> Column:
@@ -72,7 +72,7 @@ def _plain(values: Any) -> list[float]:
     return [0.0 if abs(v) < 1e-15 else float(v) for v in values]
 
 
-def _evidence(site: Site, promise: Promise, runs: Runs) -> Evidence:
+def _evidence(site: Site, promise: Promise, runs: Runs) -> TableEvidence:
     used = [r for r in runs if r["role"] == "identify"]
     air = [float(t) for r in used for t in r["columns"].get("temp_air_C", [])]
     if not air or not np.isfinite(air).all():
@@ -81,7 +81,7 @@ def _evidence(site: Site, promise: Promise, runs: Runs) -> Evidence:
     until = tuple(until_s(site.calibrated_until[kind]) for kind in sorted(_instruments(used)) if kind in site.calibrated_until)
     known = until if len(until) == len(_instruments(used)) else ()
     drift = 0.0 if promise.drift_mm is None else promise.drift_mm
-    return Evidence(
+    return TableEvidence(
         len(used), promise.ended_s, (min(air), max(air)), drift, p.u_model_mm, p.before_mm, p.after_mm,
         mark_of(boot for r in used for boot in [r.get("table", {}).get("boot_id")]), known,
         promise.last_s,
@@ -105,12 +105,12 @@ def mark_of(boots: Iterable[int | None]) -> str:
 
 async def scene_of(
     site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
-) -> Scene:
+) -> CandidateContext:
     """This machine, its controller and its table in force, now. ``attended``: a person who may approve is at the machine."""
     last_s = await asyncio.to_thread(_last_push_s, store, site)
     month_ago = {} if attended else _on_grid(await asyncio.to_thread(_month_ago, store, site, base, clock), grid)
     travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}
-    return Scene(
+    return CandidateContext(
         site.name, mark_of([base.status.boot_id]), MAP_VERSION, form.lsb_nm, form.bank_registers, travel, {}, base.crc,
         _on_grid(base.tables, grid), month_ago, clock.utc().timestamp(), attended=attended, last_push_s=last_s,
     )  # fmt: skip
@@ -120,7 +120,7 @@ def _month_ago(store: Store, site: Site, base: Base, clock: Clock) -> NineTables
     """The tables that were in force `MONTH` ago, as far as pushes tell; before the first push that of its base, else the present one."""
     entries = read_entries(store, site.name, site.control)
     then = clock.utc() - MONTH
-    kept = [e for e in entries if e.state is State.KEEP]
+    kept = [e for e in entries if e.state is PushState.KEEP]
     old = [e.push for e in kept if datetime.fromisoformat(e.utc) <= then]
     number, key = (old[-1], "image") if old else (kept[0].push, "base_image") if kept else (0, "")
     if not key:

@@ -18,9 +18,9 @@ from abbe.models.arrays import F2
 from abbe.models.compensation.sign_proof import Shift, SignProof, bar_shift, sign_proof, step_tables
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.models.machine import AXES
-from abbe.service.campaigns.bar_places import BarPlaces, Readings
+from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.compensation.proved_levels import identity
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
 from abbe.service.errors import TableMismatch, TableRefused
@@ -61,18 +61,18 @@ class _Bench:
     site: Site
     bar: BarPlaces
 
-    async def with_table(self, what: str, tables: NineTables, base: Base, lsb_nm: int) -> Readings:
+    async def with_table(self, what: str, tables: NineTables, base: Base, lsb_nm: int) -> PlaceReadings:
         """Read all places with other tables in force; the old ones are in force again afterwards, whatever happens."""
         now = await read_base(self.session.controller)
         if now.crc != base.crc:
             raise TableMismatch("somebody changed the active table during commissioning", "begin again")
-        found: list[Readings] = []
+        found: list[PlaceReadings] = []
 
         async def read() -> Verdict:
             found.append(await self.bar.read(what))
             return Verdict(False, f"{KIND}: {what} was read")  # a test step is never kept
 
-        wanted = Wanted(tables, now, lsb_nm, None, {"kind": KIND, "what": what})
+        wanted = WantedTable(tables, now, lsb_nm, None, {"kind": KIND, "what": what})
         await Pushing(self.session.controller, self.store, self.site).bring(wanted, Questions(list, KIND, read, read))
         if not found:
             raise TableMismatch("the controller changed before the places were read", "look at the controller, then begin again")
@@ -172,7 +172,7 @@ def _stepped(bench: _Bench, tables: NineTables, axes: tuple[int, ...], step_mm: 
     return tables
 
 
-def _shifts(directions: F2, before: Readings, read: list[Readings], after: Readings) -> tuple[Shift, Shift, Shift]:
+def _shifts(directions: F2, before: PlaceReadings, read: list[PlaceReadings], after: PlaceReadings) -> tuple[Shift, Shift, Shift]:
     # after "before" comes the small step, then X, Y, Z, then "after": five equal times
     found = [
         bar_shift(directions, before.deviation_mm, one.deviation_mm, after.deviation_mm, U_READING_MM, share=(k + 2) / 5.0)

@@ -19,12 +19,12 @@ from abbe.models.arrays import F1
 from abbe.models.machine import AXES, Machine
 from abbe.service.errors import FileFormatError, FormatRefused, TableFileError
 from abbe.service.files import NotPlainError, read_plain
-from abbe.service.formats.choice import Choice, best_of, choices, rounded
-from abbe.service.formats.controls import CONTROLS, Control
+from abbe.service.formats.choice import FormatChoice, best_of, choices, rounded
+from abbe.service.formats.controls import CONTROLS, ControlModel
 from abbe.service.formats.identified import Identified
 from abbe.service.formats.model import Compensation
 from abbe.service.formats.registry import FORMATS, format_of
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.text import TextFile
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.rendering.page_file import write_page
@@ -39,7 +39,7 @@ class Exported:
     """Files for a control, the kinds of tables that were weighed against each other, and what a person has to know."""
 
     files: tuple[TextFile, ...]
-    choices: tuple[Choice, ...]
+    choices: tuple[FormatChoice, ...]
     notes: tuple[str, ...]
 
 
@@ -86,7 +86,7 @@ def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> d
     return doc
 
 
-def control_for(key: str) -> Control:
+def control_for(key: str) -> ControlModel:
     """A control by its key, or a format by its: what a control with that format alone can do.
 
     Raises
@@ -104,7 +104,7 @@ def control_for(key: str) -> Control:
             return replace(c, own=key if c.own == key else "", lattice=key if c.lattice == key else "")
     points = min(form.limits.points, 101)
     shared = key if form.limits.cross else ""
-    home = next((c for c in CONTROLS.values() if key in (c.own, c.cross)), Control(key, form.name))
+    home = next((c for c in CONTROLS.values() if key in (c.own, c.cross)), ControlModel(key, form.name))
     return replace(
         home,
         key=key,
@@ -119,10 +119,10 @@ def control_for(key: str) -> Control:
     )
 
 
-def settings_for(control: Control, machine: Machine, reference_mm: F1) -> Settings:
+def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> FormatSettings:
     """What the writers are told: reference, decimals of the control's unit, Fanuc's unit."""
     x, y, z = (float(v) for v in reference_mm)
-    return Settings(
+    return FormatSettings(
         reference_mm=(x, y, z),
         decimals=max(3, round(-math.log10(control.unit_mm))),
         machine=machine,
@@ -157,7 +157,7 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
     return Exported(files, found, _notes(best.compensation, control, fresh=fresh))
 
 
-def files_of(comp: Compensation, control: Control, settings: Settings) -> tuple[TextFile, ...]:
+def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings) -> tuple[TextFile, ...]:
     """Each part in the format in which the control holds it."""
     own = Compensation(comp.own)
     cross = Compensation(comp.cross, comp.products)
@@ -176,7 +176,7 @@ def files_of(comp: Compensation, control: Control, settings: Settings) -> tuple[
     return tuple(out)
 
 
-def _notes(comp: Compensation, control: Control, *, fresh: bool) -> tuple[str, ...]:
+def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[str, ...]:
     out = [] if fresh else [ONLY_FRESH]
     lost = {a: v for a, v in comp.lost_motion_mm.items() if abs(v) > 0.5e-3 * 1e-3}
     if lost:
@@ -192,14 +192,14 @@ def _notes(comp: Compensation, control: Control, *, fresh: bool) -> tuple[str, .
     return tuple(out)
 
 
-def expected(known: Identified, control: Control, reference_mm: F1 | None = None) -> Compensation:
+def expected(known: Identified, control: ControlModel, reference_mm: F1 | None = None) -> Compensation:
     """What an export to this control would have written, rounded as there, without what is no table."""
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     comp = best_of(choices(known, control, reference)).compensation
     return replace(rounded(comp, control.unit_mm), lost_motion_mm={})
 
 
-def read_key(key: str, files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """Tables of one format, or of all the formats of a control together.
 
     Raises
@@ -239,7 +239,7 @@ def belongs(file: TextFile, key: str) -> bool:
     return file.name.lower().endswith(SUFFIXES.get(key, ""))
 
 
-def formats_in(control: Control) -> tuple[str, ...]:
+def formats_in(control: ControlModel) -> tuple[str, ...]:
     """Formats that a control reads; several tell their files apart by name, so they always go into a folder."""
     return tuple(dict.fromkeys(k for k in (control.own, control.cross, control.lattice, control.motions) if k))
 

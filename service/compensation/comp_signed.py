@@ -15,7 +15,7 @@ from abbe.service.errors import FileFormatError, SignatureRefused
 from abbe.service.files import NotPlainError, read_plain
 from abbe.service.formats.text import TextFile
 from abbe.service.rendering.page_file import write_page
-from abbe.service.signed.container import LARGEST, NO_BASE, Claims, Expected, check, claims_of, sign
+from abbe.service.signed.container import LARGEST, NO_BASE, Claims, ExpectedContent, check, claims_of, sign
 from abbe.service.signed.keys import read_key
 from abbe.service.site import site_of
 
@@ -23,7 +23,7 @@ LONGEST_DAYS = 366.0
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class SealStatus:
     """What files are worth: ``claims`` None: a candidate, to be looked at and compared, never to be pushed as it is."""
 
     claims: Claims | None
@@ -36,7 +36,7 @@ class Standing:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class SigningRequest:
     """What the person who brings files in says: their format, whose signatures count besides the machine file's, the base in force."""
 
     form: str
@@ -50,7 +50,7 @@ def signature_file(path: Path) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Seal:
+class TableSeal:
     """How a person signs: his key, from now on for so many days, on which base."""
 
     key: Path
@@ -58,7 +58,7 @@ class Seal:
     base: str = NO_BASE
 
 
-def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: Seal) -> MachineFile:
+def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: TableSeal) -> MachineFile:
     """Everything that can speak against signing, before a file is written.
 
     Raises
@@ -79,7 +79,7 @@ def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: Seal) -
     return config
 
 
-def sign_files(out: Path, form: str, config: MachineFile, seal: Seal, now: datetime) -> Path:
+def sign_files(out: Path, form: str, config: MachineFile, seal: TableSeal, now: datetime) -> Path:
     """Sign the files at ``out``. Returns the file with the signature.
 
     Raises
@@ -94,7 +94,7 @@ def sign_files(out: Path, form: str, config: MachineFile, seal: Seal, now: datet
     return target
 
 
-def standing(path: Path, read: Sequence[TextFile], config: MachineFile | None, ask: Asked, now: datetime) -> Standing:
+def standing(path: Path, read: Sequence[TextFile], config: MachineFile | None, ask: SigningRequest, now: datetime) -> SealStatus:
     """What the files at ``path`` are worth, whose text was ``read`` already.
 
     Raises
@@ -104,9 +104,9 @@ def standing(path: Path, read: Sequence[TextFile], config: MachineFile | None, a
     """
     seal = signature_file(path)
     if not seal.exists():
-        return Standing(None, "not signed")
+        return SealStatus(None, "not signed")
     if config is None:
-        return Standing(None, "signed, but for which machine has to be known: give --machine")
+        return SealStatus(None, "signed, but for which machine has to be known: give --machine")
     try:
         sealed = read_plain(seal, LARGEST)
     except NotPlainError as error:
@@ -115,12 +115,12 @@ def standing(path: Path, read: Sequence[TextFile], config: MachineFile | None, a
         raise FileFormatError(
             f"{seal}: cannot be read: {error.strerror}", "make it readable, or remove it: then it is a candidate"
         ) from None
-    expected = Expected(config.name, site_of(config).limits.digest(), ask.form, [*ask.trusted, *config.signatures.trusted], ask.base)
+    expected = ExpectedContent(config.name, site_of(config).limits.digest(), ask.form, [*ask.trusted, *config.signatures.trusted], ask.base)
     found = contents(path)
     claims = check(sealed, found, expected, now)
     if {f.name: f.text for f in read} != {name: io.StringIO(held.decode("utf-8"), None).read() for name, held in found.items()}:
         raise SignatureRefused(f"{path} was changed while it was read", "try again; nothing was taken in")
-    return Standing(claims, f"signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)")
+    return SealStatus(claims, f"signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)")
 
 
 def contents(path: Path) -> dict[str, bytes]:

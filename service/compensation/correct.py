@@ -13,11 +13,11 @@ import numpy as np
 
 from abbe.models.compensation.sign_probe import expected_changes, probe
 from abbe.models.compensation.tables import NineTables, Predicted
-from abbe.service.campaigns.bar_places import BarPlaces, Readings
+from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import check_commissioned
-from abbe.service.compensation.proposal_checks import Held, hold
+from abbe.service.compensation.proposal_checks import HoldReason, hold
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposals import (
     Made,
@@ -30,7 +30,7 @@ from abbe.service.compensation.proposals import (
     solved_again,
 )
 from abbe.service.compensation.proved_levels import check_level
-from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
 from abbe.service.errors import AbbeError, TableRefused, TakenBack
@@ -46,7 +46,7 @@ from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import check_limits
-from abbe.service.verification.verify import Decision, Figures, check_before, decide, figure_rows, figures
+from abbe.service.verification.verify import VerificationDecision, VerificationFigures, check_before, decide, figure_rows, figures
 
 UNSEEN = "DRIFT: no ball-bar run that the solution has not seen shows whether the machine still is what was measured"
 VERIFY, SIGN = "verify-after-push-", "sign-check"
@@ -69,10 +69,10 @@ class Correction:
     lsb_nm: int
     predicted: Predicted
     holdout_misfit_um: float | None
-    before: Figures
-    after: Figures
-    pushed: Pushed
-    decision: Decision
+    before: VerificationFigures
+    after: VerificationFigures
+    pushed: PushResult
+    decision: VerificationDecision
     bank: int
     image: bytes
     not_for_tables: tuple[str, ...] = ()
@@ -80,7 +80,7 @@ class Correction:
 
 
 @dataclass(frozen=True, slots=True)
-class _Bench:
+class _CorrectionContext:
     """What a correction works with."""
 
     session: Session
@@ -132,7 +132,7 @@ async def correct(
     made = await make(store, site, gathered, progress=progress)
     check_promise(made.proposed.predicted)
     check_limits(made.proposed.tables, gathered.base.tables, site.limits)  # says where, and which key of the machine file to look at
-    return await _push(_Bench(session, store, site, rate_hz, progress, SystemClock()), made, before)
+    return await _push(_CorrectionContext(session, store, site, rate_hz, progress, SystemClock()), made, before)
 
 
 async def push(  # noqa: PLR0913 - one argument for each thing it needs
@@ -182,7 +182,7 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
     made = Made(number, proposed, await solved_again(store, site, proposed.campaign, proposed.base_tables))
     control = control or Control()
     await control.gate()
-    return await _push(_Bench(session, store, site, rate_hz, progress, clock, attended, control), made, before)
+    return await _push(_CorrectionContext(session, store, site, rate_hz, progress, clock, attended, control), made, before)
 
 
 async def reasons_now(session: Session, store: Store, site: Site, number: int, clock: Clock | None = None) -> list[str]:
@@ -219,7 +219,7 @@ def check_promise(predicted: Predicted) -> None:
         )
 
 
-async def _push(bench: _Bench, made: Made, before: list[dict[str, Any]]) -> Correction:
+async def _push(bench: _CorrectionContext, made: Made, before: list[dict[str, Any]]) -> Correction:
     """Hold the proposal against now, push it, verify it. Any interlock ends it: nothing waits while an unverified table is in force."""
     session, store, proposed = bench.session, bench.store, made.proposed
     site = replace(bench.site, watching=replace(bench.site.watching, suspending=Suspending()))
@@ -244,7 +244,7 @@ async def _push(bench: _Bench, made: Made, before: list[dict[str, Any]]) -> Corr
     p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
     doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
     work = _Correcting(bench, held, misfit_mm, bar, old)
-    wanted = Wanted(proposed.tables, held.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
+    wanted = WantedTable(proposed.tables, held.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
     pushed, after, decision = await _push_and_verify(work, wanted)
     bank = pushed.bank if decision.keep else pushed.previous_bank
     image = await session.controller.read_bank(bank)
@@ -266,14 +266,14 @@ def _as_solved(run: dict[str, Any], solved: Solved, table: NineTables | None) ->
 class _Correcting:
     """Answers the push machine's questions about one proposal: are there reasons against it, goes the tool where it says, is it better?"""
 
-    bench: _Bench
-    held: Held
+    bench: _CorrectionContext
+    held: HoldReason
     drift_mm: float | None
     bar: BarPlaces | None
-    before: Figures
-    read_before: Readings | None = None
-    after: Figures | None = None
-    decision: Decision | None = None
+    before: VerificationFigures
+    read_before: PlaceReadings | None = None
+    after: VerificationFigures | None = None
+    decision: VerificationDecision | None = None
     verified_as: str = ""
     pushing: Pushing | None = None
 
@@ -308,7 +308,7 @@ class _Correcting:
         return Verdict(self.decision.keep, self.decision.text)
 
 
-async def _push_and_verify(work: _Correcting, wanted: Wanted) -> tuple[Pushed, Figures, Decision]:
+async def _push_and_verify(work: _Correcting, wanted: WantedTable) -> tuple[PushResult, VerificationFigures, VerificationDecision]:
     """Push, prove the sign, measure again, keep or go back. Whatever stops it takes the old table back."""
     bench = work.bench
     against = work.reasons()
@@ -328,7 +328,7 @@ async def _push_and_verify(work: _Correcting, wanted: Wanted) -> tuple[Pushed, F
             pushed = await pushing.bring(wanted, questions)
     if work.after is None or work.decision is None:
         raise TakenBack(f"the table was taken back: {pushed.why}", "look at the control's convention: abbe comp commission")
-    decision = work.decision if pushed.kept == work.decision.keep else Decision(pushed.kept, pushed.why)
+    decision = work.decision if pushed.kept == work.decision.keep else VerificationDecision(pushed.kept, pushed.why)
     try:
         await _store_verification(bench, work.verified_as, pushed, work.after, decision)
     except AbbeError as error:  # what the control does is decided and done; only the note of it is missing
@@ -337,7 +337,9 @@ async def _push_and_verify(work: _Correcting, wanted: Wanted) -> tuple[Pushed, F
     return pushed, work.after, decision
 
 
-async def _store_verification(bench: _Bench, name: str, pushed: Pushed, after: Figures, decision: Decision) -> None:
+async def _store_verification(
+    bench: _CorrectionContext, name: str, pushed: PushResult, after: VerificationFigures, decision: VerificationDecision
+) -> None:
     store, site = bench.store, bench.site
     rows = {k: {"value": v, "u": u} for k, (v, u) in figure_rows(after).items()}
     machine_id = await store.write(store.add_machine, site.name, site.doc)

@@ -10,8 +10,8 @@ from abbe.service.compensation.recover import READY, finish_push
 from abbe.service.errors import StillActive
 from abbe.service.push.adapter import ControllerPort, nobody
 from abbe.service.push.book import StoreBook
-from abbe.service.push.operations import Done, Doubt, Kind, Op, Outcome, Truth
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.operations import Done, Doubt, Operation, OperationKind, Outcome, Truth
+from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
@@ -51,13 +51,13 @@ async def finish_when_safe(controller: Controller, store: Store, site: Site, *, 
         The controller holds a table that the journal does not know: a person must look.
     """
     book = await StoreBook.last(store, site.name, clock, site.control)
-    if book is None or (await book.entries())[-1].state in TERMINAL - {State.OPERATOR}:
+    if book is None or (await book.entries())[-1].state in TERMINAL - {PushState.OPERATOR}:
         return None
     port = ControllerPort(controller, nobody(), clock)
     end_s = clock.monotonic_s() + limit_s
     told, remind_s = "", 0.0
     while True:
-        why, pause_s = _closed(await port.execute(Op(Kind.LOOK), ())), POLL_S
+        why, pause_s = _closed(await port.execute(Operation(OperationKind.LOOK), ())), POLL_S
         if not why:
             try:
                 return await finish_push(controller, store, site, clock)

@@ -15,7 +15,7 @@ from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import STOPPED, Outcome
+from abbe.service.tables.push_outcome import STOPPED, PushOutcome
 from abbe.service.tables.table_history import offered
 
 
@@ -28,7 +28,7 @@ class BackOrder:
     ordered: Ordered
 
 
-async def bring_back(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> Outcome:
+async def bring_back(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> PushOutcome:
     """Take the table back. What is returned is what was heard; which table is in force says the journal (`push_outcome.ordered`).
 
     A refusal is an outcome, not an error: another process has the machine, the controller holds what the journal does not know, or the
@@ -39,28 +39,28 @@ async def bring_back(site: Site, store: Store, order: BackOrder, *, clock: Clock
             async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
                 return await _heard(session.controller, store, site, order, clock)
     except MachineInUse as busy:
-        return Outcome("refused", f"{busy}; nothing was written")
+        return PushOutcome("refused", f"{busy}; nothing was written")
     except (AbbeError, DriverError, OSError) as error:
-        return Outcome("failed", _told(error))
+        return PushOutcome("failed", _told(error))
 
 
-async def _heard(controller: Controller, store: Store, site: Site, order: BackOrder, clock: Clock) -> Outcome:
+async def _heard(controller: Controller, store: Store, site: Site, order: BackOrder, clock: Clock) -> PushOutcome:
     control = order.ordered.control
     try:
         await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
         back = await rollback(controller, store, site, ordered=order.ordered)
     except (TableRefused, TableMismatch) as no:
-        return Outcome("refused", _told(no))
+        return PushOutcome("refused", _told(no))
     except StillActive as open_:
         return await _finished(controller, store, site, order, open_, clock)
     except MachineInUse:
         raise
     except (AbbeError, DriverError, OSError) as error:
-        return Outcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
+        return PushOutcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
     if back is None:
-        return Outcome("refused", "the table from before is in force already; nothing was written")
+        return PushOutcome("refused", "the table from before is in force already; nothing was written")
     told = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
-    return Outcome("kept", f"{told}; the machine is unverified now: run a quick check")
+    return PushOutcome("kept", f"{told}; the machine is unverified now: run a quick check")
 
 
 def check_unchanged(store: Store, machine: str, order: BackOrder, control: str = "") -> None:
@@ -79,14 +79,14 @@ def check_unchanged(store: Store, machine: str, order: BackOrder, control: str =
         )
 
 
-async def _finished(controller: Controller, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock) -> Outcome:
+async def _finished(controller: Controller, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock) -> PushOutcome:
     """The rollback broke off, and the way back from it is not open now: go it as soon as it is."""
     finish = finish_when_safe(controller, store, site, limit_s=LIMIT_S, clock=clock, say=lambda _: None)
     try:
         done = await order.ordered.control.unless_stopped(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return Outcome("failed", f"{_told(error)}; {_told(again)}; it is taken back before the next check")
-    return Outcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+        return PushOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back before the next check")
+    return PushOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
 
 
 def _told(error: BaseException) -> str:

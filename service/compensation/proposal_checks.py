@@ -14,7 +14,7 @@ from abbe.service.compensation.candidates import scene_of, until_s
 from abbe.service.compensation.proposal_doc import Proposed
 from abbe.service.compensation.proposals import by_whom, login
 from abbe.service.errors import TableRefused
-from abbe.service.push.candidate import Candidate, Scene, Seal
+from abbe.service.push.candidate import Candidate, CandidateContext, EvidenceSeal
 from abbe.service.push.operations import Approval
 from abbe.service.push.validate import content_digest, reasons_against
 from abbe.service.site import Site
@@ -26,7 +26,7 @@ from abbe.service.tables.base_table import Base, read_base
 
 
 @dataclass(frozen=True)
-class Held:
+class HoldReason:
     """A proposal held against its machine, its controller and its approvals as they are now.
 
     ``attended``: whoever pushes it is a person; else an approval is needed even where two people are not demanded.
@@ -36,7 +36,7 @@ class Held:
     proposed: Proposed
     site: Site
     base: Base
-    scene: Scene
+    scene: CandidateContext
     approvals: tuple[ApprovalRecord, ...]
     rejections: tuple[RejectionRecord, ...] = ()
     attended: bool = True
@@ -99,12 +99,12 @@ class Held:
 
 async def hold(
     controller: Controller, store: Store, site: Site, number: int, proposed: Proposed, clock: Clock, *, attended: bool = True
-) -> Held:
+) -> HoldReason:
     """Read what a proposal is held against. Nothing is written."""
     base = await read_base(controller)
     scene = await scene_of(site, store, base, await controller.table_format(), proposed.tables, clock, attended=attended)
     approvals, rejections = await asyncio.to_thread(lambda: (store.approvals(number), store.rejections(number)))
-    return Held(number, proposed, site, base, scene, tuple(approvals), tuple(rejections), attended)
+    return HoldReason(number, proposed, site, base, scene, tuple(approvals), tuple(rejections), attended)
 
 
 def valid_approval(
@@ -180,7 +180,7 @@ def _drifted(candidate: Candidate, drift_mm: float) -> Candidate:
     """The candidate with what became known after it was signed; only to be judged, never stored."""
     later = replace(candidate, evidence=replace(candidate.evidence, drift_mm=drift_mm))
     digest = content_digest(later)
-    return replace(later, digest=digest, seal=Seal(later.seal.role, digest))
+    return replace(later, digest=digest, seal=EvidenceSeal(later.seal.role, digest))
 
 
 def _changed(then: dict[str, Any], now: dict[str, Any]) -> str:

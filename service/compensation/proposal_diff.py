@@ -42,7 +42,7 @@ class CurveChange:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class TableDifference:
     """What is compared with what, and the nine tables."""
 
     new: str
@@ -50,7 +50,7 @@ class Difference:
     curves: tuple[CurveChange, ...]
 
 
-def compare(store: Store, number: int, with_what: str) -> Difference:
+def compare(store: Store, number: int, with_what: str) -> TableDifference:
     """Compare a proposal with the table that it was made on (``ACTIVE``), or with another proposal (its number).
 
     Raises
@@ -61,7 +61,7 @@ def compare(store: Store, number: int, with_what: str) -> Difference:
     proposed = load(store, number)
     if with_what.upper() == ACTIVE:
         name = f"the table in force when it was made ({proposed.candidate.base_crc:08X})"
-        return Difference(f"proposal {number}", name, changes(proposed.base_tables, proposed.tables))
+        return TableDifference(f"proposal {number}", name, changes(proposed.base_tables, proposed.tables))
     if not with_what.isdigit():
         raise TableRefused(f"--with {with_what!r} is neither ACTIVE nor the number of a proposal", "abbe comp show lists them")
     other = load(store, int(with_what))
@@ -69,7 +69,7 @@ def compare(store: Store, number: int, with_what: str) -> Difference:
         raise TableRefused(
             f"proposal {with_what} is for {other.candidate.machine!r}", f"compare proposals of {proposed.candidate.machine!r}"
         )
-    return Difference(f"proposal {number}", f"proposal {with_what}", changes(other.tables, proposed.tables))
+    return TableDifference(f"proposal {number}", f"proposal {with_what}", changes(other.tables, proposed.tables))
 
 
 def changes(old: NineTables | None, new: NineTables) -> tuple[CurveChange, ...]:
@@ -85,7 +85,7 @@ def changes(old: NineTables | None, new: NineTables) -> tuple[CurveChange, ...]:
     return tuple(found)
 
 
-def rows(found: Difference) -> list[tuple[str, ...]]:
+def rows(found: TableDifference) -> list[tuple[str, ...]]:
     """One line per table, for people; U is k = 2."""
     out: list[tuple[str, ...]] = []
     for c in found.curves:
@@ -96,7 +96,7 @@ def rows(found: Difference) -> list[tuple[str, ...]]:
     return out
 
 
-def largest(found: Difference) -> str:
+def largest(found: TableDifference) -> str:
     """The largest change of all nine tables, as a sentence."""
     c = max(found.curves, key=lambda one: abs(one.change_mm[one.worst]))
     k = c.worst
@@ -105,7 +105,7 @@ def largest(found: Difference) -> str:
     return f"largest change: {size:+.2f} µm (U = {expanded:.2f} µm, k = 2) {where}"
 
 
-def diff_json(found: Difference) -> dict[str, Any]:
+def diff_json(found: TableDifference) -> dict[str, Any]:
     """For programs: every number of every curve."""
     tables = [
         {
@@ -118,7 +118,7 @@ def diff_json(found: Difference) -> dict[str, Any]:
     return {"new": found.new, "old": found.old, "tables": tables}
 
 
-def diff_html(found: Difference, proposed: Proposed) -> str:
+def diff_html(found: TableDifference, proposed: Proposed) -> str:
     """The page: table of numbers and picture."""
     p = proposed.predicted
     lead = (

@@ -15,7 +15,7 @@ from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
 from abbe.service.errors import StoreError
 from abbe.service.push.approval import approval_digest
-from abbe.service.push.candidate import Candidate, Column, Evidence, Seal
+from abbe.service.push.candidate import Candidate, Column, EvidenceSeal, TableEvidence
 from abbe.service.push.entries import Doc, canonical
 from abbe.service.push.limits import PushLimits
 from abbe.service.storage.store import Store
@@ -177,13 +177,13 @@ def _candidate(doc: Doc) -> Candidate:
     columns = tuple(_column(c) for c in doc["columns"])
     e = doc["evidence"]
     low, high = e["temperature_c"]
-    evidence = Evidence(
+    evidence = TableEvidence(
         int(e["run_count"]), float(e["ended_s"]), (float(low), float(high)), float(e["drift_mm"]), float(e["u_mm"]), float(e["before_mm"]),
         float(e["after_mm"]), str(e["machine_mark"]), tuple(float(s) for s in e["calibrated_until_s"]),
         None if e.get("last_s") is None else float(e["last_s"]),
     )  # fmt: skip
     head = (doc["machine"], doc["map_version"], doc["lsb_nm"], doc["length_unit"])
-    return Candidate(*head, columns, doc["base_crc"], evidence, doc["digest"], Seal(**doc["seal"]))
+    return Candidate(*head, columns, doc["base_crc"], evidence, doc["digest"], EvidenceSeal(**doc["seal"]))
 
 
 def load(store: Store, number: int) -> Proposed:

@@ -10,8 +10,8 @@ from abbe.service.compensation.proposal_checks import valid_approval
 from abbe.service.compensation.proposal_doc import Proposed
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import read_entries
-from abbe.service.push.entries import Entry, Journal, facts
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.entries import Journal, JournalEntry, facts
+from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.storage.records import ApprovalRecord
 from abbe.service.storage.repositories.decisions import RejectionRecord
 from abbe.service.storage.store import Store
@@ -19,14 +19,14 @@ from abbe.service.tables.push_history import KIND, pushes_of
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class ProposalStatus:
     """One word and one sentence. Words: refused, rejected, proposed, approved, expired, superseded, pushed, kept, rolled back."""
 
     word: str
     text: str
 
 
-def standing(store: Store, number: int, proposed: Proposed, now_s: float) -> Standing:
+def standing(store: Store, number: int, proposed: Proposed, now_s: float) -> ProposalStatus:
     """Where a stored proposal stands."""
     entries = read_entries(store, proposed.candidate.machine)
     docs = {t.id: t.doc for t in store.tables()}
@@ -37,11 +37,11 @@ def standing_of(
     number: int,
     proposed: Proposed,
     approvals: list[ApprovalRecord],
-    entries: list[Entry],
+    entries: list[JournalEntry],
     docs: dict[int, dict[str, Any]],
     now_s: float,
     rejections: Sequence[RejectionRecord] = (),
-) -> Standing:
+) -> ProposalStatus:
     """The same from plain values; ``docs``: of the store's tables, by number."""
     journals = pushes_of(entries)
     own = [j for j in journals.values() if docs.get(int(facts(j)["table"]), {}).get("proposal") == number]
@@ -50,40 +50,40 @@ def standing_of(
         if found is not None:
             return found
     if rejections:
-        return Standing("rejected", f"by {rejections[-1].name}: {rejections[-1].reason}")
+        return ProposalStatus("rejected", f"by {rejections[-1].name}: {rejections[-1].reason}")
     if proposed.reasons:
-        return Standing("refused", f"{len(proposed.reasons)} reasons against it when it was proposed")
-    wrote = [e.push for e in entries if e.state is State.STAGING and e.utc > proposed.utc]
+        return ProposalStatus("refused", f"{len(proposed.reasons)} reasons against it when it was proposed")
+    wrote = [e.push for e in entries if e.state is PushState.STAGING and e.utc > proposed.utc]
     if wrote:
-        return Standing("superseded", f"push {wrote[-1]} wrote into the controller since it was proposed")
+        return ProposalStatus("superseded", f"push {wrote[-1]} wrote into the controller since it was proposed")
     if now_s >= proposed.valid_until_s:
-        return Standing("expired", f"its measurement is older than {proposed.limits.age_h:g} h")
+        return ProposalStatus("expired", f"its measurement is older than {proposed.limits.age_h:g} h")
     approval, why = valid_approval(proposed, approvals, now_s, two_people=proposed.two_people)
     if approval is not None:
-        return Standing("approved", f"by {approval.name} until {approval.expiry}")
-    return Standing("proposed", why if approvals or proposed.two_people else "waits for a push")
+        return ProposalStatus("approved", f"by {approval.name} until {approval.expiry}")
+    return ProposalStatus("proposed", why if approvals or proposed.two_people else "waits for a push")
 
 
-def _pushed(own: Journal, journals: dict[int, Journal], docs: dict[int, dict[str, Any]]) -> Standing | None:
+def _pushed(own: Journal, journals: dict[int, Journal], docs: dict[int, dict[str, Any]]) -> ProposalStatus | None:
     """How its last push ended; None if it came to nothing before the new table was in force."""
     last, f = own[-1], facts(own)
-    if last.state in (State.REJECTED, State.ABORTED):
+    if last.state in (PushState.REJECTED, PushState.ABORTED):
         return None
-    if last.state is State.ROLLED_BACK:
-        return Standing("rolled back", f"by push {last.push} itself: {f.get('why', '')}")
-    if last.state is not State.KEEP:
+    if last.state is PushState.ROLLED_BACK:
+        return ProposalStatus("rolled back", f"by push {last.push} itself: {f.get('why', '')}")
+    if last.state is not PushState.KEEP:
         open_ = "" if last.state in TERMINAL else "; the next command that uses the machine finishes it"
-        return Standing("pushed", f"push {last.push} stands at {last.state}{open_}")
-    later = [j for n, j in journals.items() if n > last.push and j[-1].state is State.KEEP]
+        return ProposalStatus("pushed", f"push {last.push} stands at {last.state}{open_}")
+    later = [j for n, j in journals.items() if n > last.push and j[-1].state is PushState.KEEP]
     if not later:
-        return Standing("kept", f"push {last.push}: {f.get('verify', '')}")
+        return ProposalStatus("kept", f"push {last.push}: {f.get('verify', '')}")
     if facts(later[-1])["image"] == f["image"]:
-        return Standing("kept", f"push {last.push} kept it; in force again since push {later[-1][-1].push}")
+        return ProposalStatus("kept", f"push {last.push} kept it; in force again since push {later[-1][-1].push}")
     number = later[0][-1].push
     back = docs.get(int(facts(later[0])["table"]), {}).get("kind") == KIND
     if back:
-        return Standing("rolled back", f"by order of a person with push {number}, after push {last.push} had kept it")
-    return Standing("superseded", f"push {last.push} kept it; push {number} put another table in its place")
+        return ProposalStatus("rolled back", f"by order of a person with push {number}, after push {last.push} had kept it")
+    return ProposalStatus("superseded", f"push {last.push} kept it; push {number} put another table in its place")
 
 
 def check_waiting(store: Store, number: int, proposed: Proposed, now_s: float) -> None:

@@ -21,7 +21,7 @@ HINT = "what this controller does for a safe push was never proved{}: abbe comp 
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class LevelStatus:
     """What counts for a push now. ``hint``: what has to be said about it; empty when it was proved."""
 
     capabilities: Capabilities
@@ -50,13 +50,13 @@ def last_proof(store: Store, site: Site) -> Doc | None:
     return dict(last[0].doc) if last else None
 
 
-async def standing(controller: Controller, store: Store, site: Site) -> Standing:
+async def standing(controller: Controller, store: Store, site: Site) -> LevelStatus:
     """Find out what counts for a push into this controller, as it is now."""
     info = await controller.identify()
     doc = await asyncio.to_thread(last_proof, store, site)
     if doc is not None and doc["identity"] == identity(info):
-        return Standing(Capabilities(**{f.name: doc["flags"].get(f.name) is True for f in fields(Capabilities)}), "")
-    return Standing(await _visible(controller), HINT.format("" if doc is None else " since it is another one, or has another firmware"))
+        return LevelStatus(Capabilities(**{f.name: doc["flags"].get(f.name) is True for f in fields(Capabilities)}), "")
+    return LevelStatus(await _visible(controller), HINT.format("" if doc is None else " since it is another one, or has another firmware"))
 
 
 async def _visible(controller: Controller) -> Capabilities:

@@ -33,8 +33,8 @@ from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.records import AlarmEntryRecord
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import STOPPED, Outcome
-from abbe.service.verification.alarm_states import NO_ALARM, Kind
+from abbe.service.tables.push_outcome import STOPPED, PushOutcome
+from abbe.service.verification.alarm_states import NO_ALARM, AlarmKind
 
 WAIT_S = 600.0
 """So long a machine that does not let the old table back at once is watched; after that the service tries again and again, and says so."""
@@ -53,7 +53,7 @@ class Approved:
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class PushOrder:
     """One try: which proposal, whom it is told that it began, who hears of its progress, and who may stop it."""
 
     proposal: int
@@ -63,7 +63,7 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
-class _Bench:
+class _PushContext:
     session: Session
     site: Site
     store: Store
@@ -76,8 +76,8 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
 
     Older ones that are approved as well are not tried in its place: whoever approved the last one wanted that.
     """
-    tried = {e.doc.get("approval") for e in entries if e.kind == Kind.PUSHING}
-    asked = {e.doc.get("proposal"): e.alarm for e in entries if e.kind == Kind.PROPOSED}
+    tried = {e.doc.get("approval") for e in entries if e.kind == AlarmKind.PUSHING}
+    asked = {e.doc.get("proposal"): e.alarm for e in entries if e.kind == AlarmKind.PROPOSED}
     given = [(rows[-1].id, record.id) for record in store.proposals(machine) if (rows := store.approvals(record.id))]
     if not given:
         return None
@@ -91,7 +91,7 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
     return None
 
 
-async def push_approved(site: Site, store: Store, order: Order, *, clock: Clock, rate_hz: int = 100) -> Outcome:
+async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Clock, rate_hz: int = 100) -> PushOutcome:
     """Verify with the table in force, push, prove, verify again; keep or go back. A refusal is an outcome, not an error.
 
     What is returned is what was heard; which table is in force says the journal (`push_outcome.by_journal`).
@@ -105,28 +105,28 @@ async def push_approved(site: Site, store: Store, order: Order, *, clock: Clock,
         try:
             async with recovered_session(store, site) as session:
                 await order.begun()
-                return await _heard(_Bench(session, site, store, clock, rate_hz), order)
+                return await _heard(_PushContext(session, site, store, clock, rate_hz), order)
         except MachineInUse:
             raise
         except (AbbeError, DriverError, OSError) as error:  # the devices, before anything of it was begun
             await order.begun()
-            return Outcome("failed", _told(error))
+            return PushOutcome("failed", _told(error))
 
 
-async def _heard(bench: _Bench, order: Order) -> Outcome:
+async def _heard(bench: _PushContext, order: PushOrder) -> PushOutcome:
     try:
         return await _pushed(bench, order)
     except TakenBack as back:
-        return Outcome("rolled back", _told(back))
+        return PushOutcome("rolled back", _told(back))
     except TableRefused as no:
-        return Outcome("refused", _told(no))
+        return PushOutcome("refused", _told(no))
     except StillActive as open_:
         return await _back(bench, order, open_)
     except (AbbeError, DriverError, OSError) as error:
-        return Outcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _told(error))
+        return PushOutcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _told(error))
 
 
-async def _pushed(bench: _Bench, order: Order) -> Outcome:
+async def _pushed(bench: _PushContext, order: PushOrder) -> PushOutcome:
     session, store, site, control = bench.session, bench.store, bench.site, order.control
     control.now(State.RUNNING)
     await check_commissioned(session.controller, store, site)
@@ -140,10 +140,10 @@ async def _pushed(bench: _Bench, order: Order) -> Outcome:
         session, store, site, order.proposal, before,
         rate_hz=bench.rate_hz, progress=order.progress, clock=bench.clock, attended=False, control=control,
     )  # fmt: skip
-    return Outcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
+    return PushOutcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
 
 
-async def _before(bench: _Bench, order: Order) -> list[dict[str, Any]]:
+async def _before(bench: _PushContext, order: PushOrder) -> list[dict[str, Any]]:
     site = bench.site
     name = f"verify-before proposal {order.proposal} {bench.clock.utc():%Y-%m-%d %H:%M:%S}"
     plan = paced(verification(site.machine, rate_hz=bench.rate_hz, name=name), site.max_feed_mm_min)
@@ -153,15 +153,15 @@ async def _before(bench: _Bench, order: Order) -> list[dict[str, Any]]:
     )
 
 
-async def _back(bench: _Bench, order: Order, error: StillActive) -> Outcome:
+async def _back(bench: _PushContext, order: PushOrder, error: StillActive) -> PushOutcome:
     """Watch the machine until the old table is back. A stop does not end that; after an abort the service goes back to it."""
     said: list[str] = []
     finish = finish_when_safe(bench.session.controller, bench.store, bench.site, limit_s=WAIT_S, clock=bench.clock, say=said.append)
     try:
         done = await order.control.unless_aborted(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return Outcome("failed", f"{_told(error)}; {_told(again)}; it is taken back as soon as it can be")
-    return Outcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+        return PushOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back as soon as it can be")
+    return PushOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
 
 
 def _told(error: BaseException) -> str:

@@ -21,15 +21,15 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import standing
 from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push import execute
-from abbe.service.push.adapter import ControllerPort, People
+from abbe.service.push.adapter import ControllerPort, PushActors
 from abbe.service.push.approval import approval_digest
 from abbe.service.push.book import StoreBook
 from abbe.service.push.entries import Doc, Journal, facts
 from abbe.service.push.execute import Ended
 from abbe.service.push.operations import Approval, Verdict
-from abbe.service.push.order import Order
+from abbe.service.push.order import OperationOrder
 from abbe.service.push.semantic_digest import meaning_of_tables
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.owner import this_process
@@ -52,7 +52,7 @@ _under_way: set[tuple[str, str]] = set()
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class WantedTable:
     """A table that shall come into force: absolute corrections in the controller's unit, on which base, and what is kept about it.
 
     ``image_id``: number inside the image, drawn by lot if None; given where the image was approved before.
@@ -94,7 +94,7 @@ class Questions:
 
 
 @dataclass(frozen=True, slots=True)
-class Pushed:
+class PushResult:
     """How a push ended: the new table is kept, or the old one is in force again. ``log``: every transition, for people."""
 
     push_id: int
@@ -128,7 +128,7 @@ class Pushing:
     _error: BaseException | None = None
     _notes: list[str] = field(default_factory=list)
 
-    async def bring(self, wanted: Wanted | WantedAgain, questions: Questions) -> Pushed:
+    async def bring(self, wanted: WantedTable | WantedAgain, questions: Questions) -> PushResult:
         """Push, prove, verify; keep or go back.
 
         Raises
@@ -168,7 +168,7 @@ class Pushing:
             self.control.hurry = ""
         return self._outcome(ended)
 
-    async def _order(self, wanted: Wanted | WantedAgain) -> Order:
+    async def _order(self, wanted: WantedTable | WantedAgain) -> OperationOrder:
         form = await self.controller.table_format()
         image, meaning = _image(wanted)
         if len(image) > 2 * form.bank_registers:
@@ -177,7 +177,7 @@ class Pushing:
         level = self.level if self.level is not None else (await standing(self.controller, self.store, self.site)).level
         machine_id = await self.store.write(self.store.add_machine, self.site.name, self.site.doc)
         table_id = await self.store.write(self.store.add_table, machine_id, wanted.solution_id, image, crc32(image), wanted.doc)
-        return Order(
+        return OperationOrder(
             self.site.name, image, crc32(image), meaning, self.site.limits.digest(),
             owner=(secrets.randbits(15) + 1) << 16, level=level, attended=self.attended, table=table_id,
             process=asdict(this_process()), control=self.site.control,
@@ -192,7 +192,7 @@ class Pushing:
                 return
             await self.clock.sleep(STILL_POLL_S)
 
-    async def _drive(self, book: StoreBook, order: Order, wanted: Wanted | WantedAgain, questions: Questions) -> Ended:
+    async def _drive(self, book: StoreBook, order: OperationOrder, wanted: WantedTable | WantedAgain, questions: Questions) -> Ended:
         """Let the machine run in a task of its own; a cancellation is raised when it has come to its end, and says what is in force."""
         port = ControllerPort(self.controller, self._people(wanted, questions), self.clock)
         task = asyncio.ensure_future(execute.push(port, book, order, stop=self._told_to_stop))
@@ -224,7 +224,7 @@ class Pushing:
         TableMismatch
             It did.
         """
-        if ended.state is not State.ABORTED or State.ACTIVATING not in {entry.state for entry in ended.journal}:
+        if ended.state is not PushState.ABORTED or PushState.ACTIVATING not in {entry.state for entry in ended.journal}:
             return
         known = facts(ended.journal)
         await self.clock.sleep(AGAIN_S)
@@ -245,10 +245,10 @@ class Pushing:
         except Exception as again:  # noqa: BLE001 - whatever it is, the first failure is the one to be heard, with what is known
             failed.add_note(f"{PERHAPS} ({again})")
             return failed
-        failed.add_note(PERHAPS if not ended.settled or ended.state is State.OPERATOR else "the old table is in force")
+        failed.add_note(PERHAPS if not ended.settled or ended.state is PushState.OPERATOR else "the old table is in force")
         return failed
 
-    def _people(self, wanted: Wanted | WantedAgain, questions: Questions) -> People:
+    def _people(self, wanted: WantedTable | WantedAgain, questions: Questions) -> PushActors:
         async def validate(journal: Journal) -> list[str]:
             known = facts(journal)
             if known["base_crc"] != wanted.base.crc or bytes.fromhex(known["base_image"]) != wanted.base.image:
@@ -270,7 +270,7 @@ class Pushing:
         async def verify(journal: Journal) -> Verdict:
             return await self._ask(questions.verify)
 
-        return People(validate, approve, probe, verify)
+        return PushActors(validate, approve, probe, verify)
 
     async def _ask(self, question: Callable[[], Awaitable[Verdict]]) -> Verdict:
         """Let the job measure; whatever stops it is an answer, and is raised again when the old table is in force."""
@@ -305,7 +305,7 @@ class Pushing:
         except asyncio.CancelledError as error:
             self._notes += getattr(error, "__notes__", [])
 
-    def _outcome(self, ended: Ended) -> Pushed:
+    def _outcome(self, ended: Ended) -> PushResult:
         """What a job hears, with everything that its own error was told on its way."""
         try:
             return self._pushed(ended)
@@ -315,33 +315,33 @@ class Pushing:
                     error.add_note(note)
             raise
 
-    def _pushed(self, ended: Ended) -> Pushed:
+    def _pushed(self, ended: Ended) -> PushResult:
         """What a job hears."""
         known = facts(ended.journal)
         why = str(known.get("why", ended.why))
         detail = str(self._error) if self._error is not None else why
-        if ended.state is not None and not ended.settled and ended.state is not State.ROLLBACK_PENDING:
+        if ended.state is not None and not ended.settled and ended.state is not PushState.ROLLBACK_PENDING:
             raise StillActive(f"{detail}: {ended.why}", MAKE_READY) from self._error
         match ended.state:
-            case State.KEEP | State.ROLLED_BACK:
+            case PushState.KEEP | PushState.ROLLED_BACK:
                 if self._error is not None:
                     raise self._error
                 last = ended.journal[-1]
-                return Pushed(
+                return PushResult(
                     last.push, int(known["table"]), int(known["target"]), int(known["crc"]), int(known["base_bank"]),
-                    int(known["base_crc"]), last.state is State.KEEP, why, push_log(ended.journal),
+                    int(known["base_crc"]), last.state is PushState.KEEP, why, push_log(ended.journal),
                 )  # fmt: skip
-            case State.REJECTED:
+            case PushState.REJECTED:
                 reasons = list(known.get("reasons", []))
                 raise TableRefused("; ".join(reasons), "nothing was written")
-            case State.OPERATOR:
+            case PushState.OPERATOR:
                 raise operator_needed(ended.journal, detail) from self._error
-            case State.ROLLBACK_PENDING:
+            case PushState.ROLLBACK_PENDING:
                 raise StillActive(f"{detail}; {STILL_ACTIVE} ({known.get('pending', '')})", MAKE_READY) from self._error
         raise PushNotBegun(f"the table was not brought into force: {why}", "the old table is in force; look at the cause, then push again")
 
 
-def _image(wanted: Wanted | WantedAgain) -> tuple[bytes, str]:
+def _image(wanted: WantedTable | WantedAgain) -> tuple[bytes, str]:
     """What the controller is to hold, and the digest of what it means, which does not come from it."""
     if isinstance(wanted, WantedAgain):
         return wanted.image, wanted.meaning
@@ -353,9 +353,9 @@ def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
     """What whoever stopped it has to know."""
     if ended is None:
         return f"{failed}; {'; '.join(getattr(failed, '__notes__', []))}"
-    if ended.state is State.KEEP:
+    if ended.state is PushState.KEEP:
         return "the new table was verified and is kept"
-    if ended.state is State.OPERATOR:
+    if ended.state is PushState.OPERATOR:
         error = operator_needed(ended.journal)
         return str(error)
     if not ended.settled:

@@ -16,13 +16,13 @@ from abbe.service.push.adapter import ControllerPort, nobody
 from abbe.service.push.book import StoreBook
 from abbe.service.push.entries import WORD, Journal, facts
 from abbe.service.push.staging import LAID_ASIDE
-from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, State
+from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.owner import Owner, this_process
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import operator_needed
 from abbe.service.tables.table_gate import accept_strange, check_in_force, said, vouch
-from abbe.service.tables.unverified import Known, known_tables
+from abbe.service.tables.unverified import KnownState, known_tables
 from abbe.service.tables.whose_push import check_own, is_own
 
 READY = "make the machine ready (interlocks, link), then start again"
@@ -89,26 +89,26 @@ async def _ended(controller: Controller, store: Store, site: Site, clock: Clock)
     if book is None or journal[-1].push == WORD:
         return None
     before = journal[-1].state
-    if before not in TERMINAL or before is State.OPERATOR:
+    if before not in TERMINAL or before is PushState.OPERATOR:
         await check_own(controller, site, journal)
-    if before is State.OPERATOR:
+    if before is PushState.OPERATOR:
         raise operator_needed(journal)
     _refuse_if_under_way(store, site, journal)
     ended = await run_to_end(execute.recover(ControllerPort(controller, nobody(), clock), book))
     return _told(ended, before)
 
 
-def _told(ended: execute.Ended, before: State) -> str | None:
+def _told(ended: execute.Ended, before: PushState) -> str | None:
     known, number = facts(ended.journal), ended.journal[-1].push
     why = known.get("why", "interrupted before verification")
     match ended.state:
         case state if state is before and state in TERMINAL:
             return None
-        case State.ROLLED_BACK:
+        case PushState.ROLLED_BACK:
             return f"push {number} was not verified ({why}); the old table was made active again"
-        case State.ABORTED:
+        case PushState.ABORTED:
             return f"push {number} was not finished ({why}); the old table is in force"
-        case State.OPERATOR:
+        case PushState.OPERATOR:
             raise operator_needed(ended.journal)
     raise StillActive(f"the unverified table of push {number} is still active: {known.get('pending', ended.why)}", READY)
 
@@ -142,7 +142,7 @@ async def accept(controller: Controller, store: Store, site: Site, by: str = "a 
         before = await controller.comp_status()
         ended = await run_to_end(execute.recover(ControllerPort(controller, nobody(), clock), book))
         journal, now = ended.journal, await controller.comp_status()
-        if ended.settled and journal[-1].state is not State.OPERATOR:
+        if ended.settled and journal[-1].state is not PushState.OPERATOR:
             changed = before.active_bank != now.active_bank
             what = (
                 "the table from before it was made active again: look at the controller once more" if changed else "its table is as it was"
@@ -164,7 +164,7 @@ async def _accepted(controller: Controller, store: Store, site: Site, by: str) -
     await _given_to_a_person(store, site, chain)
     for other_chain in _open_with(crc, known) - {chain}:
         book = await _given_to_a_person(store, site, other_chain)
-        await book.append(await book.entries(), State.ACCEPTED, said(now, by))
+        await book.append(await book.entries(), PushState.ACCEPTED, said(now, by))
     await vouch(store, site, now, by)
     told = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted by {by}"
     push = known.unverified.get(crc)
@@ -174,7 +174,7 @@ async def _accepted(controller: Controller, store: Store, site: Site, by: str) -
     return f"{told}; it is that of push {push.push}{name}, which no measurement has verified"
 
 
-def _open_with(crc: int, known: Known) -> set[str]:
+def _open_with(crc: int, known: KnownState) -> set[str]:
     """Journal of the last push that brought this table, if it is still open: under another name or address it would be taken back."""
     push = known.pushed.get(crc)
     return {push.chain} if push is not None and push.may_be_active else set()
@@ -186,7 +186,7 @@ async def _given_to_a_person(store: Store, site: Site, chain: str) -> StoreBook:
     journal = await book.entries()
     if journal and journal[-1].state not in TERMINAL:
         _refuse_if_under_way(store, site, journal)
-        state = State.ABORTED if journal[-1].state in BEFORE_ACTIVATION else State.OPERATOR
+        state = PushState.ABORTED if journal[-1].state in BEFORE_ACTIVATION else PushState.OPERATOR
         await book.append(journal, state, {"why": "a person took the decision"})
     return book
 
@@ -194,7 +194,7 @@ async def _given_to_a_person(store: Store, site: Site, chain: str) -> StoreBook:
 def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
     """A push that another process, or another task of this one, is driving is not recovered by us."""
     last = journal[-1]
-    if last.state in TERMINAL or last.state is State.ROLLBACK_PENDING:
+    if last.state in TERMINAL or last.state is PushState.ROLLBACK_PENDING:
         return
     process = facts(journal).get("process")
     owner = Owner(**process) if process else None

@@ -14,13 +14,13 @@ from abbe.drivers.api import Controller
 from abbe.drivers.cnc.tables import crc32
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposals import by_whom
-from abbe.service.compensation.pushing import Pushed, Pushing, Questions, WantedAgain
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedAgain
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.push.book import read_entries
-from abbe.service.push.entries import Entry, Journal, facts
+from abbe.service.push.entries import Journal, JournalEntry, facts
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -30,7 +30,7 @@ from abbe.service.tables.unverified import unverified_crcs
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownTables:
     """A table that was in force, as the journal holds it in full, and how the journal knows it."""
 
     image: bytes
@@ -42,7 +42,7 @@ class Known:
 class Back:
     """The push that brought a table back, and which table that is."""
 
-    pushed: Pushed
+    pushed: PushResult
     how: str
 
 
@@ -120,34 +120,34 @@ def _rollbacks(store: Store) -> frozenset[int]:
     return frozenset(t.id for t in store.tables() if t.doc.get("kind") == KIND)
 
 
-def _base(journal: Journal, how: str) -> Known:
+def _base(journal: Journal, how: str) -> KnownTables:
     f = facts(journal)
-    return Known(bytes.fromhex(f["base_image"]), str(f["base_meaning"]), how)
+    return KnownTables(bytes.fromhex(f["base_image"]), str(f["base_meaning"]), how)
 
 
-def _left(journal: Journal) -> Known:
+def _left(journal: Journal) -> KnownTables:
     """What was in force when a push had ended."""
     state, number, f = ended_as(journal), journal[-1].push, facts(journal)
-    if state is State.KEEP:
-        return Known(bytes.fromhex(f["image"]), str(f["meaning"]), f"the table that push {number} brought and kept")
-    if state in TERMINAL - {State.OPERATOR, State.ACCEPTED}:
+    if state is PushState.KEEP:
+        return KnownTables(bytes.fromhex(f["image"]), str(f["meaning"]), f"the table that push {number} brought and kept")
+    if state in TERMINAL - {PushState.OPERATOR, PushState.ACCEPTED}:
         return _base(journal, f"the table that was in force before and after push {number}")
     raise TableRefused(f"push {number} ended {state}: the journal does not hold the table that was in force then", "name another")
 
 
-def known_images(entries: list[Entry]) -> set[bytes]:
+def known_images(entries: list[JournalEntry]) -> set[bytes]:
     """All tables that were in force, verified or put there by a person: bases, and what was kept."""
     found, refuted = set(), unverified_crcs(entries)
     for journal in pushes_of(entries).values():
         f = facts(journal)
         if int(f["base_crc"]) not in refuted:
             found.add(bytes.fromhex(f["base_image"]))
-        if ended_as(journal) is State.KEEP:
+        if ended_as(journal) is PushState.KEEP:
             found.add(bytes.fromhex(f["image"]))
     return found
 
 
-def check_known(entries: list[Entry], base: Base) -> None:
+def check_known(entries: list[JournalEntry], base: Base) -> None:
     """What a person or another program put there is never overwritten without a look at it.
 
     Raises
@@ -155,7 +155,7 @@ def check_known(entries: list[Entry], base: Base) -> None:
     TableMismatch
         The table in force is neither known as one that was in force nor as one that a person accepted.
     """
-    accepted = {e.doc["accepted_crc"] for e in entries if e.state is State.ACCEPTED}
+    accepted = {e.doc["accepted_crc"] for e in entries if e.state is PushState.ACCEPTED}
     if base.image not in known_images(entries) and crc32(base.image) not in accepted:
         raise TableMismatch(
             f"the table in force ({base.crc:08X}) is not one that the push journal knows",
@@ -163,7 +163,7 @@ def check_known(entries: list[Entry], base: Base) -> None:
         )
 
 
-def table_after(entries: list[Entry], push: int) -> Known:
+def table_after(entries: list[JournalEntry], push: int) -> KnownTables:
     """The table that was in force when a push had ended; 0: before the first."""
     journals = pushes_of(entries)
     if push == 0 and journals:
@@ -173,7 +173,7 @@ def table_after(entries: list[Entry], push: int) -> Known:
     return _left(journals[push])
 
 
-def table_before_last_kept(entries: list[Entry], base: Base, rollbacks: frozenset[int]) -> Known:
+def table_before_last_kept(entries: list[JournalEntry], base: Base, rollbacks: frozenset[int]) -> KnownTables:
     """The table before the last kept push, if that one is in force and was no rollback itself."""
     last = last_kept(entries, rollbacks)
     f, number = facts(last), last[-1].push

@@ -15,11 +15,11 @@ import structlog
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import Event
-from abbe.service.core.jobs import BY_HAND, ByHand, Full
+from abbe.service.core.jobs import BY_HAND, ByHand, FullCampaigns
 from abbe.service.core.rights import person
 from abbe.service.errors import AbbeError, Aborted, Stopped
 from abbe.service.events import Progress, ProgressSink
-from abbe.service.jobs.guided_campaign import Led, is_full
+from abbe.service.jobs.guided_campaign import CampaignOutcome, is_full
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
 from abbe.service.scheduler.ports import JobWatcher, SlotState
@@ -43,11 +43,11 @@ class CampaignOrder:
     control: Control
 
 
-MeasureCampaign = Callable[[CampaignOrder], Awaitable[Led]]
+MeasureCampaign = Callable[[CampaignOrder], Awaitable[CampaignOutcome]]
 """``await measure(order)``: measures, solves, proposes."""
 
 
-class Campaigns:
+class CampaignJobs:
     """Carries full campaigns out as jobs.
 
     Parameters
@@ -70,9 +70,9 @@ class Campaigns:
         self._machine, self._names, self._measure = machine, names, measure
         self._audit, self._watchers = audit, tuple(watchers)
 
-    def full(self, may: Callable[[str], Awaitable[bool]]) -> Full:
+    def full(self, may: Callable[[str], Awaitable[bool]]) -> FullCampaigns:
         """What the book of jobs is told of them. ``await may(who)``: whether somebody may propose tables."""
-        return Full(self._names, self._of, may)
+        return FullCampaigns(self._names, self._of, may)
 
     def _of(self, recipe: str, who: str) -> ByHand | None:
         return partial(self._carried_out, recipe, who) if is_full(recipe, self._names) else None
@@ -104,7 +104,7 @@ class Campaigns:
             log.error("not in the audit", cause=error.detail)
         return SlotState(f"done: {led.word}", led.text, led.solution, led.proposal), None
 
-    async def _led(self, order: CampaignOrder) -> Led:
+    async def _led(self, order: CampaignOrder) -> CampaignOutcome:
         return await self._measure(order)
 
     def _progress(self, progress: Progress) -> None:
@@ -123,9 +123,9 @@ class Campaigns:
             log.warning("a campaign was stopped with the service", cause=str(trouble))
 
 
-def _failed(error: Exception) -> Led:
+def _failed(error: Exception) -> CampaignOutcome:
     """What a person is told of a campaign that was ended, or could not go on: cause, and how to go on."""
     ended = isinstance(error, Stopped | Aborted)
     cause = record.cause_of(error)
     words = [cause["what"], "" if ended else cause["remedy"], *getattr(error, "__notes__", [])]
-    return Led("stopped" if ended else "failed", "; ".join(filter(None, words)))
+    return CampaignOutcome("stopped" if ended else "failed", "; ".join(filter(None, words)))

@@ -20,7 +20,7 @@ import structlog
 from abbe.service.campaigns.builtin_recipes import parted
 from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, JobSeen, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
-from abbe.service.scheduler.ports import Errand, JobKind, SlotState
+from abbe.service.scheduler.ports import FollowUp, JobKind, SlotState
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control, State
 
@@ -49,7 +49,7 @@ async def nobody(_: str) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Full:
+class FullCampaigns:
     """What a person may start besides checks: names, and ``of(recipe, who)``, how one is carried out for somebody; None: it is none.
 
     ``may``: whether somebody may propose tables, by the table of users as it is now: a full campaign ends with a proposal of his.
@@ -61,7 +61,7 @@ class Full:
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class JobRequest:
     """Who asks for something, in which request; ``what`` is what he may not ask for again under another meaning of ``key``."""
 
     request: int
@@ -70,7 +70,7 @@ class Wish:
     what: str
 
 
-class Place(Protocol):
+class MachineClaim(Protocol):
     """Who sees to it that one check runs at a time."""
 
     def take(self, name: str) -> str:
@@ -89,7 +89,7 @@ class _Job:
     task: asyncio.Task[str] | None = None
 
 
-class JobBook:
+class JobRegistry:
     """Knows every job since the service began, the latest `MOST_JOBS` of them by number.
 
     Parameters
@@ -113,13 +113,13 @@ class JobBook:
         self._jobs: OrderedDict[str, _Job] = OrderedDict()
         self._keys: OrderedDict[tuple[str, str], tuple[str, str]] = OrderedDict()
         self._now: _Job | None = None
-        self.place: Place | None = None
+        self.place: MachineClaim | None = None
         """Where a job by hand is started; None: nowhere (``--once``, or not yet)."""
-        self.full = Full()
+        self.full = FullCampaigns()
         """The full campaigns; none unless somebody says which."""
         self._tasks: asyncio.TaskGroup | None = None
 
-    def open(self, place: Place, tasks: asyncio.TaskGroup) -> None:
+    def open(self, place: MachineClaim, tasks: asyncio.TaskGroup) -> None:
         """From now on people may start jobs; they run in ``tasks``."""
         self.place, self._tasks = place, tasks
 
@@ -139,7 +139,7 @@ class JobBook:
         job = self._new(schedule, "")
         return await self._carry_out(job, lambda: self._run(schedule, slot_utc, job.control))
 
-    async def errand(self, errand: Errand) -> str:
+    async def errand(self, errand: FollowUp) -> str:
         """Do what no slot asks for, as a job; return how it ended."""
         job = self._new(errand.schedule, "", errand.kind)
         work = errand.work
@@ -173,7 +173,7 @@ class JobBook:
             self._changed()
         return state
 
-    async def _by_hand(self, job: _Job, work: ByHand, place: Place) -> str:
+    async def _by_hand(self, job: _Job, work: ByHand, place: MachineClaim) -> str:
         try:
             return await self._carry_out(job, lambda: work(job.seen.begun_utc, job.control))
         finally:
@@ -213,7 +213,7 @@ class JobBook:
         campaign = self.full.of(asked.recipe, asked.who)
         if campaign is not None and not await self.full.may(asked.who):
             return _answer(asked.request, "forbidden", f"{asked.who} may not propose tables here, and {asked.recipe} ends with a proposal")
-        wish = Wish(asked.request, asked.who, asked.key, asked.recipe)
+        wish = JobRequest(asked.request, asked.who, asked.key, asked.recipe)
         again = self.again(wish)
         if again is not None:
             return again
@@ -225,7 +225,7 @@ class JobBook:
             return _answer(asked.request, "unknown", f"there is no recipe {asked.recipe!r} here; there are: {there}")
         return self.begin(wish, schedule, lambda begun, control: self._run(schedule, begun, control))
 
-    def again(self, wish: Wish) -> Answer | None:
+    def again(self, wish: JobRequest) -> Answer | None:
         """The answer to what was asked for with this key before; None: it was not."""
         known = self._keys.get((wish.who, wish.key)) if wish.key else None
         if known is None:
@@ -234,7 +234,7 @@ class JobBook:
             return _answer(wish.request, "conflict", "this key was used for another request", known[0])
         return _answer(wish.request, "done", AGAIN, known[0])
 
-    def begin(self, wish: Wish, schedule: Schedule, work: ByHand, kind: JobKind = "check") -> Answer:
+    def begin(self, wish: JobRequest, schedule: Schedule, work: ByHand, kind: JobKind = "check") -> Answer:
         """Begin a job that a person wants, now, if nothing else has the machine. Whether he may is for the caller to ask."""
         if self.place is None or self._tasks is None:
             return _answer(wish.request, "busy", "the service starts, ends, or runs its timetable once; it takes no jobs")

@@ -11,7 +11,7 @@ import structlog
 
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
-from abbe.service.core.jobs import Place
+from abbe.service.core.jobs import MachineClaim
 from abbe.service.errors import AbbeError, MachineInUse
 from abbe.service.scheduler import record
 from abbe.service.scheduler.loop import Alarms
@@ -41,7 +41,7 @@ class OpenEnds:
         One try.
     is_open : callable
         Asked after all was closed.
-    place : Place
+    place : MachineClaim
         The machine is ours during a try: no check starts meanwhile.
     alarms : Alarms
         Told of each new reason why it is not possible.
@@ -57,7 +57,7 @@ class OpenEnds:
         self,
         recover: Recover,
         is_open: IsOpen,
-        place: Place,
+        place: MachineClaim,
         alarms: Alarms,
         attention: MutableSequence[str],
         clock: Clock,

@@ -27,7 +27,7 @@ from abbe.service.tables.in_force import LookAtTable
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
+class ServiceSetup:
     """What the service is to do, taken from the machine file.
 
     Parameters

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from abbe.service.channel.messages import CheckNow, DeviceSeen, DueSlot, Moment
 from abbe.service.clock import Clock
-from abbe.service.core.jobs import JobBook
+from abbe.service.core.jobs import JobRegistry
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.web.core_link.board import Board
 
@@ -19,14 +19,14 @@ AGAIN = timedelta(minutes=1)
 WORD, TEXT = 200, 4000
 
 
-class Moments:
+class SnapshotSource:
     """Makes messages of what is known.
 
     Parameters
     ----------
     board : Board
         Devices, broker, the running check.
-    book : JobBook
+    book : JobRegistry
         Which job that is.
     next_due : callable
         The timetable.
@@ -34,7 +34,7 @@ class Moments:
         Now.
     """
 
-    def __init__(self, board: Board, book: JobBook, next_due: Callable[[], Sequence[tuple[Schedule, datetime]]], clock: Clock) -> None:
+    def __init__(self, board: Board, book: JobRegistry, next_due: Callable[[], Sequence[tuple[Schedule, datetime]]], clock: Clock) -> None:
         self._board, self._book, self._next_due, self._clock = board, book, next_due, clock
         self._due: tuple[DueSlot, ...] = ()
         self._looked: datetime | None = None

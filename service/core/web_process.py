@@ -39,7 +39,7 @@ from abbe.service.channel.messages import (
 from abbe.service.channel.wire import Wire
 from abbe.service.children import python_words
 from abbe.service.clock import Clock
-from abbe.service.core.jobs import JobBook
+from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Orders
 from abbe.service.errors import AbbeError, ChannelBroken
 
@@ -146,7 +146,7 @@ class WebProcess:
         Where it answers; it stays open here, so that a request waits while the process is started again.
     moment : callable
         How things stand, given the number of restarts.
-    book : JobBook
+    book : JobRegistry
         Is asked for what people want.
     clock : Clock
         Monotonic time.
@@ -161,7 +161,7 @@ class WebProcess:
         begin: Begin,
         listening: socket.socket,
         moment: Callable[[int], Moment],
-        book: JobBook,
+        book: JobRegistry,
         clock: Clock,
         live: LiveFeed | None = None,
         orders: Orders | None = None,

@@ -21,7 +21,7 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
 from abbe.service.demo.simulator_process import running_world, sealed_truth
 from abbe.service.devices.session import Session, open_session
-from abbe.service.discovery.discover import Job, Journal, discover, prepare
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.new_measurement import NewMeasurement, judged_anew
@@ -50,8 +50,8 @@ class HiddenDemo:
     folder: Path
     started_utc: str
     finding: dict[str, Any] = field(default_factory=dict)
-    job: Job | None = None
-    journal: Journal | None = None
+    job: DiscoveryJob | None = None
+    journal: DiscoveryJournal | None = None
     anew: NewMeasurement | None = None
     correction: Correction | None = None
     refused: str = ""
@@ -124,7 +124,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
         result.refused = str(error)
 
 
-async def _searched(job: Job, journal: Journal, progress: ProgressSink) -> dict[str, Any]:
+async def _searched(job: DiscoveryJob, journal: DiscoveryJournal, progress: ProgressSink) -> dict[str, Any]:
     """The search, off the event loop; stopped, it ends with its next word about how far it is."""
     stopped = threading.Event()
 

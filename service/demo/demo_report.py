@@ -22,7 +22,7 @@ from abbe.service.rendering.model import (
     TableCurve,
 )
 from abbe.service.report.solve_pages import contributions, parameter_rows
-from abbe.service.verification.verify import Figures, figure_rows
+from abbe.service.verification.verify import VerificationFigures, figure_rows
 
 TRUTH = "sealed truth of the simulator"
 TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
@@ -52,7 +52,7 @@ def demo_json(result: DemoResult) -> dict[str, Any]:
     return out
 
 
-def _measured(before: Figures, after: Figures) -> list[tuple[str, tuple[float, float], tuple[float, float]]]:
+def _measured(before: VerificationFigures, after: VerificationFigures) -> list[tuple[str, tuple[float, float], tuple[float, float]]]:
     old, new = figure_rows(before), figure_rows(after)
     return [(k, old[k], new[k]) for k in old if k in new]
 
@@ -85,7 +85,7 @@ def _arrows(truth: dict[str, Any]) -> ArrowField | None:
     return ArrowField(np.asarray(truth["grid_mm"], dtype=np.float64), np.asarray(truth["deviation_um"], dtype=np.float64))
 
 
-def _curves(found: Figures) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
+def _curves(found: VerificationFigures) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
     return {k: (f.position_mm.tolist(), (f.deviation_mm * 1e3).tolist()) for k, f in found.diagonals.items()}
 
 

@@ -25,7 +25,7 @@ from abbe.service.compensation.commission import commission
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
-from abbe.service.demo.simulator_process import World, running_world
+from abbe.service.demo.simulator_process import SimulatorProcess, running_world
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import AbbeError, StoreError
 from abbe.service.events import ignore_progress
@@ -36,7 +36,7 @@ from abbe.service.sequences.recipes.campaigns import identification, verificatio
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.users.people import People
-from abbe.service.verification.alarm_states import Kind
+from abbe.service.verification.alarm_states import AlarmKind
 from abbe.service.verification.alarms import alarms_of
 from abbe.service.verification.verify import COVERAGE, figure_rows, figures
 
@@ -208,7 +208,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
         await process.wait()
 
 
-async def drift(world: World, um_per_m: float = DRIFT_UM_PER_M) -> None:
+async def drift(world: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -> None:
     """Let the simulated machine's X axis grow. Only a simulator can be asked for that."""
     host, port = str(world.ready["fixture"]).removeprefix("fixture+tcp://").rsplit(":", 1)
     reader, writer = await asyncio.open_connection(host, int(port))
@@ -222,7 +222,7 @@ async def drift(world: World, um_per_m: float = DRIFT_UM_PER_M) -> None:
         raise AbbeError(f"the simulated machine does not drift: {answer}", "check the scenario")
 
 
-async def story(world: World, machine: str, store: Store, serving: Serving, say: Callable[[str], None]) -> None:
+async def story(world: SimulatorProcess, machine: str, store: Store, serving: Serving, say: Callable[[str], None]) -> None:
     """Say what happens, as it happens, one line each; ends when the alarm is over.
 
     Raises
@@ -236,17 +236,17 @@ async def story(world: World, machine: str, store: Store, serving: Serving, say:
     say(f"3. check by the timetable: {await _check(store, machine, 2)}")
     alarm = (await _until(lambda: alarms_of(store, machine)))[-1]
     say(f"4. alarm {alarm.number}: {alarm.text}")
-    found = await _until(lambda: alarms_of(store, machine)[-1].last(Kind.DISCOVERED, Kind.ENDED, Kind.FAILED))
+    found = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.DISCOVERED, AlarmKind.ENDED, AlarmKind.FAILED))
     say(f"5. the service has measured the full campaign and searched: {found.doc['text']}")
-    proposed = await _until(lambda: alarms_of(store, machine)[-1].last(Kind.PROPOSED, Kind.ENDED, Kind.FAILED))
+    proposed = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.PROPOSED, AlarmKind.ENDED, AlarmKind.FAILED))
     proposal = int(proposed.doc.get("proposal", 0))
     say(f"   {proposed.doc['text']}")
-    if proposed.kind is not Kind.PROPOSED:
+    if proposed.kind is not AlarmKind.PROPOSED:
         raise AbbeError("the story ends here: the service proposes nothing", f"{serving.log} says more; try another --seed")
     say(f"   approve it at {serving.page}proposal?id={proposal}")
     who = (await _until(lambda: store.approvals(proposal)))[-1].name
     say(f"6. approved by {who}: the service pushes it now, proves its sign and verifies it")
-    pushed = await _until(lambda: alarms_of(store, machine)[-1].last(Kind.PUSHED))
+    pushed = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.PUSHED))
     say(f"7. {pushed.doc['text']}")
     await _until(lambda: not alarms_of(store, machine)[-1].active)
     checks = await _until(lambda: _checks(store, machine))

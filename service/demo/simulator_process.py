@@ -29,7 +29,7 @@ class WorldError(AbbeError):
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class SimulatorProcess:
     """A running simulated machine: what its ready line said."""
 
     ready: dict[str, Any]
@@ -37,7 +37,7 @@ class World:
 
 
 @asynccontextmanager
-async def running_world(args: list[str]) -> AsyncIterator[World]:
+async def running_world(args: list[str]) -> AsyncIterator[SimulatorProcess]:
     """Start the simulators with these arguments; end them with the block, whatever ends it.
 
     The child also ends by itself when its standard input closes, so that not even SIGKILL of this process leaves one behind.
@@ -55,7 +55,7 @@ async def running_world(args: list[str]) -> AsyncIterator[World]:
         start_new_session=True,  # Ctrl-C at the terminal is for us: we stop the machine first, then the world
     )
     try:
-        yield World(await _ready(process), process.pid)
+        yield SimulatorProcess(await _ready(process), process.pid)
     finally:
         await run_to_end(_end(process))
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from abbe.models.compensation.smooth import smooth_of
 from abbe.models.discovery.changed.comparison import Change, Changed, changed_since
-from abbe.models.solvers.in_force import InForce
+from abbe.models.solvers.in_force import AppliedTables
 from abbe.models.uncertainty.known_field import KnownField
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import machine_digest
@@ -22,7 +22,7 @@ from abbe.service.effects.model_book import name_of, version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
 from abbe.service.identification.effect_removal import less_effects
 from abbe.service.identification.solution_field import stored_field
-from abbe.service.identification.table_removal import NOTHING, Taken, as_left, less, table_then
+from abbe.service.identification.table_removal import NOTHING, RemovedTable, as_left, less, table_then
 from abbe.service.runs.observations import run_data
 from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
@@ -117,7 +117,7 @@ def _acting(told: Sequence[Doc]) -> int | None:
     return next(iter(found), None)
 
 
-def _tables_between(store: Store, campaign: Campaign, before: _Before) -> Taken | None:
+def _tables_between(store: Store, campaign: Campaign, before: _Before) -> RemovedTable | None:
     """What is taken out of readings so that they are those of the machine with the earlier table; None: nothing.
 
     Raises
@@ -126,10 +126,10 @@ def _tables_between(store: Store, campaign: Campaign, before: _Before) -> Taken 
         One of two different tables is not known, or there was more than one at a time.
     """
     now = _acting([r.get("table") or {} for r in campaign.runs if r["role"] == "identify"])
-    return None if now == before.crc else Taken(_force(store, now), _force(store, before.crc))
+    return None if now == before.crc else RemovedTable(_force(store, now), _force(store, before.crc))
 
 
-def _force(store: Store, crc: int | None) -> InForce:
+def _force(store: Store, crc: int | None) -> AppliedTables:
     """What axes that follow do by a table."""
     if crc is None:
         return NOTHING
@@ -139,7 +139,7 @@ def _force(store: Store, crc: int | None) -> InForce:
     if int.from_bytes(image[KIND_AT], "big") == NO_CORRECTION:
         return NOTHING
     table = tables_from_image(image)
-    return NOTHING if table is None else InForce(smooth_of(table) or table.correction_at)
+    return NOTHING if table is None else AppliedTables(smooth_of(table) or table.correction_at)
 
 
 def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[Doc]) -> Doc:

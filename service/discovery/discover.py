@@ -45,7 +45,7 @@ Thin = Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
 
 
 @dataclass(frozen=True)
-class Job:
+class DiscoveryJob:
     """What a discovery works on.
 
     ``campaign``: as measured; ``runs``: its runs, long ones as means (`abbe.service.campaign_data.decimation`), less what a table in force
@@ -93,7 +93,7 @@ def prepare(
     table: TableThen = NO_TABLE,
     since: Since | None = None,
     thin: Thin = thinned,
-) -> Job:
+) -> DiscoveryJob:
     """Check a campaign's runs and take out what the model book knows.
 
     Parameters
@@ -131,7 +131,9 @@ def prepare(
     known = [] if base is None else [e for e in base.doc["effects"] if applies(e, campaign.name)]
     known_mm = readings_of(known, effects, case)
     labels = tuple(e["label"] for e in known)
-    return Job(campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen, table_mm, since)
+    return DiscoveryJob(
+        campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen, table_mm, since
+    )
 
 
 def _between(measured: list[dict[str, Any]], less: list[dict[str, Any]]) -> dict[str, F1]:
@@ -152,7 +154,7 @@ def _checked(campaign: Campaign) -> list[str]:
     return [f.line for f in flags]
 
 
-class Journal:
+class DiscoveryJournal:
     """States of one discovery, in order; this one forgets them with the process. `StoredJournal` keeps them."""
 
     def __init__(self) -> None:
@@ -192,7 +194,7 @@ class Journal:
         return bool(self.states) and self.states[-1][0] in ENDS
 
 
-def discover(job: Job, journal: Journal, search: Search, progress: ProgressSink) -> dict[str, Any]:
+def discover(job: DiscoveryJob, journal: DiscoveryJournal, search: Search, progress: ProgressSink) -> dict[str, Any]:
     """Take a discovery from wherever its journal stands to its end.
 
     Returns
@@ -233,6 +235,6 @@ def _enters(ending: dict[str, Any], finding: dict[str, Any]) -> bool:
     return bool(finding["effects"]) and ending["not_added"] is None
 
 
-def _version(job: Job, journal: Journal, finding: dict[str, Any]) -> dict[str, Any]:
+def _version(job: DiscoveryJob, journal: DiscoveryJournal, finding: dict[str, Any]) -> dict[str, Any]:
     """The model's version that a proved finding brings: with what moves readings, and nothing that was only seen beside it."""
     return grown(job.base, finding | {"effects": entering(finding)}, job.source | {"discovery": journal.id}, job.effects)

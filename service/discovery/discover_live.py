@@ -14,7 +14,7 @@ from typing import Any
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.campaigns.measure import measure, start_campaign
 from abbe.service.devices.session import Session
-from abbe.service.discovery.discover import Job, prepare
+from abbe.service.discovery.discover import DiscoveryJob, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
 from abbe.service.effects.model_book import version
 from abbe.service.errors import CampaignRefused, UnsafeToMove
@@ -154,7 +154,7 @@ def _last_s(campaign: Campaign) -> float:
     return max((float(run["columns"]["t_s"][-1]) for run in campaign.runs), default=0.0)
 
 
-def next_search(store: Store, job: Job, journal: StoredJournal, name: str) -> tuple[Job, StoredJournal]:
+def next_search(store: Store, job: DiscoveryJob, journal: StoredJournal, name: str) -> tuple[DiscoveryJob, StoredJournal]:
     """The search of a campaign joined with one that was added to it, and where it stands.
 
     The readings of the first search are in it again, so it starts from the version of the model that the first one started from, and

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from abbe.service.campaign_data.campaign_folder import ensure_stored
-from abbe.service.discovery.discover import Job, Journal
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
 from abbe.service.errors import ModelMovedOn
 from abbe.service.storage.records import DiscoveryRecord, NewVersion
 from abbe.service.storage.store import Store
 
 
-class StoredJournal(Journal):
+class StoredJournal(DiscoveryJournal):
     """A journal whose every state is on the disk before the next thing happens; the last one together with the model's new version.
 
     ``base``: the version of the model whose effects were taken out of the readings; None where nothing was.
@@ -46,7 +46,7 @@ class StoredJournal(Journal):
             raise ModelMovedOn(f"discovery {self._id}: {moved.detail}", f"{again}; what was found stays in discovery {self._id}") from None
 
 
-def journal_of(store: Store, job: Job, before: StoredJournal | None = None) -> StoredJournal:
+def journal_of(store: Store, job: DiscoveryJob, before: StoredJournal | None = None) -> StoredJournal:
     """The journal of a job: that of the same search where there is one that still holds, else a new one. A folder is imported first.
 
     A search holds as long as the model's current version is the one it started from, or one that it or what went on with it brought.

@@ -13,7 +13,7 @@ from abbe.models.discovery.case import CaseRun, Role
 from abbe.models.discovery.prediction import left_together, predictions, solve
 from abbe.models.discovery.whitened_problem import scene_of
 from abbe.service.campaign_data.packed_arrays import packed
-from abbe.service.discovery.discover import Job
+from abbe.service.discovery.discover import DiscoveryJob
 from abbe.service.discovery.discovery_doc import noise_mm_of
 
 FORMAT = "abbe-simulation/1"
@@ -36,7 +36,7 @@ class Simulation:
     noise_mm: dict[str, float]
 
 
-def simulate(job: Job) -> Simulation:
+def simulate(job: DiscoveryJob) -> Simulation:
     """Fit the present model to the identify runs and predict every run of the campaign."""
     scene = scene_of(job.case, baseline_of(job.case))
     predicted = predictions(scene, solve(scene, ()))
@@ -46,7 +46,7 @@ def simulate(job: Job) -> Simulation:
     return Simulation(total, left, {kind: c.sd_mm for kind, c in scene.colours.items()})
 
 
-def gap_doc(job: Job, told: Simulation) -> dict[str, Any]:
+def gap_doc(job: DiscoveryJob, told: Simulation) -> dict[str, Any]:
     """The gap of every run and role, µm: rms of measured minus simulated, and the noise that no model takes out."""
     runs = {r.path.label: _run(r, told) for r in job.case.runs}
     gaps = {}
@@ -60,7 +60,7 @@ def gap_doc(job: Job, told: Simulation) -> dict[str, Any]:
     return {"gaps": gaps, "runs": runs, "noise_um": {kind: v * 1e3 for kind, v in told.noise_mm.items()}}
 
 
-def simulation_doc(job: Job, told: Simulation) -> dict[str, Any]:
+def simulation_doc(job: DiscoveryJob, told: Simulation) -> dict[str, Any]:
     """The simulation as JSON: the gap per run and role, and every prediction, mm."""
     head = {"format": FORMAT, "campaign": job.campaign.name, "machine": job.campaign.site.name, "present_model": sorted(job.case.includes)}
     known = {"model_version": None if job.base is None else job.base.version, "known_effects": list(job.known)}
@@ -69,7 +69,7 @@ def simulation_doc(job: Job, told: Simulation) -> dict[str, Any]:
     )
 
 
-def simulated_finding(job: Job, told: Simulation) -> dict[str, Any]:
+def simulated_finding(job: DiscoveryJob, told: Simulation) -> dict[str, Any]:
     """The simulation in the form that the page of a finding is drawn from: nothing was looked for, before and after are the same."""
     doc = gap_doc(job, told)
     runs = {label: r | ({"rms_after_um": r["rms_before_um"]} if "rms_before_um" in r else {}) for label, r in doc["runs"].items()}

@@ -11,17 +11,17 @@ import numpy as np
 
 from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_table
+from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_table
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, integers
 
-LIMITS = Limits(points=1000, equidistant=True, directional=False)
+LIMITS = FormatLimits(points=1000, equidistant=True, directional=False)
 WHAT = "Centroid ballscrew table"
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """One file per axis; the reference must be one end of the table.
 
     Raises
@@ -45,7 +45,7 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     return tuple(files)
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """The tables of version 1 files; the axis is the letter before ``.tab``, positions count from the reference.
 
     Raises
@@ -56,7 +56,7 @@ def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
     return Compensation(tuple(_read_one(f, settings) for f in files))
 
 
-def _read_one(file: TextFile, settings: Settings) -> AxisTable:
+def _read_one(file: TextFile, settings: FormatSettings) -> AxisTable:
     axis = file.name.rpartition(".")[0][-1:].upper()
     lines = list(file.lines())
     if axis not in AXES or not lines:

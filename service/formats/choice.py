@@ -14,9 +14,9 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
 from abbe.models.volumetric import remove_rigid, volume_grid
-from abbe.service.formats.controls import Control
+from abbe.service.formats.controls import ControlModel
 from abbe.service.formats.identified import Identified, Values, axis_tables, grid_mm, lattice_of, motions_of, products_of, table_values
-from abbe.service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable, correction_at
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable, correction_at
 
 JUDGE_NODES, COARSE_NODES = 12, 6
 WORTH = 0.02
@@ -24,7 +24,7 @@ WORTH = 0.02
 
 
 @dataclass(frozen=True)
-class Choice:
+class FormatChoice:
     """One kind of tables: what is left (rms and largest vector over the volume, mm), how many numbers it takes, whether it is the one."""
 
     kind: str
@@ -39,10 +39,10 @@ class Choice:
         return self.compensation.numbers
 
 
-class Judge:
+class FormatJudge:
     """The identified field at the places where tables are judged, computed once."""
 
-    def __init__(self, known: Identified, control: Control, nodes: int = JUDGE_NODES) -> None:
+    def __init__(self, known: Identified, control: ControlModel, nodes: int = JUDGE_NODES) -> None:
         self.points_mm: F2 = volume_grid(known.machine.stroke_mm, nodes)
         self._moving = {way: known.moving_mm(self.points_mm, way) for way in (1, -1)}
         self._control = control
@@ -57,15 +57,15 @@ class Judge:
         both = np.concatenate([self.points_mm, self.points_mm])
         return np.asarray(np.linalg.norm(remove_rigid(both, np.concatenate(parts)), axis=1))
 
-    def choice(self, kind: str, comp: Compensation) -> Choice:
+    def choice(self, kind: str, comp: Compensation) -> FormatChoice:
         """A kind of tables with its figures."""
         left = self.left_mm(comp)
-        return Choice(kind, comp, float(np.sqrt(np.mean(left**2))), float(left.max()))
+        return FormatChoice(kind, comp, float(np.sqrt(np.mean(left**2))), float(left.max()))
 
 
-def choices(known: Identified, control: Control, reference_mm: F1) -> tuple[Choice, ...]:
+def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple[FormatChoice, ...]:
     """Every kind of tables the control can hold, from none to all, one of them marked as the best."""
-    judge = Judge(known, control)
+    judge = FormatJudge(known, control)
     found = [judge.choice("no table", Compensation())]
     if control.own:
         build = _Builder(known, control, reference_mm)
@@ -82,12 +82,12 @@ def choices(known: Identified, control: Control, reference_mm: F1) -> tuple[Choi
     return _marked(found)
 
 
-def best_of(found: tuple[Choice, ...]) -> Choice:
+def best_of(found: tuple[FormatChoice, ...]) -> FormatChoice:
     """The one that is marked."""
     return next(c for c in found if c.best)
 
 
-def _marked(found: list[Choice]) -> tuple[Choice, ...]:
+def _marked(found: list[FormatChoice]) -> tuple[FormatChoice, ...]:
     best = found[0]
     for c in sorted(found[1:], key=lambda c: c.numbers):
         if c.rms_mm < (1.0 - WORTH) * best.rms_mm:
@@ -100,7 +100,7 @@ def _grids(known: Identified, points: int, reference_mm: F1) -> tuple[F1, F1, F1
     return x, y, z
 
 
-def _own(known: Identified, control: Control, tables: tuple[AxisTable, ...]) -> Compensation:
+def _own(known: Identified, control: ControlModel, tables: tuple[AxisTable, ...]) -> Compensation:
     """Own-axis tables as the control holds lost motion: in their columns, or as its backlash parameter."""
     if control.both_directions:
         return Compensation(tables)
@@ -108,7 +108,7 @@ def _own(known: Identified, control: Control, tables: tuple[AxisTable, ...]) -> 
     return Compensation(plain, lost_motion_mm=dict(known.lost_motion_mm))
 
 
-def _crossed(control: Control, build: _Builder, judge: Judge) -> list[Choice]:
+def _crossed(control: ControlModel, build: _Builder, judge: FormatJudge) -> list[FormatChoice]:
     """Own-axis tables with cross tables, and with products; as many as the control has room for."""
     kinds: list[tuple[str, tuple[ProductTable, ...]]] = [("one-axis and cross tables", ())]
     kinds += [("one-axis, cross and product tables", build.offered)] if control.products else []
@@ -116,7 +116,7 @@ def _crossed(control: Control, build: _Builder, judge: Judge) -> list[Choice]:
     for kind, offered in kinds:
         chosen, pairs = offered, PAIRS
         if control.tables is not None:
-            chosen, pairs = build.greedy(Judge(build.known, control, nodes=COARSE_NODES), offered, control.tables)
+            chosen, pairs = build.greedy(FormatJudge(build.known, control, nodes=COARSE_NODES), offered, control.tables)
         out.append(judge.choice(kind, build.together(chosen, pairs)))
     return out
 
@@ -128,7 +128,7 @@ PAIRS: tuple[Pair, ...] = tuple((a, o) for a in AXES for o in AXES if a != o)
 class _Builder:
     """Puts tables together; what some hold is not in the others. Everything is linear, so every part is worked out once."""
 
-    def __init__(self, known: Identified, control: Control, reference_mm: F1) -> None:
+    def __init__(self, known: Identified, control: ControlModel, reference_mm: F1) -> None:
         self.known, self._control = known, control
         self._sets = tuple(_grids(known, n, reference_mm) for n in (control.own_points, control.cross_points))
         self.offered = products_of(known, self._sets[1], reference_mm) if control.products else ()
@@ -146,7 +146,7 @@ class _Builder:
         x, y, z = (self._whole[k][a] + sum((self._of[p.name][k][a] for p in products), np.zeros((1, 3))) for a in range(3))
         return x, y, z
 
-    def greedy(self, judge: Judge, offered: tuple[ProductTable, ...], room: int) -> tuple[tuple[ProductTable, ...], tuple[Pair, ...]]:
+    def greedy(self, judge: FormatJudge, offered: tuple[ProductTable, ...], room: int) -> tuple[tuple[ProductTable, ...], tuple[Pair, ...]]:
         """Again and again what takes out most per table that it needs, until the room is full or nothing helps."""
         products: tuple[ProductTable, ...] = ()
         pairs: tuple[Pair, ...] = ()
@@ -177,7 +177,7 @@ def rounded(comp: Compensation, unit_mm: float) -> Compensation:
     def to(v: F1, unit: float = unit_mm) -> F1:
         return np.asarray(np.round(v / unit) * unit)
 
-    def curve(c: Curve, unit: float) -> Curve:
+    def curve(c: AxisCurve, unit: float) -> AxisCurve:
         return replace(c, value=to(c.value, unit))
 
     tables = tuple(replace(t, forward_mm=to(t.forward_mm), backward_mm=to(t.backward_mm)) for t in comp.tables)

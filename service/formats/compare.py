@@ -26,7 +26,7 @@ POINTS = 400
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class FormatDifference:
     """Largest difference of one axis' correction, mm, and where it is: commanded position, direction of motion."""
 
     axis: str
@@ -55,22 +55,22 @@ def places_mm(*parts: Compensation) -> F2:
     return np.concatenate([random, *lines])
 
 
-def differences(found: Compensation, expected: Compensation) -> tuple[Difference, ...]:
+def differences(found: Compensation, expected: Compensation) -> tuple[FormatDifference, ...]:
     """Largest difference per axis, over both directions."""
     p = places_mm(found, expected)
     out = []
     for a, axis in enumerate(AXES):
-        best = Difference(axis, 0.0, (0.0, 0.0, 0.0), 1)
+        best = FormatDifference(axis, 0.0, (0.0, 0.0, 0.0), 1)
         for way in (1, -1):
             size = np.abs(_moving(found, p, way) - _moving(expected, p, way))[:, a]
             k = int(size.argmax())
             if size[k] > best.size_mm:
-                best = Difference(axis, float(size[k]), (float(p[k, 0]), float(p[k, 1]), float(p[k, 2])), way)
+                best = FormatDifference(axis, float(size[k]), (float(p[k, 0]), float(p[k, 1]), float(p[k, 2])), way)
         out.append(best)
     return tuple(out)
 
 
-def check_same(found: Compensation, expected: Compensation, tolerance_mm: float) -> tuple[Difference, ...]:
+def check_same(found: Compensation, expected: Compensation, tolerance_mm: float) -> tuple[FormatDifference, ...]:
     """Differences, if all are within the tolerance.
 
     Raises

@@ -9,7 +9,7 @@ from abbe.service.formats.model import Lookup
 
 
 @dataclass(frozen=True, slots=True)
-class Control:
+class ControlModel:
     """One control.
 
     Attributes
@@ -50,10 +50,10 @@ class Control:
     unit_mm: float = 1e-6
 
 
-CONTROLS: dict[str, Control] = {
+CONTROLS: dict[str, ControlModel] = {
     c.key: c
     for c in (
-        Control(
+        ControlModel(
             "linuxcnc",
             "LinuxCNC: COMP_FILE and HAL network",
             own="linuxcnc-1",
@@ -62,7 +62,7 @@ CONTROLS: dict[str, Control] = {
             cross_points=16,
             products=True,
         ),
-        Control(
+        ControlModel(
             "siemens-840d",
             "SINUMERIK 840D sl: ENC_COMP and CEC",
             own="siemens-eec",
@@ -71,7 +71,7 @@ CONTROLS: dict[str, Control] = {
             cross="siemens-cec",
             products=True,
         ),
-        Control(
+        ControlModel(
             "siemens-828d",
             "SINUMERIK 828D with the option: ENC_COMP and 8 CEC tables",
             own="siemens-eec",
@@ -81,9 +81,11 @@ CONTROLS: dict[str, Control] = {
             products=True,
             tables=8,
         ),
-        Control("fanuc", "Fanuc with pitch error compensation only", own="fanuc-pitch", own_points=101, unit_mm=1e-3),
-        Control("fanuc-30i", "Fanuc 30i with 3-D error compensation", own="fanuc-pitch", lattice="fanuc-lattice", nodes=9, unit_mm=1e-3),
-        Control(
+        ControlModel("fanuc", "Fanuc with pitch error compensation only", own="fanuc-pitch", own_points=101, unit_mm=1e-3),
+        ControlModel(
+            "fanuc-30i", "Fanuc 30i with 3-D error compensation", own="fanuc-pitch", lattice="fanuc-lattice", nodes=9, unit_mm=1e-3
+        ),
+        ControlModel(
             "heidenhain",
             "Heidenhain TNC: .COM tables",
             own="heidenhain",
@@ -92,14 +94,14 @@ CONTROLS: dict[str, Control] = {
             cross="heidenhain",
             unit_mm=1e-4,
         ),
-        Control("isg", "Beckhoff/ISG kernel with TF5280", motions="isg"),
-        Control("mach4", "Mach4", own="mach4", own_points=101, unit_mm=1e-4),
-        Control("centroid", "Centroid, table version 1", own="centroid", own_points=101, both_directions=False, unit_mm=1e-3),
+        ControlModel("isg", "Beckhoff/ISG kernel with TF5280", motions="isg"),
+        ControlModel("mach4", "Mach4", own="mach4", own_points=101, unit_mm=1e-4),
+        ControlModel("centroid", "Centroid, table version 1", own="centroid", own_points=101, both_directions=False, unit_mm=1e-3),
     )
 }
 
 
-def control_of(key: str) -> Control:
+def control_of(key: str) -> ControlModel:
     """The control of a key.
 
     Raises

@@ -9,19 +9,19 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_positions, check_size
+from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_positions, check_size
 from abbe.service.formats.model import Compensation, Lattice
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, integers, whole
 
-LIMITS = Limits(points=1000, equidistant=True, own=False, lattice=True)
+LIMITS = FormatLimits(points=1000, equidistant=True, own=False, lattice=True)
 WHAT = "Fanuc 3-D error compensation"
 NAME = "LATTICE.CSV"
 HEADER = "node,x_mm,y_mm,z_mm,x_units,y_units,z_units"
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """One line per node.
 
     Raises
@@ -47,7 +47,7 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     return (TextFile(NAME, "\n".join(lines) + "\n"),)
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """The grid of a sheet.
 
     Raises

@@ -17,13 +17,13 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_table
+from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_table
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, integers, whole
 
-LIMITS = Limits(points=129, equidistant=True)
+LIMITS = FormatLimits(points=129, equidistant=True)
 WHAT = "Fanuc pitch error compensation"
 NAME = "PITCH.TXT"
 LAST_POINT = 1023
@@ -42,7 +42,7 @@ class _Data:
     point: dict[int, tuple[int, int]] = field(default_factory=dict)
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """Parameters 3605 to 3627 and the points of all axes in one file; ``settings.reference_mm`` is the reference position.
 
     Raises
@@ -53,7 +53,7 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     check_kinds(comp, LIMITS, WHAT)
     if settings.reference_mm is None:
         raise FormatRefused(f"{WHAT}: counts from the reference position, and none is given", f"give the reference; {NOTHING}")
-    limits = LIMITS if settings.points is None else Limits(points=settings.points + 1, equidistant=True)
+    limits = LIMITS if settings.points is None else FormatLimits(points=settings.points + 1, equidistant=True)
     unit = settings.unit_mm * settings.magnification
     parameters: dict[int, list[str]] = {}
     points: list[str] = []
@@ -104,7 +104,7 @@ def _points(difference: np.ndarray[tuple[int, ...], np.dtype[np.int64]], first: 
     return [f"N{BASE + first + k}Q1P{v}" for k, v in enumerate(difference)]
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """What the control would sum up from the points.
 
     Raises
@@ -145,7 +145,7 @@ def _parse(file: TextFile) -> _Data:
     return data
 
 
-def _axis_table(file: TextFile, data: _Data, axis: int, settings: Settings) -> AxisTable:
+def _axis_table(file: TextFile, data: _Data, axis: int, settings: FormatSettings) -> AxisTable:
     def value(number: int) -> float:
         if (number, axis) not in data.parameter:
             raise file.wrong(1, f"parameter {number} of axis {axis} is missing: the control keeps its old value")

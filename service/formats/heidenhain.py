@@ -12,13 +12,13 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_table
+from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_table
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, fixed, increasing
 
-LIMITS = Limits(points=256, cross=True)
+LIMITS = FormatLimits(points=256, cross=True)
 WHAT = "Heidenhain .COM"
 POSITION_DECIMALS = 4
 ASSIGNMENT = "CONFIG.CMA"
@@ -27,7 +27,7 @@ STEEPEST = 64
 """TNC 4xx: two neighbouring values may differ by the spacing over this."""
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """One .COM per axis that something depends on, and CONFIG.CMA with its only line active.
 
     Raises
@@ -56,7 +56,7 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     return tuple(files)
 
 
-def _check_positions(tables: list[AxisTable], settings: Settings) -> None:
+def _check_positions(tables: list[AxisTable], settings: FormatSettings) -> None:
     position = tables[0].position_mm
     if np.abs(np.round(position, POSITION_DECIMALS) - position).max() > 1e-7:
         raise FormatRefused(f"{WHAT}: positions over {tables[0].axis} are finer than 0.1 µm", f"choose another grid; {NOTHING}")
@@ -74,7 +74,7 @@ def _check_positions(tables: list[AxisTable], settings: Settings) -> None:
         raise FormatRefused(f"{WHAT}: values over {tables[0].axis} change by {steepest * 1e3:.1f} µm from point to point", NOTHING)
 
 
-def _com(axis: str, tables: list[AxisTable], settings: Settings) -> str:
+def _com(axis: str, tables: list[AxisTable], settings: FormatSettings) -> str:
     position = tables[0].position_mm
     own = next((t for t in tables if t.own), None)
     columns: dict[str, F1] = {}
@@ -88,7 +88,7 @@ def _com(axis: str, tables: list[AxisTable], settings: Settings) -> str:
     return "\n".join([*lines, "[END]"]) + "\n"
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """What the control would take from the tables that the active line of the .CMA names (all .COM files if there is no .CMA).
 
     Raises

@@ -21,7 +21,7 @@ from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.geometry.bases import Term, term_values
 from abbe.models.geometry.chain import design
 from abbe.models.machine import AXES, Machine, lever_masks
-from abbe.service.formats.model import AxisTable, Curve, Lattice, Motions, ProductTable
+from abbe.service.formats.model import AxisCurve, AxisTable, Lattice, Motions, ProductTable
 
 Grids = tuple[F1, F1, F1]
 NODES = 9
@@ -98,8 +98,8 @@ def products_of(known: Identified, grids: Grids, reference_mm: F1) -> tuple[Prod
         if j == k or masks[j, k] == 0.0 or not effect.any() or not any(t.motion == name for t in known.terms):
             continue
         output = int(np.flatnonzero(effect)[0])
-        angle = Curve(AXES[j], grids[j], -effect[output] * _sampled(known, name, grids[j]))
-        out.append(ProductTable(AXES[output], angle, Curve(AXES[k], grids[k], grids[k] - reference_mm[k])))
+        angle = AxisCurve(AXES[j], grids[j], -effect[output] * _sampled(known, name, grids[j]))
+        out.append(ProductTable(AXES[output], angle, AxisCurve(AXES[k], grids[k], grids[k] - reference_mm[k])))
     return tuple(out)
 
 
@@ -185,6 +185,6 @@ def motions_of(known: Identified, grids: Grids) -> Motions:
     curves = {}
     for name, (axis, _) in PLACES.items():
         if any(t.motion == name for t in known.terms):
-            curves[name] = Curve(AXES[axis], grids[axis], _sampled(known, name, grids[axis]))
+            curves[name] = AxisCurve(AXES[axis], grids[axis], _sampled(known, name, grids[axis]))
     square = {t.motion: float(v) for t, v in zip(known.terms, known.coefficients, strict=True) if t.motion in SQUARENESS}
     return Motions(known.machine, curves, square)

@@ -12,19 +12,19 @@ import numpy as np
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, Limits, check_kinds, check_positions, check_size, check_table
-from abbe.service.formats.model import Compensation, Curve, Motions
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.model import AxisCurve, Compensation, Motions
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, increasing, short
 
-LIMITS = Limits(points=2000, directional=False, cross=True, motions=True, zero_at_reference=False)
+LIMITS = FormatLimits(points=2000, directional=False, cross=True, motions=True, zero_at_reference=False)
 WHAT = "ISG volumetric CSV"
 NAME = "volcomp.csv"
 ANGLE_DECIMALS = 3
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """Error motions (or one-axis tables, as the translations they correct) in one file.
 
     Raises
@@ -48,19 +48,19 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     return (TextFile(NAME, "\n".join(lines) + "\n"),)
 
 
-def _curves(comp: Compensation, settings: Settings) -> dict[str, Curve]:
+def _curves(comp: Compensation, settings: FormatSettings) -> dict[str, AxisCurve]:
     """Error motions by name, in ISO order."""
     if comp.motions is not None:
-        found = {n: Curve(c.axis, c.position_mm, to_file("isg", -c.value, c.position_mm)) for n, c in comp.motions.curves.items()}
+        found = {n: AxisCurve(c.axis, c.position_mm, to_file("isg", -c.value, c.position_mm)) for n, c in comp.motions.curves.items()}
     else:
         found = {}
         for t in comp.tables:
             check_table(t, LIMITS, WHAT, settings.reference_mm, settings.step_mm)
-            found[f"E{t.output}{t.axis}"] = Curve(t.axis, t.position_mm, to_file("isg", t.forward_mm, t.position_mm))
+            found[f"E{t.output}{t.axis}"] = AxisCurve(t.axis, t.position_mm, to_file("isg", t.forward_mm, t.position_mm))
     return {name: found[name] for name in PLACES if name in found}
 
 
-def _block(axis: str, mine: dict[str, Curve], settings: Settings) -> list[str]:
+def _block(axis: str, mine: dict[str, AxisCurve], settings: FormatSettings) -> list[str]:
     position = next(iter(mine.values())).position_mm
     check_positions(position, LIMITS, f"{WHAT}, {axis}")
     for name, curve in mine.items():
@@ -74,7 +74,7 @@ def _block(axis: str, mine: dict[str, Curve], settings: Settings) -> list[str]:
     return lines
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """The error motions of a file; ``settings.machine`` is the chain that the kernel is configured with.
 
     Raises
@@ -87,7 +87,7 @@ def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
     if settings.machine is None:
         raise FormatRefused(f"{WHAT}: the control works with its machine's chain, and none is given", "give the machine")
     file = files[0]
-    curves: dict[str, Curve] = {}
+    curves: dict[str, AxisCurve] = {}
     square: dict[str, float] = {}
     for head, rows in _blocks(file):
         _take(file, head, rows, curves, square)
@@ -115,7 +115,7 @@ def _blocks(file: TextFile) -> list[tuple[Row, list[Row]]]:
     return blocks
 
 
-def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, Curve], square: dict[str, float]) -> None:
+def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurve], square: dict[str, float]) -> None:
     line, names = head
     arguments = [n for n in names if n in AXES]
     strange = [n for n in names if n not in AXES and n not in PLACES and n not in SQUARENESS]
@@ -141,4 +141,4 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, Curve], 
             continue
         if name not in PLACES or AXES[PLACES[name][0]] != axis:
             raise file.wrong(line, f"{name} is no error motion of {axis}")
-        curves[name] = Curve(axis, position, -from_file("isg", table[:, k], position))
+        curves[name] = AxisCurve(axis, position, -from_file("isg", table[:, k], position))

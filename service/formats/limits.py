@@ -18,7 +18,7 @@ SPACING_TOLERANCE_MM = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class FormatLimits:
     """``points``: most per table; ``directional``: both directions can be held; ``size_mm``: largest absolute number."""
 
     points: int
@@ -34,7 +34,7 @@ class Limits:
     zero_at_reference: bool = True
 
 
-def check_kinds(comp: Compensation, limits: Limits, what: str) -> None:
+def check_kinds(comp: Compensation, limits: FormatLimits, what: str) -> None:
     """Refuse kinds of tables that the format does not know.
 
     Raises
@@ -62,7 +62,7 @@ def check_kinds(comp: Compensation, limits: Limits, what: str) -> None:
         raise FormatRefused(f"{what}: there is nothing to write", "give tables")
 
 
-def check_table(table: AxisTable, limits: Limits, what: str, reference_mm: tuple[float, float, float] | None, unit_mm: float) -> None:
+def check_table(table: AxisTable, limits: FormatLimits, what: str, reference_mm: tuple[float, float, float] | None, unit_mm: float) -> None:
     """Refuse one table that the format cannot hold.
 
     Raises
@@ -85,7 +85,7 @@ def check_table(table: AxisTable, limits: Limits, what: str, reference_mm: tuple
             )
 
 
-def check_positions(position_mm: F1, limits: Limits, name: str) -> None:
+def check_positions(position_mm: F1, limits: FormatLimits, name: str) -> None:
     """Number, order and spacing of a table's points.
 
     Raises
@@ -105,7 +105,7 @@ def check_positions(position_mm: F1, limits: Limits, name: str) -> None:
         )
 
 
-def check_size(position_mm: F1, values: F1, limits: Limits, name: str) -> None:
+def check_size(position_mm: F1, values: F1, limits: FormatLimits, name: str) -> None:
     """Refuse numbers that are none, or larger than a correction can be.
 
     Raises

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.service.formats.limits import PLAUSIBLE_MM, Limits, check_kinds, check_table
+from abbe.service.formats.limits import PLAUSIBLE_MM, FormatLimits, check_kinds, check_table
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import SIGNS, from_file, to_file
 from abbe.service.formats.text import TextFile, fixed, increasing, whole
 
-LIMITS = Limits(points=256)
+LIMITS = FormatLimits(points=256)
 POSITION_DECIMALS = 6
 
 
-def write(comp: Compensation, settings: Settings, *, kind: int = 1) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings, *, kind: int = 1) -> tuple[TextFile, ...]:
     """One file per own-axis table: ``x.comp`` ... for ``COMP_FILE`` with ``COMP_FILE_TYPE = kind``.
 
     Raises
@@ -40,7 +40,7 @@ def write(comp: Compensation, settings: Settings, *, kind: int = 1) -> tuple[Tex
     return tuple(files)
 
 
-def read(files: tuple[TextFile, ...], settings: Settings, *, kind: int = 1) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings, *, kind: int = 1) -> Compensation:
     """What LinuxCNC would take from the files; the axis is the first letter of the file's name.
 
     Raises

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from abbe.service.formats.limits import Limits, check_kinds, check_positions, check_size, check_table
-from abbe.service.formats.model import AxisTable, Compensation, Curve, ProductTable
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.limits import FormatLimits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, increasing, short
 
-LIMITS = Limits(points=16, directional=False, own=True, cross=True, products=True)
-LEVERS = Limits(points=16, size_mm=1e5)
+LIMITS = FormatLimits(points=16, directional=False, own=True, cross=True, products=True)
+LEVERS = FormatLimits(points=16, size_mm=1e5)
 WHAT = "LinuxCNC HAL network"
 NAME = "abbe.hal"
 JOINTS = {"X": 0, "Y": 1, "Z": 2}
@@ -39,7 +39,7 @@ class _Network:
     wired: set[str] = field(default_factory=set)
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """The network as one HAL file: components, order of execution, wires, tables.
 
     Raises
@@ -48,24 +48,24 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
         A grid, error motions, a direction-dependent table, or more than 16 points.
     """
     check_kinds(comp, LIMITS, WHAT)
-    curves: list[tuple[str, str, Curve, int]] = []
+    curves: list[tuple[str, str, AxisCurve, int]] = []
     for table in comp.tables:
         check_table(table, LIMITS, WHAT, settings.reference_mm, settings.step_mm)
         number = to_file("linuxcnc-hal", table.forward_mm, table.position_mm)
         name = f"t-{table.output}{table.axis}".lower()
-        curves.append((name, table.output, Curve(table.axis, table.position_mm, number), settings.decimals))
+        curves.append((name, table.output, AxisCurve(table.axis, table.position_mm, number), settings.decimals))
     for p in comp.products:
         for curve, limits in ((p.angle, LIMITS), (p.lever, LEVERS)):
             check_positions(curve.position_mm, limits, f"{WHAT}, {p.name}")
             check_size(curve.position_mm, curve.value, limits, f"{WHAT}, {p.name}")
         tail = f"{p.output}{p.angle.axis}{p.lever.axis}".lower()
         number = to_file("linuxcnc-hal", p.angle.value, p.angle.position_mm)
-        curves.append((f"a-{tail}", p.output, Curve(p.angle.axis, p.angle.position_mm, number), settings.decimals + ANGLE_DECIMALS))
+        curves.append((f"a-{tail}", p.output, AxisCurve(p.angle.axis, p.angle.position_mm, number), settings.decimals + ANGLE_DECIMALS))
         curves.append((f"l-{tail}", p.output, p.lever, settings.decimals))
     return (TextFile(NAME, "\n".join(_hal(comp, curves)) + "\n"),)
 
 
-def _hal(comp: Compensation, curves: list[tuple[str, str, Curve, int]]) -> list[str]:
+def _hal(comp: Compensation, curves: list[tuple[str, str, AxisCurve, int]]) -> list[str]:
     names = [name for name, *_ in curves]
     products = [f"m-{p.output}{p.angle.axis}{p.lever.axis}".lower() for p in comp.products]
     feeds = {a: [n for n, out, *_ in curves if out == a and n[0] == "t"] for a in JOINTS}
@@ -104,7 +104,7 @@ def _summed(axis: str, parts: list[str]) -> list[str]:
     return lines
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """What a network written by `write` does.
 
     Raises
@@ -127,8 +127,8 @@ def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
             lever = curves.get(f"l{name[1:]}")
             if lever is None:
                 raise file.wrong(1, f"the curve l{name[1:]} of a product is missing")
-            angle = Curve(m.group(3).upper(), curve.position_mm, from_file("linuxcnc-hal", curve.value, curve.position_mm))
-            products.append(ProductTable(m.group(2).upper(), angle, Curve(m.group(4).upper(), lever.position_mm, lever.value)))
+            angle = AxisCurve(m.group(3).upper(), curve.position_mm, from_file("linuxcnc-hal", curve.value, curve.position_mm))
+            products.append(ProductTable(m.group(2).upper(), angle, AxisCurve(m.group(4).upper(), lever.position_mm, lever.value)))
     return Compensation(tuple(tables), tuple(products))
 
 
@@ -149,7 +149,7 @@ def _take(net: _Network, file: TextFile, line: int, text: str) -> None:
         raise file.wrong(line, f"{text.strip()!r} is no line of such a network")
 
 
-def _curve(net: _Network, file: TextFile, name: str) -> Curve:
+def _curve(net: _Network, file: TextFile, name: str) -> AxisCurve:
     found: dict[str, list[float]] = {"x": [], "y": []}
     lines: list[int] = []
     for k in range(net.points[name]):
@@ -167,4 +167,4 @@ def _curve(net: _Network, file: TextFile, name: str) -> Curve:
     if match is None:
         raise file.wrong(1, f"curve {name!r} has none of the names t-OA, a-OAL, l-OAL")
     axis = match.group(2) if name[0] == "t" else match.group(3 if name[0] == "a" else 4)
-    return Curve(axis.upper(), np.array(found["x"]), np.array(found["y"]))
+    return AxisCurve(axis.upper(), np.array(found["x"]), np.array(found["y"]))

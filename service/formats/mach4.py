@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.service.formats.limits import Limits, check_kinds, check_table
+from abbe.service.formats.limits import FormatLimits, check_kinds, check_table
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, fixed, short
 
-LIMITS = Limits(points=10000, equidistant=True)
+LIMITS = FormatLimits(points=10000, equidistant=True)
 WHAT = "Mach4 screw map"
 HEADER = "point,position_mm,error_plus_mm,error_minus_mm"
 _HEAD = ("axis", "start_mm", "length_mm", "points")
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """One sheet per axis.
 
     Raises
@@ -41,7 +41,7 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     return tuple(files)
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """The tables of such sheets.
 
     Raises

@@ -23,7 +23,7 @@ Lookup = Literal["command", "corrected"]
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class AxisCurve:
     """A function of where one axis stands: ``value`` at increasing ``position_mm`` of ``axis`` (X, Y, Z)."""
 
     axis: str
@@ -73,8 +73,8 @@ class ProductTable:
     """Correction of ``output`` = ``angle`` (rad) times ``lever`` (mm): what a turned carriage does at a distance."""
 
     output: str
-    angle: Curve
-    lever: Curve
+    angle: AxisCurve
+    lever: AxisCurve
 
     @property
     def name(self) -> str:
@@ -95,7 +95,7 @@ class Motions:
     """ERROR motions (ISO 230-1, not corrections; mm, rad) for a control that works the deviation out by its own chain (rule G)."""
 
     machine: Machine
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, AxisCurve]
     squareness_rad: Mapping[str, float]
 
     def correction_at(self, axes_mm: F2) -> F2:

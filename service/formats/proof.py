@@ -10,15 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
-from abbe.service.formats.model import AxisTable, Compensation, Curve, Lattice, ProductTable, correction_at
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS, Format
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 
 STEP_MM = 0.010
 POSITION_MM = np.array([0.0, 50.0, 100.0, 150.0, 200.0])
 AT = 2
 """Index of the place of the step."""
-SETTINGS = Settings(
+SETTINGS = FormatSettings(
     reference_mm=(0.0, 0.0, 0.0),
     decimals=4,
     machine=Machine("w-X-Y-b-Z-t", np.array([[0.0, 200.0]] * 3)),
@@ -72,8 +72,8 @@ def _cases(form: Format) -> list[Case]:
         pair = [Compensation((AxisTable("X", "X", POSITION_MM, zero, v),)) for v in (spike, zero)]
         cases.append(("X over X, only while moving in −", "X", (place, 0.0, 0.0), -1, pair[0], pair[1]))
     if form.limits.products:
-        lever = Curve("Z", POSITION_MM, POSITION_MM)
-        both = [Compensation(products=(ProductTable("X", Curve("Y", POSITION_MM, v / 200.0), lever),)) for v in (spike, 0.0 * spike)]
+        lever = AxisCurve("Z", POSITION_MM, POSITION_MM)
+        both = [Compensation(products=(ProductTable("X", AxisCurve("Y", POSITION_MM, v / 200.0), lever),)) for v in (spike, 0.0 * spike)]
         cases.append(("X over Y times Z", "X", (0.0, place, 200.0), 1, both[0], both[1]))
     if form.limits.lattice:
         nodes = (POSITION_MM[[0, AT, 4]],) * 3

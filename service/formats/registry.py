@@ -19,14 +19,14 @@ from abbe.service.formats import (
     siemens_cec,
     siemens_eec,
 )
-from abbe.service.formats.limits import Limits
+from abbe.service.formats.limits import FormatLimits
 from abbe.service.formats.model import Compensation
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.signs import SIGNS, SignRule
 from abbe.service.formats.text import TextFile
 
-Write = Callable[[Compensation, Settings], tuple[TextFile, ...]]
-Read = Callable[[tuple[TextFile, ...], Settings], Compensation]
+Write = Callable[[Compensation, FormatSettings], tuple[TextFile, ...]]
+Read = Callable[[tuple[TextFile, ...], FormatSettings], Compensation]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Format:
 
     key: str
     name: str
-    limits: Limits
+    limits: FormatLimits
     write: Write
     read: Read
     live: str

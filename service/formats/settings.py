@@ -8,7 +8,7 @@ from abbe.models.machine import Machine
 
 
 @dataclass(frozen=True)
-class Settings:
+class FormatSettings:
     """Attributes.
 
     reference_mm : (x, y, z), optional

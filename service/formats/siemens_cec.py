@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.machine import AXES
-from abbe.service.formats.limits import Limits, check_kinds, check_positions, check_size, check_table
-from abbe.service.formats.model import AxisTable, Compensation, Curve, ProductTable
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.limits import FormatLimits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, Assignments, grid, parse, step_of
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, short
 
-LIMITS = Limits(points=2000, equidistant=True, own=True, cross=True, products=True)
-LEVERS = Limits(points=2000, equidistant=True, size_mm=1e5)
+LIMITS = FormatLimits(points=2000, equidistant=True, own=True, cross=True, products=True)
+LEVERS = FormatLimits(points=2000, equidistant=True, size_mm=1e5)
 WHAT = "Siemens CEC"
 NAME = "NC_CEC.INI"
 ANGLE_DECIMALS = 3
@@ -31,7 +31,7 @@ ANGLE_DECIMALS = 3
 class _Table:
     """One $AN_CEC table: its curve (numbers as in the file), output, direction, the table it is multiplied by (0: none), a mere factor?"""
 
-    curve: Curve
+    curve: AxisCurve
     output: str
     direction: int
     times: int
@@ -39,7 +39,7 @@ class _Table:
     decimals: int
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """All tables in one file, numbered from 0, in the order of the manual's example.
 
     Raises
@@ -47,19 +47,19 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     FormatRefused
         A grid or error motions; a limit; more points than MD18342 (``settings.points``).
     """
-    limits = LIMITS if settings.points is None else Limits(points=settings.points, equidistant=True, cross=True, products=True)
+    limits = LIMITS if settings.points is None else FormatLimits(points=settings.points, equidistant=True, cross=True, products=True)
     check_kinds(comp, limits, WHAT)
     found: list[_Table] = []
     for table in comp.tables:
         check_table(table, limits, WHAT, settings.reference_mm, settings.step_mm)
         for way, values in ((1, table.forward_mm), (-1, table.backward_mm)) if table.directional else ((0, table.forward_mm),):
-            curve = Curve(table.axis, table.position_mm, to_file("siemens-cec", values, table.position_mm))
+            curve = AxisCurve(table.axis, table.position_mm, to_file("siemens-cec", values, table.position_mm))
             found.append(_Table(curve, table.output, way, 0, False, settings.decimals))
     for p in comp.products:
         for part, limit in ((p.angle, limits), (p.lever, LEVERS)):
             check_positions(part.position_mm, limit, f"{WHAT}, {p.name}")
             check_size(part.position_mm, part.value, limit, f"{WHAT}, {p.name}")
-        angle = Curve(p.angle.axis, p.angle.position_mm, to_file("siemens-cec", p.angle.value, p.angle.position_mm))
+        angle = AxisCurve(p.angle.axis, p.angle.position_mm, to_file("siemens-cec", p.angle.value, p.angle.position_mm))
         found.append(_Table(angle, p.output, 0, len(found) + 2, False, settings.decimals + ANGLE_DECIMALS))
         found.append(_Table(p.lever, p.output, 0, 0, True, settings.decimals))
     lines = ["%_N_NC_CEC_INI", HEAD]
@@ -84,7 +84,7 @@ def _lines(t: int, table: _Table, *, switches: bool) -> list[str]:
     return [*lines, f"$SN_CEC_TABLE_ENABLE[{t}]={0 if table.factor else 1}"] if switches else lines
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """What the control would make of the file; a table for one direction alone is nothing in the other.
 
     Raises
@@ -98,7 +98,7 @@ def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
     if not numbers:
         raise found.file.wrong(1, "there is no table")
     tables = {t: _table(found, t) for t in numbers}
-    plain: dict[tuple[str, str, bytes], list[tuple[int, Curve]]] = {}
+    plain: dict[tuple[str, str, bytes], list[tuple[int, AxisCurve]]] = {}
     products = []
     for t, table in tables.items():
         if table.times:
@@ -106,7 +106,9 @@ def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
             if other is None:
                 line = found.line[("AN_CEC_MULT_BY_TABLE", (str(t),))]
                 raise found.file.wrong(line, f"table {t} is multiplied by table number {table.times}, which is not there")
-            angle = Curve(table.curve.axis, table.curve.position_mm, from_file("siemens-cec", table.curve.value, table.curve.position_mm))
+            angle = AxisCurve(
+                table.curve.axis, table.curve.position_mm, from_file("siemens-cec", table.curve.value, table.curve.position_mm)
+            )
             products.append(ProductTable(table.output, angle, other.curve))
         elif not table.factor:
             key = (table.curve.axis, table.output, table.curve.position_mm.tobytes())
@@ -114,7 +116,7 @@ def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
     return Compensation(tuple(_both(k[0], k[1], parts) for k, parts in plain.items()), tuple(products))
 
 
-def _both(axis: str, output: str, parts: list[tuple[int, Curve]]) -> AxisTable:
+def _both(axis: str, output: str, parts: list[tuple[int, AxisCurve]]) -> AxisTable:
     """All tables of one pair of axes on one grid: what they add in + and in −."""
     position = parts[0][1].position_mm
     there, back = np.zeros(position.size), np.zeros(position.size)
@@ -135,7 +137,7 @@ def _table(found: Assignments, t: int) -> _Table:
         raise found.file.wrong(found.line[("AN_CEC_DIRECTION", (n,))], f"direction {way}, expected -1, 0 or 1")
     enabled = found.value.get(("SN_CEC_TABLE_ENABLE", (n,)), "1") not in ("0", "FALSE")
     return _Table(
-        Curve(_axis(found, "AN_CEC_INPUT_AXIS", n), position, values), _axis(found, "AN_CEC_OUTPUT_AXIS", n), way, times, not enabled, 0
+        AxisCurve(_axis(found, "AN_CEC_INPUT_AXIS", n), position, values), _axis(found, "AN_CEC_OUTPUT_AXIS", n), way, times, not enabled, 0
     )
 
 

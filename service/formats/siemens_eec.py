@@ -7,19 +7,19 @@ The table must be zero at the reference point. Lost motion that does not depend 
 from __future__ import annotations
 
 from abbe.models.machine import AXES
-from abbe.service.formats.limits import Limits, check_kinds, check_table
+from abbe.service.formats.limits import FormatLimits, check_kinds, check_table
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, grid, parse, step_of
 from abbe.service.formats.signs import from_file, to_file
 from abbe.service.formats.text import TextFile, short
 
-LIMITS = Limits(points=5000, equidistant=True, directional=False)
+LIMITS = FormatLimits(points=5000, equidistant=True, directional=False)
 WHAT = "Siemens ENC_COMP"
 NAME = "AX_EEC.INI"
 
 
-def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """All own-axis tables in one file, in the order of the manual's example.
 
     Raises
@@ -27,7 +27,7 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     FormatRefused
         Another kind of table, a direction-dependent one, more points than MD38000 (``settings.points``), not zero at the reference.
     """
-    limits = LIMITS if settings.points is None else Limits(points=settings.points, equidistant=True, directional=False)
+    limits = LIMITS if settings.points is None else FormatLimits(points=settings.points, equidistant=True, directional=False)
     check_kinds(comp, limits, WHAT)
     lines = ["%_N_AX_EEC_INI", HEAD]
     for table in comp.tables:
@@ -44,7 +44,7 @@ def write(comp: Compensation, settings: Settings) -> tuple[TextFile, ...]:
     return (TextFile(NAME, "\n".join([*lines, END]) + "\n"),)
 
 
-def read(files: tuple[TextFile, ...], settings: Settings) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     """What the control would take from the file.
 
     Raises

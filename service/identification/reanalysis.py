@@ -21,7 +21,7 @@ HEADINGS = ("campaign", "runs", "verdict", "what")
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class ReanalysisTask:
     """One campaign to solve. Plain values: it goes to other processes and other computers."""
 
     url: str
@@ -30,7 +30,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Reanalysed:
     """What became of a task: the solution's document, or one line of why there is none."""
 
     campaign: str
@@ -38,7 +38,7 @@ class Answer:
     refused: str = ""
 
 
-def solve_task(task: Task) -> Answer:
+def solve_task(task: ReanalysisTask) -> Reanalysed:
     """Read a campaign, solve it, return its document; nothing is written. What is refused is an answer, not an error: the others go on."""
     try:
         with Store.open(task.url) as store:
@@ -46,17 +46,17 @@ def solve_task(task: Task) -> Answer:
             known = taken_out(store, measured, table_then(store, measured))
         solved = solve_runs(known.campaign.site, known.campaign.runs, model=task.model)
         doc = {"campaign": known.campaign.name, "machine": known.campaign.site.doc} | solution_doc(account(solved)) | known.doc
-        return Answer(task.campaign, doc)
+        return Reanalysed(task.campaign, doc)
     except AbbeError as error:
-        return Answer(task.campaign, None, f"{error.code}: {error}")
+        return Reanalysed(task.campaign, None, f"{error.code}: {error}")
 
 
-def tasks_of(store: Store, url: str, pattern: str, model: Model) -> list[Task]:
+def tasks_of(store: Store, url: str, pattern: str, model: Model) -> list[ReanalysisTask]:
     """Every campaign whose name matches (``june-*``), in order of their numbers."""
-    return [Task(url, one.name, model) for one in store.campaigns() if fnmatchcase(one.name, pattern)]
+    return [ReanalysisTask(url, one.name, model) for one in store.campaigns() if fnmatchcase(one.name, pattern)]
 
 
-def solve_all(tasks: Sequence[Task], executor: Executor, store: Store | None = None) -> Iterator[Answer]:
+def solve_all(tasks: Sequence[ReanalysisTask], executor: Executor, store: Store | None = None) -> Iterator[Reanalysed]:
     """Solve; with a store given, keep each solution in it, from this process: the database has one writer.
 
     Raises
@@ -68,10 +68,10 @@ def solve_all(tasks: Sequence[Task], executor: Executor, store: Store | None = N
         if store is None or answer.doc is None:
             yield answer
             continue
-        yield Answer(answer.campaign, answer.doc | keep(store, from_store(store, answer.campaign), answer.doc))
+        yield Reanalysed(answer.campaign, answer.doc | keep(store, from_store(store, answer.campaign), answer.doc))
 
 
-def row(answer: Answer) -> tuple[str, str, str, str]:
+def row(answer: Reanalysed) -> tuple[str, str, str, str]:
     """Return the cells of `HEADINGS`."""
     if answer.doc is None:
         return (answer.campaign, "", "refused", answer.refused)

@@ -15,7 +15,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.compensation.smooth import smooth_of
 from abbe.models.compensation.tables import NineTables
-from abbe.models.solvers.in_force import InForce
+from abbe.models.solvers.in_force import AppliedTables
 from abbe.models.solvers.joint import solve_joint
 from abbe.service.campaign_data.campaign_checks import check_files, refuse
 from abbe.service.campaign_data.campaign_folder import Campaign
@@ -28,18 +28,18 @@ from abbe.service.tables.measured_with import images_of
 from abbe.service.tables.nine_tables import tables_from_image
 
 Runs = list[dict[str, Any]]
-NOTHING = InForce(np.zeros_like)
+NOTHING = AppliedTables(np.zeros_like)
 TABLE_OUT = "table_taken_out"
 """Key in a campaign's document and in a solution's: what was taken out of the readings."""
 STAYS = "what it did beyond smooth corrections, with the lost motion above all, is still in the readings"
 
 
 @dataclass(frozen=True)
-class Taken:
+class RemovedTable:
     """``force``: what was in force, lost motion included; ``stays``: what of it stays in the readings."""
 
-    force: InForce
-    stays: InForce
+    force: AppliedTables
+    stays: AppliedTables
 
 
 @dataclass(frozen=True)
@@ -107,27 +107,27 @@ def table_line(told: dict[str, Any]) -> str:
     return f"table{which} was in force: what it did beyond smooth corrections is taken out of the readings, with lost motion {lost}"
 
 
-def taken(table: NineTables, lost_mm: F1) -> Taken:
+def taken(table: NineTables, lost_mm: F1) -> RemovedTable:
     """What is taken out of readings that were measured with ``table`` by a machine with this lost motion of X, Y, Z.
 
     A table that no polynomials meet, made by hand or of pitch errors, may correct what no solver here finds: only what the lost motion made
     of its moves is taken out.
     """
-    return Taken(InForce(table.correction_at, lost_mm), InForce(smooth_of(table) or table.correction_at))
+    return RemovedTable(AppliedTables(table.correction_at, lost_mm), AppliedTables(smooth_of(table) or table.correction_at))
 
 
-def less(runs: Runs, out: Taken) -> Runs:
+def less(runs: Runs, out: RemovedTable) -> Runs:
     """Runs without what is taken out; a run without readings stays as it is."""
     return [_less(run, out) for run in runs]
 
 
 def _lost(site: Site, used: Runs, table: NineTables) -> dict[str, tuple[float, float]]:
     """Lost motion from runs less all that the table did: what interpolation adds would pass for turns."""
-    runs = less([r for r in used if not r["setup"].get("order")] or used, Taken(InForce(table.correction_at), NOTHING))
+    runs = less([r for r in used if not r["setup"].get("order")] or used, RemovedTable(AppliedTables(table.correction_at), NOTHING))
     return solve_joint(site.machine, tuple(run_data(r) for r in runs)).backlash_mm()
 
 
-def _less(run: dict[str, Any], out: Taken) -> dict[str, Any]:
+def _less(run: dict[str, Any], out: RemovedTable) -> dict[str, Any]:
     if run["columns"]["deviation_mm"] is None:
         return run
     axes = np.column_stack([np.asarray(run["columns"][f"{c}_mm"], dtype=np.float64) for c in "xyz"])
@@ -138,7 +138,7 @@ def _less(run: dict[str, Any], out: Taken) -> dict[str, Any]:
     return changed(run, run["columns"] | {"deviation_mm": reading.tolist()}, "table" if crc is None else f"table {crc:08X}")
 
 
-def _added_mm(run: dict[str, Any], axes_mm: F2, force: InForce) -> F1:
+def _added_mm(run: dict[str, Any], axes_mm: F2, force: AppliedTables) -> F1:
     setup = run["setup"]
     if run["test"].startswith("laser"):
         return force.laser_mm(axes_mm, beam_of(setup, run["run_id"]))

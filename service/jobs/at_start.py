@@ -8,7 +8,7 @@ from abbe.service.capture.recovery import recover_segments
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
@@ -46,5 +46,5 @@ async def push_is_open(store: Store, machine: str, control: str = "") -> bool:
     journal = await asyncio.to_thread(store.last_push, machine, control)
     if not journal:
         return False
-    state = State(journal[-1].state)
-    return state is State.OPERATOR or state not in TERMINAL
+    state = PushState(journal[-1].state)
+    return state is PushState.OPERATOR or state not in TERMINAL

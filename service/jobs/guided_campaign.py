@@ -21,7 +21,7 @@ from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import Session
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.jobs.investigate import NO, Bench, made_of, promise_words
+from abbe.service.jobs.investigate import NO, InvestigationContext, made_of, promise_words
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import COMPENSATION_ON
@@ -35,7 +35,7 @@ SOLVING = "all is measured, and nothing moves while it is solved"
 
 
 @dataclass(frozen=True, slots=True)
-class Led:
+class CampaignOutcome:
     """How it ended: "proposed", or "ended" where there is no proposal that could be approved; why; and what is in the store of it."""
 
     word: str
@@ -70,7 +70,7 @@ def _source(recipe: str, rate_hz: int, text: str | None = None) -> dict[str, Any
     return {"recipe": recipe, "helix": "", "rate_hz": rate_hz, "text": text}
 
 
-async def led_campaign(bench: Bench, source: dict[str, Any], by: str) -> Led:
+async def led_campaign(bench: InvestigationContext, source: dict[str, Any], by: str) -> CampaignOutcome:
     """Measure the bench's plan under its name, solve it and propose; whoever mounts at a console is asked by ``bench.control.prompts``.
 
     Parameters
@@ -96,18 +96,18 @@ async def led_campaign(bench: Bench, source: dict[str, Any], by: str) -> Led:
         check_certificates(bench.site)
         _check_not_ended(bench)
     except NO as no:
-        return Led("ended", f"no proposal: {no}")
+        return CampaignOutcome("ended", f"no proposal: {no}")
     await _measured(bench, source)
     try:
         return await _proposed(bench, by)
     except NO as no:
-        return Led("ended", f"no proposal: {no}; campaign {name!r} stays, and `abbe solve` shows what it says")
+        return CampaignOutcome("ended", f"no proposal: {no}; campaign {name!r} stays, and `abbe solve` shows what it says")
     except BaseException as error:
         error.add_note(f"campaign {name!r} is measured: `abbe comp propose MACHINE.toml {name!r}` solves it and proposes")
         raise
 
 
-async def _measured(bench: Bench, source: dict[str, Any]) -> None:
+async def _measured(bench: InvestigationContext, source: dict[str, Any]) -> None:
     site, store, name = bench.site, bench.store, bench.plan.name
     plan = paced(bench.plan, site.max_feed_mm_min)
     whoever = _Whoever(bench.control)
@@ -129,7 +129,7 @@ async def _measured(bench: Bench, source: dict[str, Any]) -> None:
                 raise
 
 
-async def _proposed(bench: Bench, by: str) -> Led:
+async def _proposed(bench: InvestigationContext, by: str) -> CampaignOutcome:
     await bench.control.gate()
     bench.control.hurry = SOLVING
 
@@ -140,11 +140,11 @@ async def _proposed(bench: Bench, by: str) -> Led:
     made = await made_of(bench, bench.plan.name, agree, by)
     solution, against = made.proposed.solution_id, made.proposed.reasons
     if against:
-        return Led("ended", f"proposal {made.number} cannot be approved: {'; '.join(against)}", solution, made.number)
-    return Led("proposed", await asyncio.to_thread(promise_words, bench.store, made), solution, made.number)
+        return CampaignOutcome("ended", f"proposal {made.number} cannot be approved: {'; '.join(against)}", solution, made.number)
+    return CampaignOutcome("proposed", await asyncio.to_thread(promise_words, bench.store, made), solution, made.number)
 
 
-def _check_not_ended(bench: Bench) -> None:
+def _check_not_ended(bench: InvestigationContext) -> None:
     """No hour is measured for a table that no certificate carries any more."""
     ended = certificates(bench.site, bench.clock.utc().date(), needed_by(bench.plan).first)
     if ended:
@@ -174,6 +174,6 @@ class _Whoever:
         await self._control.unless_stopped(self._control.prompts.ask(text))
 
 
-def named_now(bench: Bench, recipe: str) -> Bench:
+def named_now(bench: InvestigationContext, recipe: str) -> InvestigationContext:
     """The bench with its plan named as campaigns of this recipe are: recipe, machine, and when."""
     return replace(bench, plan=replace(bench.plan, name=f"{recipe} {bench.site.name} {bench.clock.utc():%Y-%m-%d %H:%M:%S}"))

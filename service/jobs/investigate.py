@@ -42,19 +42,19 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.verification.alarm_states import TRIES, Alarm, Doc, Kind, next_step
+from abbe.service.verification.alarm_states import TRIES, Alarm, AlarmKind, Doc, next_step
 
 BESIDE = 0.5
 """What is left for another remedy than a table may be at most this share of what tables promise; above it that remedy comes first."""
 NO = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
 """Answers, not faults: they are the alarm's text, and trying again would give the same."""
 
-Note = Callable[[Kind, Doc], Awaitable[Alarm]]
+Note = Callable[[AlarmKind, Doc], Awaitable[Alarm]]
 """Writes a line of the alarm; gives the alarm with it."""
 
 
 @dataclass(frozen=True)
-class Bench:
+class InvestigationContext:
     """What an investigation works with. ``plan``: the full campaign, named anew for each try; ``live``: is shown what its paths read."""
 
     site: Site
@@ -67,7 +67,7 @@ class Bench:
     live: LiveFeed | None = None
 
 
-async def investigate(bench: Bench, alarm: Alarm, note: Note) -> None:
+async def investigate(bench: InvestigationContext, alarm: Alarm, note: Note) -> None:
     """Take an alarm as far as it goes: to a proposal that waits for approval, or to the reason why there is none.
 
     Raises
@@ -85,26 +85,26 @@ async def investigate(bench: Bench, alarm: Alarm, note: Note) -> None:
             await bench.control.gate()
             alarm = await _STEPS[step](bench, alarm, note)
     except NO as no:
-        await note(Kind.ENDED, {"text": f"no proposal: {no}", "code": no.code})
+        await note(AlarmKind.ENDED, {"text": f"no proposal: {no}", "code": no.code})
 
 
-async def _measured(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
-    tries = sum(s.kind is Kind.BEGUN for s in alarm.work) + 1
+async def _measured(bench: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
+    tries = sum(s.kind is AlarmKind.BEGUN for s in alarm.work) + 1
     if tries > TRIES:
-        return await note(Kind.ENDED, {"text": f"no proposal: {TRIES} tries to measure the full campaign were not completed"})
+        return await note(AlarmKind.ENDED, {"text": f"no proposal: {TRIES} tries to measure the full campaign were not completed"})
     again = "" if tries == 1 else ", anew: the last try was not completed"
     plan = replace(bench.plan, name=f"alarm {alarm.number} {bench.clock.utc():%Y-%m-%d %H:%M:%S}")
     site, manner = bench.site, Manner(control=bench.control, part=True, live=bench.live)
     with alone(site.urls.cnc):
         async with recovered_session(bench.store, site) as session:
             # Only now: while another process has the machine nothing of this try has begun.
-            await note(Kind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
+            await note(AlarmKind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
             plan = paced(plan, site.max_feed_mm_min)
             ids = await measure(session, bench.store, site, plan, progress=bench.progress, clock=bench.clock, manner=manner)
-    return await note(Kind.MEASURED, {"text": f"campaign {plan.name!r} is measured: {len(ids)} runs", "campaign": plan.name})
+    return await note(AlarmKind.MEASURED, {"text": f"campaign {plan.name!r} is measured: {len(ids)} runs", "campaign": plan.name})
 
 
-async def _discovered(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
+async def _discovered(bench: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
     stopped = threading.Event()
 
     def tell(progress: Progress) -> None:
@@ -121,10 +121,10 @@ async def _discovered(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
     names = ", ".join(f"{name_of(e)} {size_text(e)}" for e in finding["effects"])
     changes = changed_words(finding)
     doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {told}", changes) if t), "discovery": number}
-    return await note(Kind.DISCOVERED, doc | _against(finding, bench.store, bench.site.name))
+    return await note(AlarmKind.DISCOVERED, doc | _against(finding, bench.store, bench.site.name))
 
 
-def _search(bench: Bench, campaign: str) -> tuple[int | None, dict[str, Any]]:
+def _search(bench: InvestigationContext, campaign: str) -> tuple[int | None, dict[str, Any]]:
     store = bench.store
     measured = from_store(store, campaign)
     book, since = current(store, bench.site.name), since_of(store, measured)
@@ -150,11 +150,11 @@ def _against(finding: dict[str, Any], store: Store, machine: str) -> Doc:
     return {"against": "; ".join(why), "rms_um": rms_um, "unnamed": unnamed}
 
 
-async def _proposed(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
-    known = alarm.last(Kind.DISCOVERED)
+async def _proposed(bench: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
+    known = alarm.last(AlarmKind.DISCOVERED)
     assert known is not None
     if known.doc["unnamed"]:
-        return await note(Kind.ENDED, {"text": f"no proposal: {known.doc['against']} ({known.doc['text']})"})
+        return await note(AlarmKind.ENDED, {"text": f"no proposal: {known.doc['against']} ({known.doc['text']})"})
 
     def agree(promised: Predicted) -> None:
         check_promise(promised)
@@ -163,11 +163,11 @@ async def _proposed(bench: Bench, alarm: Alarm, note: Note) -> Alarm:
     made = await made_of(bench, _campaign(alarm), agree)
     doc = {"proposal": made.number, "text": await asyncio.to_thread(promise_words, bench.store, made)}
     if made.proposed.reasons:
-        return await note(Kind.ENDED, doc | {"text": f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"})
-    return await note(Kind.PROPOSED, doc | {"beside": known.doc["against"]})
+        return await note(AlarmKind.ENDED, doc | {"text": f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"})
+    return await note(AlarmKind.PROPOSED, doc | {"beside": known.doc["against"]})
 
 
-async def made_of(bench: Bench, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> Made:
+async def made_of(bench: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> Made:
     """Solve a measured campaign and store what follows as a proposal, on the table that the controller has in force.
 
     ``agree`` and ``by`` as in `proposals.make`, whose errors are raised as well as those of a device.
@@ -205,14 +205,14 @@ def promise_words(store: Store, made: Made) -> str:
 
 
 def _campaign(alarm: Alarm) -> str:
-    measured = alarm.last(Kind.MEASURED)
+    measured = alarm.last(AlarmKind.MEASURED)
     if measured is None:
         raise AbbeError(f"alarm {alarm.number} has no measured campaign")
     return str(measured.doc["campaign"])
 
 
-_STEPS: dict[Kind, Callable[[Bench, Alarm, Note], Awaitable[Alarm]]] = {
-    Kind.MEASURED: _measured,
-    Kind.DISCOVERED: _discovered,
-    Kind.PROPOSED: _proposed,
+_STEPS: dict[AlarmKind, Callable[[InvestigationContext, Alarm, Note], Awaitable[Alarm]]] = {
+    AlarmKind.MEASURED: _measured,
+    AlarmKind.DISCOVERED: _discovered,
+    AlarmKind.PROPOSED: _proposed,
 }

@@ -19,7 +19,7 @@ PRUNED_AT_ONCE = 1000
 DROPPED = "MQT-001"
 
 
-class Row(Protocol):
+class OutboxRow(Protocol):
     """A message that waits."""
 
     @property
@@ -41,7 +41,7 @@ class Row(Protocol):
 class Outbox(Protocol):
     """What the publisher takes messages from."""
 
-    async def pending(self) -> Sequence[Row]:
+    async def pending(self) -> Sequence[OutboxRow]:
         """Return the oldest messages that no broker has acknowledged, oldest first."""
         ...
 
@@ -57,7 +57,7 @@ class Outbox(Protocol):
 class OutboxStore(Protocol):
     """The part of the store that is used here."""
 
-    def outbox_pending(self, limit: int = ...) -> Sequence[Row]:
+    def outbox_pending(self, limit: int = ...) -> Sequence[OutboxRow]:
         """Return the oldest unacknowledged messages."""
         ...
 
@@ -105,7 +105,7 @@ class StoreOutbox:
         self._store, self._topics, self._clock = store, topics, clock
         self._kept, self._most, self._down_to = kept, most, down_to
 
-    async def pending(self) -> Sequence[Row]:
+    async def pending(self) -> Sequence[OutboxRow]:
         """Return up to 100 messages, oldest first."""
         return await asyncio.to_thread(self._store.outbox_pending, 100)
 
@@ -130,6 +130,6 @@ def encode(doc: dict[str, Any]) -> bytes:
     return json.dumps(doc, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
-def with_id(row: Row) -> bytes:
+def with_id(row: OutboxRow) -> bytes:
     """Return the payload with the row's number in it: at least once is what MQTT promises, and a receiver drops what it has seen."""
     return encode({"id": row.id, **json.loads(row.payload)})

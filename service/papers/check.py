@@ -12,7 +12,7 @@ Outcome = Literal["holds", "fails"]
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class PaperCheck:
     """A number that has to come back within a bound.
 
     Attributes
@@ -56,7 +56,7 @@ class Check:
         return {**asdict(self), "deviation": self.deviation, "status": self.status}
 
 
-def count(checks: Sequence[Check]) -> dict[Outcome, int]:
+def count(checks: Sequence[PaperCheck]) -> dict[Outcome, int]:
     """Checks by outcome."""
     holding = sum(1 for c in checks if c.status == "holds")
     return {"holds": holding, "fails": len(checks) - holding}

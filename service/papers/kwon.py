@@ -9,15 +9,15 @@ from abbe.models.papers.kwon.geometry import Geometry
 from abbe.models.papers.kwon.kinematics import forward, forward_as_printed, inverse, links, square_commands
 from abbe.service.papers import kwon_printed as paper
 from abbe.service.papers import kwon_tables
-from abbe.service.papers.check import Check
+from abbe.service.papers.check import PaperCheck
 from abbe.service.papers.printed import Printed
-from abbe.service.papers.row import Row, stated
+from abbe.service.papers.row import PaperRow, stated
 
 IK_BOUND_MM = 1e-7
 """How near the inverse has to come to the commands of math.md's example."""
 
 
-def rows() -> list[Row]:
+def rows() -> list[PaperRow]:
     """Every row of the paper, in its order."""
     return [*_kinematics(), *_text(), *kwon_tables.rows()]
 
@@ -36,7 +36,7 @@ def assumed_geometry() -> Geometry:
     )
 
 
-def _kinematics() -> list[Row]:
+def _kinematics() -> list[PaperRow]:
     geometry = assumed_geometry()
     out = []
     for command, numbers in paper.EXAMPLES:
@@ -60,7 +60,7 @@ def _kinematics() -> list[Row]:
     ]
 
 
-def checks() -> list[Check]:
+def checks() -> list[PaperCheck]:
     """Whether the inverse gives back the commands whose ball centre math.md states."""
     command, there = paper.EXAMPLES[1]
     back = inverse(assumed_geometry(), np.array([[p.value for p in there]]))[0]
@@ -69,7 +69,7 @@ def checks() -> list[Check]:
         " last ones are off"
     )
     return [
-        Check(
+        PaperCheck(
             "kwon",
             "math.md 6",
             f"λ{k} back from the ball centre",
@@ -85,7 +85,7 @@ def checks() -> list[Check]:
     ]
 
 
-def _point(name: str, numbers: tuple[Printed, ...], point: F1, how: str) -> list[Row]:
+def _point(name: str, numbers: tuple[Printed, ...], point: F1, how: str) -> list[PaperRow]:
     return [
         stated("kwon", "6", f"{name}, {axis}", "mm", number, float(value), how)
         for axis, number, value in zip("xyz", numbers, point, strict=True)
@@ -96,17 +96,17 @@ def _list(values: tuple[float, ...]) -> str:
     return "(" + ", ".join(f"{v:g}" for v in values) + ")"
 
 
-def _text() -> list[Row]:
+def _text() -> list[PaperRow]:
     raw = "the coordinates measured on the CMM (Figs. 9, 10) are not printed"
     repeated = "the repeated readings (Fig. 14) are not printed"
     sd = ", ".join(f"{1e3 * np.sqrt(row[1].value):.1f}" for row in paper.TABLE2_MEAN_SQUARES.values())
     residual = f"the residuals (Fig. 13) are not printed. Consistency only: Table 2's mean squares mean standard deviations of {sd} µm"
     return [
-        Row("kwon", "4.2", "turn about Z before referencing", "°", paper.TURN_BEFORE_DEG, why=raw),
-        Row("kwon", "4.2", "turn about Z afterwards", "°", paper.TURN_AFTER_DEG, why=raw),
-        Row("kwon", "4.2", "residuals within ±", "µm", paper.RESIDUAL_UM, why=residual),
+        PaperRow("kwon", "4.2", "turn about Z before referencing", "°", paper.TURN_BEFORE_DEG, why=raw),
+        PaperRow("kwon", "4.2", "turn about Z afterwards", "°", paper.TURN_AFTER_DEG, why=raw),
+        PaperRow("kwon", "4.2", "residuals within ±", "µm", paper.RESIDUAL_UM, why=residual),
         *(
-            Row("kwon", "4.2", f"repeatability of {axis}, ±", "µm", number, why=repeated, series="repeatability ± of x, y, z")
+            PaperRow("kwon", "4.2", f"repeatability of {axis}, ±", "µm", number, why=repeated, series="repeatability ± of x, y, z")
             for axis, number in paper.REPEATABILITY_UM.items()
         ),
     ]

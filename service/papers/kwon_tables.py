@@ -25,7 +25,7 @@ from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE
 from abbe.service.papers import kwon_printed as paper
 from abbe.service.papers.compare import Computed, agrees, computed_from
 from abbe.service.papers.printed import Printed, values
-from abbe.service.papers.row import Erratum, Row, stated
+from abbe.service.papers.row import Erratum, PaperRow, stated
 from abbe.service.papers.words import minus
 
 ALPHA = 0.01
@@ -35,7 +35,7 @@ COEFFICIENTS = "rounding of the 20 printed coefficients"
 DAMAGED_ROW = (paper.COMPONENTS.index(paper.DAMAGED[0]), paper.DAMAGED[1])
 
 
-def rows() -> list[Row]:
+def rows() -> list[PaperRow]:
     """Both tables, and the largest errors that the text names."""
     return [*_plane(), *_coefficients(), *_in_plane(), *_sums(), *_largest(), *_variance(), *_degrees_of_freedom()]
 
@@ -60,14 +60,14 @@ def in_plane(component: str, z_mm: float) -> F1:
     return in_plane_coefficients(np.array(values(restored(component))), z_mm)
 
 
-def _plane() -> list[Row]:
+def _plane() -> list[PaperRow]:
     found = plane()
     wrong = Erratum("Table 1 is the minimum-norm solution of a fit on another plane; the origin of Z may have been another")
     how = "implied_plane: median of the quotients of neighbouring coefficients"
     ratios = np.array([r for _, r in found.ratios_mm])
     why = f"{ratios.size} quotients between {ratios.min():.2f} and {ratios.max():.2f} mm, {paper.PLANE_Z_MM.value - found.z_mm:.2f} mm off"
     out = [
-        Row("kwon", "Table 1", "plane Z of the fit", "mm", paper.PLANE_Z_MM, Computed(found.z_mm), how, why, wrong),
+        PaperRow("kwon", "Table 1", "plane Z of the fit", "mm", paper.PLANE_Z_MM, Computed(found.z_mm), how, why, wrong),
         stated("kwon", "6", "plane Z of the fit", "mm", paper.MATH_PLANE_MM, found.z_mm, how),
         stated("kwon", "6", "spread of the quotients", "mm", paper.MATH_SPREAD_MM, found.sd_mm, how),
     ]
@@ -76,7 +76,7 @@ def _plane() -> list[Row]:
         ratio = computed_from(_ratio, numbers[up], numbers[low])
         name = f"β{up}/β{low} ({ladder_name((up, low))}) of {paper.COMPONENTS[component]}"
         out.append(
-            Row(
+            PaperRow(
                 "kwon",
                 "Table 1",
                 f"plane Z by {name}",
@@ -93,7 +93,7 @@ def _plane() -> list[Row]:
     return out
 
 
-def _coefficients() -> list[Row]:
+def _coefficients() -> list[PaperRow]:
     component, k = paper.DAMAGED
     number = paper.TABLE1[component][k]
     factor = plane().z_mm
@@ -101,13 +101,13 @@ def _coefficients() -> list[Row]:
     value = factor * paper.TABLE1[component][below].value
     how = f"β{below} of {component} times the implied Z"
     power = Erratum("printed with 10⁻³ instead of 10⁻⁵", computed_from(lambda b: 100.0 * factor * b, paper.TABLE1[component][below]))
-    out = [Row("kwon", "Table 1", f"β{k} of {component}", "mm/mm³", number, Computed(value), how, "exponent", power)]
+    out = [PaperRow("kwon", "Table 1", f"β{k} of {component}", "mm/mm³", number, Computed(value), how, "exponent", power)]
     lost = "needs the errors at the grid points, which are not printed"
     for c in paper.COMPONENTS:
         for i, coefficient in enumerate(paper.TABLE1[c]):
             if (c, i) != paper.DAMAGED:
                 unit = f"mm/mm{_POWERS[sum(CUBIC[i])]}" if i else "mm"
-                out.append(Row("kwon", "Table 1", f"β{i} of {c}", unit, coefficient, why=lost, series=f"coefficients of {c}"))
+                out.append(PaperRow("kwon", "Table 1", f"β{i} of {c}", unit, coefficient, why=lost, series=f"coefficients of {c}"))
     return out
 
 
@@ -116,7 +116,7 @@ def _all_pairs() -> tuple[tuple[tuple[int, int, int], float], ...]:
     return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS])).ratios_mm
 
 
-def _in_plane() -> list[Row]:
+def _in_plane() -> list[PaperRow]:
     how = f"in_plane_coefficients of Table 1 at Z = {plane().z_mm:.5f} mm, β10 of e_x restored"
     out = []
     for c in paper.COMPONENTS:
@@ -137,7 +137,7 @@ def _on_grid(component: str, z_mm: float, figure: Callable[[GridSums], float]) -
     return computed_from(of, *restored(component), because=COEFFICIENTS)
 
 
-def _sums() -> list[Row]:
+def _sums() -> list[PaperRow]:
     grid = f"grid_sums about the mean, {GRID}"
     used, other = plane().z_mm, paper.PLANE_Z_MM.value
     out = []
@@ -150,15 +150,15 @@ def _sums() -> list[Row]:
         quantity = f"regression sum of squares of {c}"
         no_fit = "at the plane that the paper states the sums do not fit: it is not the plane of the fit"
         out += [
-            Row("kwon", "Table 2", quantity, "mm²", number, here, how, why),
-            Row("kwon", "Table 2", f"{quantity}, printed Z", "mm²", number, there, how_other, no_fit, again=True),
+            PaperRow("kwon", "Table 2", quantity, "mm²", number, here, how, why),
+            PaperRow("kwon", "Table 2", f"{quantity}, printed Z", "mm²", number, there, how_other, no_fit, again=True),
             stated("kwon", "6", quantity, "mm²", paper.MATH_SUMS[c], here.value, how),
             stated("kwon", "6", f"{quantity}, printed Z", "mm²", paper.MATH_SUMS_PRINTED_Z[c], there.value, how_other),
         ]
     return out
 
 
-def _largest() -> list[Row]:
+def _largest() -> list[PaperRow]:
     out = []
     used = plane().z_mm
     how = f"largest value on {GRID}, Table 1 at Z = {used:.3f} mm"
@@ -171,19 +171,19 @@ def _largest() -> list[Row]:
             if near
             else f"not even within the residuals of ± {paper.RESIDUAL_UM.text} µm: Table 1 does not give the figure of the text"
         )
-        out.append(Row("kwon", "4.2", f"largest |{c}|", "µm", number, found, how, why))
+        out.append(PaperRow("kwon", "4.2", f"largest |{c}|", "µm", number, found, how, why))
         out.append(stated("kwon", "6", f"largest |{c}|", "µm", paper.MATH_LARGEST_UM[c], found.value, how))
     return out
 
 
-def _variance() -> list[Row]:
+def _variance() -> list[PaperRow]:
     out = []
     for c in paper.COMPONENTS:
         regression, residual, total = paper.TABLE2_SUMS[c]
         lost = "needs the errors at the grid points, which are not printed"
         out += [
-            Row("kwon", "Table 2", f"residual sum of squares of {c}", "mm²", residual, why=lost),
-            Row(
+            PaperRow("kwon", "Table 2", f"residual sum of squares of {c}", "mm²", residual, why=lost),
+            PaperRow(
                 "kwon",
                 "Table 2",
                 f"total sum of squares of {c}",
@@ -213,7 +213,7 @@ def _over_61(c: str) -> bool:
     return not agrees(by_60, printed) and agrees(by_61, printed)
 
 
-def _mean_squares(c: str, regression: Printed, residual: Printed) -> list[Row]:
+def _mean_squares(c: str, regression: Printed, residual: Printed) -> list[PaperRow]:
     of_regression, of_residual = paper.TABLE2_MEAN_SQUARES[c]
     k, n = int(paper.DOF_REGRESSION.value), int(paper.DOF_RESIDUAL.value)
     other = Erratum(f"divided by {n + 1} instead of the printed {n} here", computed_from(lambda s: s / (n + 1), residual))
@@ -222,12 +222,16 @@ def _mean_squares(c: str, regression: Printed, residual: Printed) -> list[Row]:
     in_residual = computed_from(lambda s: s / n, residual)
     slip = other if _over_61(c) else None
     return [
-        Row("kwon", "Table 2", f"mean square of the regression of {c}", "mm²", of_regression, in_regression, f"regression sum / {k}", why),
-        Row("kwon", "Table 2", f"mean square of the residual of {c}", "mm²", of_residual, in_residual, f"residual sum / {n}", erratum=slip),
+        PaperRow(
+            "kwon", "Table 2", f"mean square of the regression of {c}", "mm²", of_regression, in_regression, f"regression sum / {k}", why
+        ),
+        PaperRow(
+            "kwon", "Table 2", f"mean square of the residual of {c}", "mm²", of_residual, in_residual, f"residual sum / {n}", erratum=slip
+        ),
     ]
 
 
-def _f(c: str, regression: Printed, residual: Printed) -> Row:
+def _f(c: str, regression: Printed, residual: Printed) -> PaperRow:
     k, n = int(paper.DOF_REGRESSION.value), int(paper.DOF_RESIDUAL.value)
     found = computed_from(lambda a, b: anova_from_sums(a, b, k, n).f, regression, residual)
     number = paper.TABLE2_F[c]
@@ -242,7 +246,7 @@ def _f(c: str, regression: Printed, residual: Printed) -> Row:
         else:
             why = f"unexplained. Nearest is the ratio of the printed mean squares, {_interval(ratio)}"
             erratum = Erratum("ratio of the printed mean squares in place of that of the sums", ratio)
-    return Row("kwon", "Table 2", f"F of {c}", "", number, found, how, why, erratum)
+    return PaperRow("kwon", "Table 2", f"F of {c}", "", number, found, how, why, erratum)
 
 
 def _ratio(a: float, b: float) -> float:
@@ -260,7 +264,7 @@ def degrees_of_freedom() -> tuple[int, int]:
     return found.rank - 1, found.n - found.rank
 
 
-def _degrees_of_freedom() -> list[Row]:
+def _degrees_of_freedom() -> list[PaperRow]:
     regression, residual = degrees_of_freedom()
     points = regression + residual + 1
     grid = f"layout of the grid on one plane, {GRID}"
@@ -271,7 +275,7 @@ def _degrees_of_freedom() -> list[Row]:
     k, n = int(paper.DOF_REGRESSION.value), int(paper.DOF_RESIDUAL.value)
     more = "the sums of Table 2 and 20 + 60 + 1 = 81 say 9 × 9 points"
     return [
-        Row(
+        PaperRow(
             "kwon",
             "Table 2",
             "degrees of freedom of the regression",
@@ -282,9 +286,11 @@ def _degrees_of_freedom() -> list[Row]:
             "rank",
             counted,
         ),
-        Row("kwon", "Table 2", "degrees of freedom of the residual", "", paper.DOF_RESIDUAL, Computed(float(residual)), grid, "rank", left),
-        Row("kwon", "4.2", "grid points", "", paper.POINTS, Computed(float(points)), grid, more),
-        Row("kwon", "4.2", f"critical F({k}, {n}, {ALPHA})", "", paper.CRITICAL_F, Computed(critical_f(k, n, ALPHA)), "critical_f"),
+        PaperRow(
+            "kwon", "Table 2", "degrees of freedom of the residual", "", paper.DOF_RESIDUAL, Computed(float(residual)), grid, "rank", left
+        ),
+        PaperRow("kwon", "4.2", "grid points", "", paper.POINTS, Computed(float(points)), grid, more),
+        PaperRow("kwon", "4.2", f"critical F({k}, {n}, {ALPHA})", "", paper.CRITICAL_F, Computed(critical_f(k, n, ALPHA)), "critical_f"),
         stated(
             "kwon",
             "6",

@@ -11,9 +11,9 @@ from pathlib import Path
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from abbe.service.papers.check import Check
+from abbe.service.papers.check import PaperCheck
 from abbe.service.papers.pictures import figures
-from abbe.service.papers.row import Row
+from abbe.service.papers.row import PaperRow
 from abbe.service.papers.run import PaperResult
 from abbe.service.papers.words import NONE, check_cells, computed_cells, note, short
 from abbe.service.rendering.numbers import printable
@@ -82,7 +82,7 @@ def _whole(text: str) -> str:
     return _UNIT_AFTER.sub("\u00a0", text)
 
 
-def _checks(checks: Sequence[Check]) -> list[dict[str, str]]:
+def _checks(checks: Sequence[PaperCheck]) -> list[dict[str, str]]:
     out, before = [], ""
     for check in checks:
         given, found, deviation, bound = (_whole(cell) for cell in check_cells(check))
@@ -100,7 +100,7 @@ def _checks(checks: Sequence[Check]) -> list[dict[str, str]]:
     return out
 
 
-def _rows(rows: Sequence[Row]) -> list[dict[str, str]]:
+def _rows(rows: Sequence[PaperRow]) -> list[dict[str, str]]:
     out, before = [], ""
     for row in rows:
         text = _whole(". ".join(part for part in (row.how, note(row)) if part))
@@ -109,7 +109,7 @@ def _rows(rows: Sequence[Row]) -> list[dict[str, str]]:
     return out
 
 
-def _cells(row: Row) -> dict[str, str]:
+def _cells(row: PaperRow) -> dict[str, str]:
     unit = f" {row.unit}" if row.unit != "1" else ""
     out = {
         "where": row.where if row.source == "paper" else f"math.md, {row.where}",

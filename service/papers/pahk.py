@@ -10,37 +10,37 @@ from abbe.service.papers.compare import Computed
 from abbe.service.papers.pahk_printed import Cmm
 from abbe.service.papers.printed import values
 from abbe.service.papers.probe_example import pattern
-from abbe.service.papers.row import Erratum, Row, stated
+from abbe.service.papers.row import Erratum, PaperRow, stated
 from abbe.service.papers.words import minus
 
 URAD = 1e-6
 
 
-def rows() -> list[Row]:
+def rows() -> list[PaperRow]:
     """Every row of the paper, in its order."""
     return [*_probe(), *[r for cmm in paper.CMMS for r in _machine(cmm)]]
 
 
-def _probe() -> list[Row]:
+def _probe() -> list[PaperRow]:
     lost = "the 101 readings and the map (Fig. 3) are not printed"
     micrometres = Erratum("printed as mm; a probe error of millimetres is impossible, µm is meant")
     out = [
-        Row("pahk", "3.2", "radius of the master sphere", "mm", paper.SPHERE_MM, why="given: input of the calibration", given=True),
-        Row("pahk", "3.2", "effective radius of the probe's ball", "mm", paper.EFFECTIVE_MM, why=lost),
+        PaperRow("pahk", "3.2", "radius of the master sphere", "mm", paper.SPHERE_MM, why="given: input of the calibration", given=True),
+        PaperRow("pahk", "3.2", "effective radius of the probe's ball", "mm", paper.EFFECTIVE_MM, why=lost),
     ]
     for name, number in (("largest", paper.PROBE_LARGEST), ("smallest", paper.PROBE_SMALLEST), ("rms", paper.PROBE_RMS)):
-        out.append(Row("pahk", "3.2", f"{name} probe error (printed as mm)", "µm", number, why=lost, erratum=micrometres))
+        out.append(PaperRow("pahk", "3.2", f"{name} probe error (printed as mm)", "µm", number, why=lost, erratum=micrometres))
     return [*out, *_pattern()]
 
 
-def _pattern() -> list[Row]:
+def _pattern() -> list[PaperRow]:
     angles = pattern()
     below = angles[angles[:, 0] > 0.0]
     step = f"master_sphere_pattern with a step of {paper.PATTERN_STEP_DEG.text}°"
     return [
-        Row("pahk", "3.2", "circles of latitude", "", paper.PATTERN_CIRCLES, Computed(float(len(np.unique(below[:, 0])))), step),
-        Row("pahk", "3.2", "points on the circles", "", paper.PATTERN_ON_CIRCLES, Computed(float(len(below))), step),
-        Row("pahk", "3.2", "points of the pattern", "", paper.PATTERN_POINTS, Computed(float(len(angles))), step),
+        PaperRow("pahk", "3.2", "circles of latitude", "", paper.PATTERN_CIRCLES, Computed(float(len(np.unique(below[:, 0])))), step),
+        PaperRow("pahk", "3.2", "points on the circles", "", paper.PATTERN_ON_CIRCLES, Computed(float(len(below))), step),
+        PaperRow("pahk", "3.2", "points of the pattern", "", paper.PATTERN_POINTS, Computed(float(len(angles))), step),
     ]
 
 
@@ -49,30 +49,30 @@ def machine_inputs(cmm: Cmm) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.fl
     return np.array(values(cmm.volume_mm)), np.array([cmm.squareness_urad[k].value for k in ("XY", "XZ", "YZ")]) * URAD
 
 
-def _machine(cmm: Cmm) -> list[Row]:
+def _machine(cmm: Cmm) -> list[PaperRow]:
     where = f"4, {cmm.name}"
     out = [
-        Row("pahk", where, f"squareness {name}", "µrad", number, why="measured: input of the model", given=True)
+        PaperRow("pahk", where, f"squareness {name}", "µrad", number, why="measured: input of the model", given=True)
         for name, number in cmm.squareness_urad.items()
     ]
     curve = "read from a curve that is lost with the figure"
     for name, (unit, band, repeatability) in cmm.bands.items():
-        out.append(Row("pahk", where, f"band of {name}", unit, band, why=curve))
-        out.append(Row("pahk", where, f"repeatability of {name}", unit, repeatability, why=curve))
+        out.append(PaperRow("pahk", where, f"band of {name}", unit, band, why=curve))
+        out.append(PaperRow("pahk", where, f"repeatability of {name}", unit, repeatability, why=curve))
     why = diagonal_evidence(cmm)
     out += [
-        Row("pahk", where, f"space diagonal {k}, deviation", "µm", number, why=why, series=f"diagonals of {cmm.name}")
+        PaperRow("pahk", where, f"space diagonal {k}, deviation", "µm", number, why=why, series=f"diagonals of {cmm.name}")
         for k, number in enumerate(cmm.diagonals_um, 1)
     ]
     random = "the random errors of the single parameters are printed for three of ten only, and their curves are lost"
     out += [
-        Row("pahk", where, f"space diagonal {k}, random error", "µm", number, why=random, series=f"random errors of {cmm.name}")
+        PaperRow("pahk", where, f"space diagonal {k}, random error", "µm", number, why=random, series=f"random errors of {cmm.name}")
         for k, number in enumerate(cmm.random_um, 1)
     ]
     return [*out, *_known(cmm)]
 
 
-def _known(cmm: Cmm) -> list[Row]:
+def _known(cmm: Cmm) -> list[PaperRow]:
     """What math.md says of the machine and what can be computed: the evidence behind "not reproducible"."""
     where = f"8, {cmm.name}"
     volume, squareness = machine_inputs(cmm)

@@ -33,7 +33,7 @@ SURFACE_NODES = 41
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class PaperFigure:
     """Pictures (``<svg>`` elements) that share a caption."""
 
     pictures: tuple[str, ...]
@@ -41,7 +41,7 @@ class Figure:
     kind: Literal["pair", "wide", "three"] = "pair"
 
 
-def figures(paper: Paper) -> list[Figure]:
+def figures(paper: Paper) -> list[PaperFigure]:
     """Pictures of one paper, in its order."""
     if paper == "pahk":
         return [_probe(), _machines()]
@@ -52,7 +52,7 @@ def figures(paper: Paper) -> list[Figure]:
     return []
 
 
-def _surfaces() -> list[Figure]:
+def _surfaces() -> list[PaperFigure]:
     z = plane().z_mm
     drawn = {c: _surface(c, z) for c in kwon_printed.COMPONENTS}
     scale = SignedScale.around(*(s.values for s in drawn.values()))
@@ -64,7 +64,10 @@ def _surfaces() -> list[Figure]:
     )
     spatial = tuple(surface_plot(s, scale, key=f"surface-{c}", heading=f"{c} over the plane") for c, s in drawn.items())
     flat = tuple(contour_plot(s, scale, key=f"contour-{c}", heading=f"{c}, level lines") for c, s in drawn.items())
-    return [Figure(spatial, f"Kwon, Fig. 11: {text}", "three"), Figure(flat, f"Kwon, Fig. 12: level lines of the same {text}", "three")]
+    return [
+        PaperFigure(spatial, f"Kwon, Fig. 11: {text}", "three"),
+        PaperFigure(flat, f"Kwon, Fig. 12: level lines of the same {text}", "three"),
+    ]
 
 
 def _surface(component: str, z_mm: float) -> Surface:
@@ -80,7 +83,7 @@ def _hemisphere(step_deg: float) -> tuple[F1, F1]:
     return low, around
 
 
-def _probe() -> Figure:
+def _probe() -> PaperFigure:
     found = example()
     coarse, fine = _hemisphere(6.0), _hemisphere(2.0)
     relief, chart = found.values_um(*coarse), found.values_um(*fine)
@@ -98,16 +101,16 @@ def _probe() -> Figure:
         f" (Reff {found.calibration.effective_radius_mm:.4f} mm, map within {short(1e3 * found.largest_mm)} µm of the declared one),"
         " bilinear between the touches. Positive: the probe triggers late. Dashed: equator of the ball without error."
     )
-    return Figure(pictures, caption)
+    return PaperFigure(pictures, caption)
 
 
-def _machines() -> Figure:
+def _machines() -> PaperFigure:
     caption = (
         "Pahk, Figs. 5 and 7(a): volumetric error of CMM A and CMM B, 5 × 5 × 5 nodes, tool relative to workpiece, Y line as datum"
         " as in the paper. Only the three printed squareness errors are in it: the positional, straightness and angular curves of Figs. 4"
         " and 6 are lost, so these are not the paper's maps. Dashed: as commanded; solid: with the errors magnified as each picture states."
     )
-    return Figure(tuple(_machine(cmm) for cmm in pahk_printed.CMMS), caption)
+    return PaperFigure(tuple(_machine(cmm) for cmm in pahk_printed.CMMS), caption)
 
 
 def _machine(cmm: Cmm) -> str:
@@ -123,7 +126,7 @@ def _machine(cmm: Cmm) -> str:
     return deformed_grid(grid, 1e3 * deviation, key=f"pahk-{cmm.type_name}", heading=heading)
 
 
-def _laser_and_bar() -> Figure:
+def _laser_and_bar() -> PaperFigure:
     x = np.array(restored_x_mm())
     laser, bar, _ = yang_printed.TABLE2["dxx"]
     data = Comparison(
@@ -140,4 +143,4 @@ def _laser_and_bar() -> Figure:
         "Yang and Kim, Fig. 7: δxx (EXX) by laser (Table 3, the eighth position restored to 254.0 mm) with the two first-order lines of"
         " Table 2. Below: laser minus the ball bar's line."
     )
-    return Figure((comparison_plot(data, key="yang-dxx", heading="δxx: laser against ball bar"),), caption, kind="wide")
+    return PaperFigure((comparison_plot(data, key="yang-dxx", heading="δxx: laser against ball bar"),), caption, kind="wide")

@@ -30,7 +30,7 @@ class Erratum:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class PaperRow:
     """One printed number beside ours.
 
     Attributes
@@ -173,18 +173,18 @@ class Row:
         }
 
 
-def stated(paper: Paper, where: str, quantity: str, unit: str, number: Printed, value: float, how: str) -> Row:
+def stated(paper: Paper, where: str, quantity: str, unit: str, number: Printed, value: float, how: str) -> PaperRow:
     """Row for a number that math.md states. Where it differs, math.md may have rounded an already rounded number: that is tried."""
     computed = Computed(value)
     if agrees(computed, number):
-        return Row(paper, where, quantity, unit, number, computed, how, source="math.md")
+        return PaperRow(paper, where, quantity, unit, number, computed, how, source="math.md")
     twice = Computed(_rounded_twice(value, number))
     if agrees(twice, number):
         slip = Erratum("math.md rounds a rounded number", twice)
-        return Row(paper, where, quantity, unit, number, computed, how, erratum=slip, source="math.md")
+        return PaperRow(paper, where, quantity, unit, number, computed, how, erratum=slip, source="math.md")
     digits = abs(value - number.value) / (2.0 * number.rounding)
     why = f"off by {digits:.1f} units of the last digit that math.md states"
-    return Row(paper, where, quantity, unit, number, computed, how, why, source="math.md")
+    return PaperRow(paper, where, quantity, unit, number, computed, how, why, source="math.md")
 
 
 def _rounded_twice(value: float, number: Printed) -> float:

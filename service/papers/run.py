@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, get_args
 
-from abbe.service.papers.check import Check, Outcome, count
-from abbe.service.papers.row import Paper, Row, Source, Status
+from abbe.service.papers.check import Outcome, PaperCheck, count
+from abbe.service.papers.row import Paper, PaperRow, Source, Status
 
 TITLES: dict[Paper, str] = {
     "pahk": "Pahk 1995: numerical CMM (paper 000)",
@@ -27,8 +27,8 @@ class PaperResult:
 
     paper: Paper
     title: str
-    rows: tuple[Row, ...]
-    checks: tuple[Check, ...]
+    rows: tuple[PaperRow, ...]
+    checks: tuple[PaperCheck, ...]
 
     def counts(self, source: Source = "paper") -> dict[Status, int]:
         """Numbers by status: those that the paper prints, or those that math.md adds."""
@@ -60,8 +60,8 @@ def results(papers: Iterable[Paper] = tuple(TITLES)) -> list[PaperResult]:
         if paper in wanted:
             # A paper's module is loaded when it is asked for: scipy takes its time.
             module = import_module(f"abbe.service.papers.{paper}")
-            rows: list[Row] = module.rows()
-            checks: list[Check] = module.checks() if paper in CHECKED else []
+            rows: list[PaperRow] = module.rows()
+            checks: list[PaperCheck] = module.checks() if paper in CHECKED else []
             own = [r for r in rows if r.source == "paper"]
             found.append(PaperResult(paper, title, (*own, *(r for r in rows if r.source != "paper")), tuple(checks)))
     return found

@@ -9,20 +9,20 @@ import numpy as np
 from abbe.models.papers.wang.mirror import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
 from abbe.service.papers import wang_printed as paper
 from abbe.service.papers.compare import Computed
-from abbe.service.papers.row import Erratum, Row
+from abbe.service.papers.row import Erratum, PaperRow
 
 CUBE = np.ones(3)
 
 
-def rows() -> list[Row]:
+def rows() -> list[PaperRow]:
     """Every row of the paper, in its order."""
     share = float(projection_factors(CUBE)[0])
     # The text writes the factor as "one over root three squared": read literally a third.
     literal = Erratum("the text writes 1/√3²; 1/√3 is meant", Computed(share))
     of_cube = "projection_factors of a cube"
     return [
-        Row("wang", "IV.A", "share of an axis' error seen on the diagonal", "", paper.PROJECTION, Computed(share), of_cube),
-        Row(
+        PaperRow("wang", "IV.A", "share of an axis' error seen on the diagonal", "", paper.PROJECTION, Computed(share), of_cube),
+        PaperRow(
             "wang",
             "IV.A",
             "the same as the text writes it, 1/√3²",
@@ -33,21 +33,21 @@ def rows() -> list[Row]:
             erratum=literal,
             again=True,
         ),
-        Row("wang", "IV.A", "factor on the resolution", "", paper.RESOLUTION, Computed(1.0 / share), f"1 / {of_cube}"),
+        PaperRow("wang", "IV.A", "factor on the resolution", "", paper.RESOLUTION, Computed(1.0 / share), f"1 / {of_cube}"),
         _cosine(),
         _mirror(),
     ]
 
 
-def _cosine() -> Row:
+def _cosine() -> PaperRow:
     misaligned = math.atan(paper.BEAM_MM_PER_M.value * 1e-3)
     computed = Computed(cosine_error(misaligned) * 1e6)
     how = "cosine_error of 1 mm in 1 m"
     why = "second order of the angle; the paper gives an upper bound"
-    return Row("wang", "IV.B", "cosine error, beam askew by 1 mm in 1 m", "µm/m", paper.COSINE_UM_PER_M, computed, how, why)
+    return PaperRow("wang", "IV.B", "cosine error, beam askew by 1 mm in 1 m", "µm/m", paper.COSINE_UM_PER_M, computed, how, why)
 
 
-def _mirror() -> Row:
+def _mirror() -> PaperRow:
     beam = diagonal_beam(CUBE, "ppp")
     tilt = np.array([paper.MIRROR_MRAD.value * 1e-3, 0.0])
     step = paper.STEP_MM.value * tilt_axes(beam)[:1]
@@ -57,4 +57,4 @@ def _mirror() -> Row:
         "the paper gives an upper bound. It calls the error constant and removable by calculation: that takes 12 slopes away with it and"
         " leaves only 3 squarenesses and one weighted scale (math.md 5.4)"
     )
-    return Row("wang", "IV.C", "mirror askew by 0.5 mrad, step of 50 mm", "µm", paper.MIRROR_UM, computed, how, why)
+    return PaperRow("wang", "IV.C", "mirror askew by 0.5 mrad, step of 50 mm", "µm", paper.MIRROR_UM, computed, how, why)

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-from abbe.service.papers.check import Check
+from abbe.service.papers.check import PaperCheck
 from abbe.service.papers.compare import FLOAT, OPERANDS
 from abbe.service.papers.printed import Printed
-from abbe.service.papers.row import Row
+from abbe.service.papers.row import PaperRow
 
 NONE = "–"
 _HYPHEN = re.compile(r"(?<![\w.])-(?=\d)|(?<=\de)-(?=\d)")
@@ -19,7 +19,7 @@ _HYPHEN = re.compile(r"(?<![\w.])-(?=\d)|(?<=\de)-(?=\d)")
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class PrintedLine:
     """One line of a table: of a row, or of a whole column whose rows end alike."""
 
     where: str
@@ -45,7 +45,7 @@ def short(value: float) -> str:
     return minus("0" if value == 0.0 else f"{value:.1e}" if not 1e-3 <= abs(value) < 1e5 else f"{value:.2g}")
 
 
-def note(row: Row) -> str:
+def note(row: PaperRow) -> str:
     """What the status rests on, why, and what the erratum explains."""
     parts = [part for part in (row.remark, row.why) if part]
     if row.erratum is not None:
@@ -58,20 +58,20 @@ def note(row: Row) -> str:
     return _HYPHEN.sub("−", "; ".join(parts))
 
 
-def lines(rows: Sequence[Row]) -> Iterator[Line]:
+def lines(rows: Sequence[PaperRow]) -> Iterator[PrintedLine]:
     """Lines of a table; neighbouring rows of one series and one status become one line with its worst difference."""
     for _, group in groupby(rows, key=lambda r: (r.series, r.status) if r.series else (id(r), r.status)):
         members = list(group)
         yield _line(members[0]) if len(members) == 1 else _column(members)
 
 
-def _line(row: Row) -> Line:
+def _line(row: PaperRow) -> PrintedLine:
     sign = "< " if row.printed.bound else ""
     printed = sign + minus(row.printed.text)
-    return Line(row.where, f"{row.quantity}{_unit(row.unit)}", printed, *computed_cells(row), row.status, note(row))
+    return PrintedLine(row.where, f"{row.quantity}{_unit(row.unit)}", printed, *computed_cells(row), row.status, note(row))
 
 
-def computed_cells(row: Row) -> tuple[str, str, str]:
+def computed_cells(row: PaperRow) -> tuple[str, str, str]:
     """Computed value, difference, and within what the two have to agree."""
     if row.computed is None or row.difference is None:
         return NONE, NONE, NONE
@@ -80,20 +80,20 @@ def computed_cells(row: Row) -> tuple[str, str, str]:
     return digits_like(row.computed.value, row.printed), short(0.0 if dust else row.difference), within
 
 
-def _column(rows: list[Row]) -> Line:
+def _column(rows: list[PaperRow]) -> PrintedLine:
     first = rows[0]
     unit = _unit(_common(r.unit for r in rows))
     name = f"{first.series}{unit}, worst of {len(rows)}"
     compared = [r for r in rows if r.difference is not None and r.computed is not None]
     if not compared:
-        return Line(first.where, f"{first.series}{unit}", f"{len(rows)} values", NONE, NONE, NONE, first.status, note(first))
+        return PrintedLine(first.where, f"{first.series}{unit}", f"{len(rows)} values", NONE, NONE, NONE, first.status, note(first))
     worst = max(compared, key=lambda r: abs(r.difference or 0.0))
     notes = list(dict.fromkeys(note(r) for r in rows))
     text = notes[0] if len(notes) == 1 else note(worst) + " (worst of the series)"
-    return Line(first.where, name, minus(worst.printed.text), *computed_cells(worst), first.status, text)
+    return PrintedLine(first.where, name, minus(worst.printed.text), *computed_cells(worst), first.status, text)
 
 
-def check_lines(checks: Sequence[Check]) -> Iterator[tuple[str, ...]]:
+def check_lines(checks: Sequence[PaperCheck]) -> Iterator[tuple[str, ...]]:
     """Cells of the table of checks: a group in one line with the check that comes nearest to its bound, or breaks it most."""
     for series, group in groupby(checks, key=lambda c: c.series):
         members = list(group)
@@ -102,7 +102,7 @@ def check_lines(checks: Sequence[Check]) -> Iterator[tuple[str, ...]]:
         yield f"{series}, worst of {len(members)}", *check_cells(worst), status, worst.why
 
 
-def check_cells(check: Check) -> tuple[str, str, str, str]:
+def check_cells(check: PaperCheck) -> tuple[str, str, str, str]:
     """What was put in, what came back, how far that is off and how far it may be, with their unit."""
     unit = f" {check.unit}"
     digits = max(0, 1 - math.floor(math.log10(check.bound)))

@@ -18,7 +18,7 @@ from abbe.models.papers.yang.complete import delta_exact
 from abbe.models.paths.helix import helix_points
 from abbe.models.solvers.helix import LINEAR, fit_helix, helix_design
 from abbe.service.papers import yang_printed as paper
-from abbe.service.papers.check import Check
+from abbe.service.papers.check import PaperCheck
 
 TURNS = 5.0
 """Not in the paper (math.md 4.3)."""
@@ -33,7 +33,7 @@ BOUND_URAD = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Recovered:
+class RecoveredErrors:
     """The six parameters of the paper as the helix of one radius returns them, and how much the neglected second order may move each."""
 
     radius_mm: float
@@ -41,7 +41,7 @@ class Recovered:
     second_order: dict[str, float]
 
 
-def recover(radius_mm: float) -> Recovered:
+def recover(radius_mm: float) -> RecoveredErrors:
     """Simulate the exact bar lengths of a machine with the laser column's errors and fit the paper's six parameters.
 
     Parameters
@@ -60,7 +60,7 @@ def recover(radius_mm: float) -> Recovered:
     sign = iso_squareness(1.0, 1.0, 1.0)
     ours = {"dxx": "EXX.1", "dyy": "EYY.1", "dzz": "EZZ.1", "Sxy": "C0Y", "Sxz": "B0Z", "Syz": "A0Z"}
     values = {name: float(found[iso] * sign.get(iso, 1.0)) for name, iso in ours.items()}
-    return Recovered(radius_mm, values, {name: float(limit[iso]) for name, iso in ours.items()})
+    return RecoveredErrors(radius_mm, values, {name: float(limit[iso]) for name, iso in ours.items()})
 
 
 def _deviation_mm(truth: dict[str, float], points_mm: F2) -> F2:
@@ -71,7 +71,7 @@ def _deviation_mm(truth: dict[str, float], points_mm: F2) -> F2:
     return delta_exact(YangErrors(d, np.zeros_like(d), truth["Sxy"], truth["Sxz"], truth["Syz"]), slide, TOOL_MM)
 
 
-def checks() -> list[Check]:
+def checks() -> list[PaperCheck]:
     """The laser column put into a machine, and what the helix gives back, by radius, in urad (a slope of 1e-6 counts as 1 urad)."""
     out = []
     for radius in paper.BAR_RADII:
@@ -83,7 +83,7 @@ def checks() -> list[Check]:
                 f" the fit neglects may move one of them by {max(found.second_order.values()) * URAD:.3f} µrad"
             )
             out.append(
-                Check(
+                PaperCheck(
                     "yang",
                     "math.md 8",
                     f"{name} of the laser column by helix R {radius.text} mm",

@@ -8,7 +8,7 @@ from abbe.models.functions.line_fit import slope_through_origin, straight_line
 from abbe.service.papers import yang_printed as paper
 from abbe.service.papers.compare import Computed, computed_from
 from abbe.service.papers.printed import Printed, values
-from abbe.service.papers.row import Erratum, Row
+from abbe.service.papers.row import Erratum, PaperRow
 
 
 def restored_x_mm() -> list[float]:
@@ -24,7 +24,7 @@ def bar_line_um() -> list[float]:
     return [slope * x * 1e3 for x in restored_x_mm()]
 
 
-def laser_slope_rows(printed: Printed) -> list[Row]:
+def laser_slope_rows(printed: Printed) -> list[PaperRow]:
     """The laser's slope of Table 2 from the readings of Table 3: a line through the origin gives it, an ordinary one does not."""
     x = np.array(restored_x_mm())
     by_origin = computed_from(
@@ -34,7 +34,7 @@ def laser_slope_rows(printed: Printed) -> list[Row]:
     ordinary = computed_from(lambda *y: straight_line(x, np.array(y))[0] * 1e-3, *paper.TABLE3_LASER, because="readings rounded to 0.1 µm")
     share = 100.0 * (by_origin.value - printed.value) / printed.value
     return [
-        Row(
+        PaperRow(
             "yang",
             "Table 2",
             "dxx, laser, line through origin",
@@ -44,7 +44,7 @@ def laser_slope_rows(printed: Printed) -> list[Row]:
             "slope_through_origin on Table 3 (23 readings, x restored)",
             f"off by {abs(share):.2f} %: readings rounded to 0.1 µm allow that",
         ),
-        Row(
+        PaperRow(
             "yang",
             "Table 2",
             "dxx, laser, ordinary line",
@@ -58,33 +58,35 @@ def laser_slope_rows(printed: Printed) -> list[Row]:
     ]
 
 
-def rows() -> list[Row]:
+def rows() -> list[PaperRow]:
     """Positions, three columns, and the figures that the text draws from them."""
     return [_position(), *_laser_column(), *_bar_column(), *_difference_column(), *_figures()]
 
 
-def _position() -> Row:
+def _position() -> PaperRow:
     x = restored_x_mm()[paper.DAMAGED]
     text = "digits lost in the text file. With 254.0 mm the bar's line gives the printed −22.1 µm (row of the bar column)"
     how = "middle of the neighbouring positions 215.9 and 292.1 mm"
-    return Row("yang", "Table 3", "eighth position", "mm", paper.TABLE3_X[paper.DAMAGED], Computed(x), how, "damaged print", Erratum(text))
+    return PaperRow(
+        "yang", "Table 3", "eighth position", "mm", paper.TABLE3_X[paper.DAMAGED], Computed(x), how, "damaged print", Erratum(text)
+    )
 
 
-def _laser_column() -> list[Row]:
+def _laser_column() -> list[PaperRow]:
     why = "measured: input, nothing can compute it"
     return [
-        Row("yang", "Table 3", f"laser at {x:g} mm", "µm", number, why=why, series="laser column", given=True)
+        PaperRow("yang", "Table 3", f"laser at {x:g} mm", "µm", number, why=why, series="laser column", given=True)
         for x, number in zip(restored_x_mm(), paper.TABLE3_LASER, strict=True)
     ]
 
 
-def _bar_column() -> list[Row]:
+def _bar_column() -> list[PaperRow]:
     slope = paper.TABLE2["dxx"][1]
     how = f"bar slope {slope.text} of Table 2 times x"
     return [_in_column("bar", x, number, slope.value * x * 1e3, how) for x, number in zip(restored_x_mm(), paper.TABLE3_BAR, strict=True)]
 
 
-def _difference_column() -> list[Row]:
+def _difference_column() -> list[PaperRow]:
     how = "printed laser − printed bar, taken as exact"
     return [
         _in_column("laser − bar", x, number, laser.value - bar.value, how)
@@ -92,16 +94,16 @@ def _difference_column() -> list[Row]:
     ]
 
 
-def _in_column(name: str, x_mm: float, number: Printed, value_um: float, how: str) -> Row:
+def _in_column(name: str, x_mm: float, number: Printed, value_um: float, how: str) -> PaperRow:
     """A number of a column; the one at the origin is zero whatever the slope and the readings are, so it is no evidence."""
     quantity, series = f"{name} at {x_mm:g} mm", f"{name} column"
     if x_mm == 0.0:
         why = "zero by construction: readings and lines start at the origin"
-        return Row("yang", "Table 3", quantity, "µm", number, why=why, series=series, given=True)
-    return Row("yang", "Table 3", quantity, "µm", number, Computed(value_um), how, series=series)
+        return PaperRow("yang", "Table 3", quantity, "µm", number, why=why, series=series, given=True)
+    return PaperRow("yang", "Table 3", quantity, "µm", number, Computed(value_um), how, series=series)
 
 
-def _figures() -> list[Row]:
+def _figures() -> list[PaperRow]:
     apart = np.array(values(paper.TABLE3_LASER)) - np.array(values(paper.TABLE3_BAR))
     at = restored_x_mm()[int(np.argmax(np.abs(apart)))]
     laser, bar, _ = paper.TABLE2["dxx"]
@@ -110,9 +112,11 @@ def _figures() -> list[Row]:
     size = float(np.abs(apart).max())
     column = "printed laser − printed bar"
     return [
-        Row("yang", "Table 3", "largest |laser − bar|", "µm", paper.TABLE3_MAX, Computed(size), column, f"at {at:g} mm"),
-        Row(
+        PaperRow("yang", "Table 3", "largest |laser − bar|", "µm", paper.TABLE3_MAX, Computed(size), column, f"at {at:g} mm"),
+        PaperRow(
             "yang", "Table 3", "mean |laser − bar|", "µm", paper.TABLE3_MEAN, Computed(float(np.abs(apart).mean())), f"{column}, 23 points"
         ),
-        Row("yang", "3.3", f"the two lines apart at {end:g} mm", "µm", paper.LINES_AT_END, lines, "slopes of Table 2 times the travel"),
+        PaperRow(
+            "yang", "3.3", f"the two lines apart at {end:g} mm", "µm", paper.LINES_AT_END, lines, "slopes of Table 2 times the travel"
+        ),
     ]

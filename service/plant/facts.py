@@ -39,7 +39,7 @@ def unit_of(key: str) -> Unit | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class PlantFigure:
     """One figure of a check. ``expanded``: its uncertainty, k = 2. What is None is not known."""
 
     key: str
@@ -59,7 +59,7 @@ class Check:
     duration_s: float
     verdict: str
     text: str
-    figures: tuple[Figure, ...]
+    figures: tuple[PlantFigure, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Protocol
 
-from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce, Verified
+from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, PlantFigure, Running, TableInForce, Verified
 from abbe.service.storage.records import PushEntryRecord, SlotRecord
 
 SHOWN_ALARMS = 20
@@ -87,7 +87,7 @@ def _verified(one: Any) -> Verified:
 
 
 def _check(one: Any) -> Check:
-    figures = (Figure(key, value, one.uncertainties.get(key), one.limits.get(key)) for key, value in one.values.items())
+    figures = (PlantFigure(key, value, one.uncertainties.get(key), one.limits.get(key)) for key, value in one.values.items())
     return Check(one.id, one.schedule, one.recipe, one.started_utc, one.duration_s, one.verdict, one.text, tuple(figures))
 
 

@@ -33,7 +33,7 @@ ITEMS = (
 _NAMES = {"result": "last_check", "table": "compensation_table"}
 
 
-class Refused(Exception):  # noqa: N818 - reads as what it is
+class MtconnectRefusal(Exception):  # noqa: N818 - reads as what it is
     """A request that cannot be answered: the code of the Error document, its text, and the HTTP status."""
 
     def __init__(self, code: str, text: str, status: int = 400) -> None:
@@ -140,9 +140,9 @@ class Agent:
         try:
             number = int(text)
         except ValueError:
-            raise Refused("INVALID_REQUEST", f"{name} is {text[:40]!r}, expected a whole number") from None
+            raise MtconnectRefusal("INVALID_REQUEST", f"{name} is {text[:40]!r}, expected a whole number") from None
         if not least <= number <= most:
-            raise Refused("OUT_OF_RANGE", f"{name} is {text[:40]}, expected {least} to {most}", 404)
+            raise MtconnectRefusal("OUT_OF_RANGE", f"{name} is {text[:40]}, expected {least} to {most}", 404)
         return number
 
     def _streams(self, facts: Facts, found: list[Observation], following: int) -> bytes:
@@ -159,7 +159,7 @@ class Agent:
                     _write(parent, one)
         return _bytes(root)
 
-    def error(self, refused: Refused, now: datetime) -> bytes:
+    def error(self, refused: MtconnectRefusal, now: datetime) -> bytes:
         """Return the Error document of a request that was refused."""
         root = _root("MTConnectError", self._header(now))
         ET.SubElement(ET.SubElement(root, "Errors"), "Error", errorCode=refused.code).text = _clean(refused.text)
@@ -216,9 +216,9 @@ def _condition(facts: Facts) -> tuple[str, str, str]:
 def _only(query: Mapping[str, str], allowed: set[str]) -> None:
     for name in query:
         if name in {"path", "interval", "heartbeat", "to"}:
-            raise Refused("UNSUPPORTED", f"{name} is not supported here")
+            raise MtconnectRefusal("UNSUPPORTED", f"{name} is not supported here")
         if name not in allowed:
-            raise Refused("INVALID_REQUEST", f"{name[:40]!r} is not known here")
+            raise MtconnectRefusal("INVALID_REQUEST", f"{name[:40]!r} is not known here")
 
 
 def _root(kind: str, header: Mapping[str, str]) -> ET.Element:

@@ -14,7 +14,7 @@ from abbe.drivers.errors import DriverError, Rebooted, Refused
 from abbe.service.clock import Clock
 from abbe.service.push import operations as o
 from abbe.service.push.entries import Journal, facts
-from abbe.service.push.operations import Kind, Op, Outcome, Truth
+from abbe.service.push.operations import Operation, OperationKind, Outcome, Truth
 from abbe.service.push.semantic_digest import meaning_of_bytes
 from abbe.service.sequences.interlocks import MOVING, tripped
 
@@ -24,7 +24,7 @@ _IN_POSITION = 7
 
 
 @dataclass(frozen=True, slots=True)
-class People:
+class PushActors:
     """Who answers the machine's questions: the check of the table, the approval, the probe and the verification."""
 
     validate: Callable[[Journal], Awaitable[list[str]]]
@@ -33,7 +33,7 @@ class People:
     verify: Callable[[Journal], Awaitable[o.Verdict]]
 
 
-def nobody() -> People:
+def nobody() -> PushActors:
     """For recoveries: they ask nothing, and what they were asked would be no."""
 
     async def no_reason(journal: Journal) -> list[str]:
@@ -45,7 +45,7 @@ def nobody() -> People:
     async def no_verdict(journal: Journal) -> o.Verdict:
         return o.Verdict(False, "nobody is there to measure it")
 
-    return People(no_reason, no_approval, no_verdict, no_verdict)
+    return PushActors(no_reason, no_approval, no_verdict, no_verdict)
 
 
 class ControllerPort:
@@ -55,17 +55,17 @@ class ControllerPort:
     ----------
     controller : Controller
         Identified.
-    people : People
+    people : PushActors
         Whom to ask.
     clock : Clock
         Monotonic time of the approval.
     """
 
-    def __init__(self, controller: Controller, people: People, clock: Clock) -> None:
+    def __init__(self, controller: Controller, people: PushActors, clock: Clock) -> None:
         self._c, self._people, self._clock = controller, people, clock
         self._map = ""
 
-    async def execute(self, op: Op, journal: Journal) -> Outcome:
+    async def execute(self, op: Operation, journal: Journal) -> Outcome:
         """Do one operation; never raises for what the controller or the link does."""
         try:
             return await self._execute(op, journal)
@@ -74,44 +74,44 @@ class ControllerPort:
         except (DriverError, TimeoutError) as error:
             return o.Doubt(str(error) or type(error).__name__)
 
-    async def _execute(self, op: Op, journal: Journal) -> Outcome:
+    async def _execute(self, op: Operation, journal: Journal) -> Outcome:
         match op.kind:
-            case Kind.LOOK:
+            case OperationKind.LOOK:
                 return o.Done(await self._look())
-            case Kind.READ:
+            case OperationKind.READ:
                 return o.Done(await self._c.read_bank(op.bank, 2 * op.count or None))
-            case Kind.READ_AGAIN:
+            case OperationKind.READ_AGAIN:
                 return o.Done(meaning_of_bytes(await self._c.read_bank(op.bank, 2 * op.count or None)))
-            case Kind.READ_CHUNK:
+            case OperationKind.READ_CHUNK:
                 return o.Done(await self._c.read_part(op.bank, op.first, 2 * op.count))
-            case Kind.VALIDATE | Kind.APPROVE | Kind.PROBE | Kind.VERIFY:
+            case OperationKind.VALIDATE | OperationKind.APPROVE | OperationKind.PROBE | OperationKind.VERIFY:
                 return await self._ask(op.kind, journal)
             case _:
                 await self._change(op)
                 return o.Done()
 
-    async def _change(self, op: Op) -> None:
+    async def _change(self, op: Operation) -> None:
         match op.kind:
-            case Kind.LEASE:
+            case OperationKind.LEASE:
                 await self._c.lease(op.owner, LEASE_MS)
-            case Kind.RELEASE:
+            case OperationKind.RELEASE:
                 await self._c.release(op.owner)
-            case Kind.WRITE:
+            case OperationKind.WRITE:
                 await self._c.write_part(op.bank, op.first, op.data)
-            case Kind.SEAL:
+            case OperationKind.SEAL:
                 await self._c.seal(op.bank, op.owner)
-            case Kind.ACTIVATE:
+            case OperationKind.ACTIVATE:
                 await self._c.activate(op.bank, expect_crc=op.crc, expect_gen=op.gen, owner=op.owner)
             case _:
                 raise AssertionError(f"{op.kind} is no operation on a controller")
 
-    async def _ask(self, kind: Kind, journal: Journal) -> Outcome:
-        if kind is Kind.VALIDATE:
+    async def _ask(self, kind: OperationKind, journal: Journal) -> Outcome:
+        if kind is OperationKind.VALIDATE:
             return o.Done(await self._people.validate(journal))
-        if kind is Kind.APPROVE:
+        if kind is OperationKind.APPROVE:
             approval = await self._people.approve(journal)
             return o.Refused("nobody approved it") if approval is None else o.Done(approval)
-        return o.Done(await self._while_leased(self._people.probe if kind is Kind.PROBE else self._people.verify, journal))
+        return o.Done(await self._while_leased(self._people.probe if kind is OperationKind.PROBE else self._people.verify, journal))
 
     async def _while_leased(self, question: Callable[[Journal], Awaitable[o.Verdict]], journal: Journal) -> o.Verdict:
         """Measuring takes longer than a lease: it is renewed meanwhile. Where another has it, nothing of the measurement counts."""

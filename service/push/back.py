@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from abbe.service.push.entries import Doc
 from abbe.service.push.learn import BACK
-from abbe.service.push.operations import Kind, Known, Op, Refused, Truth
+from abbe.service.push.operations import Knowledge, Operation, OperationKind, Refused, Truth
 from abbe.service.push.staging import BRACKETS, EMPTY, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 
 DOUBTS = 3
 BACKS = 3
@@ -19,9 +19,9 @@ OWNERS = 0xFFFF
 """Owner ids of one push: the first for the way forward, a higher one for every lease on the way back."""
 
 
-def record(state: State, **doc: object) -> Op:
+def record(state: PushState, **doc: object) -> Operation:
     """The operation that writes a journal entry."""
-    return Op(Kind.RECORD, state=state, doc=doc)
+    return Operation(OperationKind.RECORD, state=state, doc=doc)
 
 
 def in_force(f: Doc, truth: Truth) -> str:
@@ -38,49 +38,49 @@ def seen(f: Doc, truth: Truth) -> Doc:
     return {"expected": {"base_crc": f["base_crc"], "crc": f["crc"]}, "controller": says}
 
 
-def go_back(f: Doc, known: Known, state: State, seq: int) -> Op:
+def go_back(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
     """Next operation on the way back.
 
     Parameters
     ----------
     f : dict
         Facts of the journal.
-    known : Known
+    known : Knowledge
         What this process knows.
-    state : State
+    state : PushState
         Last state: ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING.
     seq : int
         Number of the last entry; every lease on the way back has a higher owner id than those before.
     """
     if known.rested:
-        return Op(Kind.END, text="the way back is not open now")
+        return Operation(OperationKind.END, text="the way back is not open now")
     if known.doubts >= DOUBTS:
         return _pending(state, "the controller does not answer")
-    if state is State.ACTIVATING_BACK and known.wrote_last and not known.asked:
-        return Op(Kind.ACTIVATE, bank=f["back_bank"], crc=f["base_crc"], gen=f["back_gen"], owner=known.lease, text=BACK)
+    if state is PushState.ACTIVATING_BACK and known.wrote_last and not known.asked:
+        return Operation(OperationKind.ACTIVATE, bank=f["back_bank"], crc=f["base_crc"], gen=f["back_gen"], owner=known.lease, text=BACK)
     if known.start is None:
-        return Op(Kind.LOOK, mark=True)
+        return Operation(OperationKind.LOOK, mark=True)
     which = in_force(f, known.start)
     if which == "base":
         return _arrived(f, known)
     if which == "neither":
-        return record(State.OPERATOR, why="the active table is neither the old nor the new one", **seen(f, known.start))
+        return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **seen(f, known.start))
     return _switch(f, known, state, seq)
 
 
-def _arrived(f: Doc, known: Known) -> Op:
+def _arrived(f: Doc, known: Knowledge) -> Operation:
     assert known.start is not None
     step = bracket(known, known.start.active, len(bytes.fromhex(f["base_image"])) // 2, again=False)
-    if isinstance(step, Op):
+    if isinstance(step, Operation):
         return step
     if step is not None and known.image == bytes.fromhex(f["base_image"]):
-        return record(State.ROLLED_BACK, bank=step.truth.active)
+        return record(PushState.ROLLED_BACK, bank=step.truth.active)
     if known.brackets < BRACKETS:
-        return Op(Kind.LOOK, mark=True)
-    return record(State.OPERATOR, why="the active bank has the old table's CRC and another content", **seen(f, known.start))
+        return Operation(OperationKind.LOOK, mark=True)
+    return record(PushState.OPERATOR, why="the active bank has the old table's CRC and another content", **seen(f, known.start))
 
 
-def _switch(f: Doc, known: Known, state: State, seq: int) -> Op:
+def _switch(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
     """The new table is active and has to go."""
     truth = known.start
     assert truth is not None
@@ -88,14 +88,18 @@ def _switch(f: Doc, known: Known, state: State, seq: int) -> Op:
         return _pending(state, f"not safe now: {truth.unsafe}")
     if truth.states[1 - truth.active] == LAID_ASIDE and truth.crc[1 - truth.active] == f["base_crc"]:
         return _pending(state, "the old table acts after the control's next start: start it anew, and move nothing before")
-    if state is State.ACTIVATING_BACK:
+    if state is PushState.ACTIVATING_BACK:
         text = known.verdict.text if isinstance(known.verdict, Refused) else "the activation of the old table did not happen"
-        return _pending(state, text) if known.backs >= BACKS else record(State.ROLLBACK, again=text)
-    if state is State.ROLLBACK_PENDING:
-        return record(State.ROLLBACK, again="the way back is open again") if _lease_open(f, truth) else _pending(state, "leased by another")
+        return _pending(state, text) if known.backs >= BACKS else record(PushState.ROLLBACK, again=text)
+    if state is PushState.ROLLBACK_PENDING:
+        return (
+            record(PushState.ROLLBACK, again="the way back is open again")
+            if _lease_open(f, truth)
+            else _pending(state, "leased by another")
+        )
     if not known.lease or truth.owner != known.lease:
         return _lease(f, known, truth, state, seq)
-    if state is State.RESTAGING:
+    if state is PushState.RESTAGING:
         return _restage(f, known, truth, state)
     return _with_old_bank(f, known, truth)
 
@@ -104,48 +108,48 @@ def _lease_open(f: Doc, truth: Truth) -> bool:
     return truth.owner == 0 or f["owner"] <= truth.owner <= f["owner"] + OWNERS
 
 
-def _lease(f: Doc, known: Known, truth: Truth, state: State, seq: int) -> Op:
+def _lease(f: Doc, known: Knowledge, truth: Truth, state: PushState, seq: int) -> Operation:
     if isinstance(known.verdict, Refused) or not _lease_open(f, truth):
         return _pending(state, "another owner has the lease")
     if known.leases + known.releases >= LEASES:
         return _pending(state, "the controller answers, but does not give or take the lease")
     if truth.owner:  # of this push, from before: it is shut out first, whoever still holds it
-        return Op(Kind.RELEASE, owner=truth.owner)
-    return Op(Kind.LEASE, owner=f["owner"] + 1 + seq)
+        return Operation(OperationKind.RELEASE, owner=truth.owner)
+    return Operation(OperationKind.LEASE, owner=f["owner"] + 1 + seq)
 
 
-def _with_old_bank(f: Doc, known: Known, truth: Truth) -> Op:
+def _with_old_bank(f: Doc, known: Knowledge, truth: Truth) -> Operation:
     """Use the old table where it still stands, restore it from the journal where the controller lost it, never over a person's work."""
     other, base = 1 - truth.active, bytes.fromhex(f["base_image"])
     if truth.states[other] == SEALED and truth.crc[other] == f["base_crc"]:
         step = bracket(known, other, len(base) // 2, again=False)
-        if isinstance(step, Op):
+        if isinstance(step, Operation):
             return step
         if step is not None and known.image == base:
-            return _armed(step.truth, other, State.ROLLBACK)
+            return _armed(step.truth, other, PushState.ROLLBACK)
         if known.brackets < BRACKETS:
-            return Op(Kind.LOOK, mark=True)
+            return Operation(OperationKind.LOOK, mark=True)
     if truth.states[other] == EMPTY:  # the controller forgot it
         return _begin_restaging(truth, other)
     if f.get("restaged"):  # by this push, which was interrupted: what stands there may be ours
         step = bracket(known, other, len(base) // 2, again=False)
-        if isinstance(step, Op):
+        if isinstance(step, Operation):
             return step
         if step is None and known.brackets < BRACKETS:
-            return Op(Kind.LOOK, mark=True)
+            return Operation(OperationKind.LOOK, mark=True)
         if step is not None and _ours(known.image or b"", base, 2 * f["chunk_words"]):
             return _begin_restaging(step.truth, other)
-    return record(State.OPERATOR, why="the old table is no longer in its bank, and somebody else put there what is", **seen(f, truth))
+    return record(PushState.OPERATOR, why="the old table is no longer in its bank, and somebody else put there what is", **seen(f, truth))
 
 
-def _armed(truth: Truth, bank: int, state: State) -> Op:
+def _armed(truth: Truth, bank: int, state: PushState) -> Operation:
     if truth.unsafe:
         return _pending(state, f"not safe now: {truth.unsafe}")
-    return record(State.ACTIVATING_BACK, back_bank=bank, back_gen=truth.gen)
+    return record(PushState.ACTIVATING_BACK, back_bank=bank, back_gen=truth.gen)
 
 
-def _begin_restaging(truth: Truth, bank: int) -> Op:
-    return record(State.RESTAGING, restaged=True, back_bank=bank, restage_gen=truth.gen, restage_boot=truth.boot)
+def _begin_restaging(truth: Truth, bank: int) -> Operation:
+    return record(PushState.RESTAGING, restaged=True, back_bank=bank, restage_gen=truth.gen, restage_boot=truth.boot)
 
 
 def _ours(held: bytes, base: bytes, size: int) -> bool:
@@ -154,9 +158,9 @@ def _ours(held: bytes, base: bytes, size: int) -> bool:
     return len(held) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
 
 
-def _restage(f: Doc, known: Known, truth: Truth, state: State) -> Op:
+def _restage(f: Doc, known: Knowledge, truth: Truth, state: PushState) -> Operation:
     if not known.wrote_last:  # how far an earlier process came is not known: again from the beginning, with the generation of now
-        return record(State.ROLLBACK, again="restoring the old table was interrupted")
+        return record(PushState.ROLLBACK, again="restoring the old table was interrupted")
     image = Image(
         f["back_bank"], bytes.fromhex(f["base_image"]), f["base_crc"], f["base_meaning"], known.lease,
         f["restage_gen"], f["restage_boot"], f["crc"], f["chunk_words"],
@@ -165,11 +169,11 @@ def _restage(f: Doc, known: Known, truth: Truth, state: State) -> Op:
     if isinstance(step, Coherent):
         return _armed(step.truth, image.bank, state)
     if isinstance(step, Failed):
-        return record(State.OPERATOR, why=step.why, **seen(f, truth)) if step.foreign else _pending(state, step.why)
+        return record(PushState.OPERATOR, why=step.why, **seen(f, truth)) if step.foreign else _pending(state, step.why)
     return step
 
 
-def _pending(state: State, why: str) -> Op:
-    if state is State.ROLLBACK_PENDING:
-        return Op(Kind.END, text=why)
-    return record(State.ROLLBACK_PENDING, pending=why)
+def _pending(state: PushState, why: str) -> Operation:
+    if state is PushState.ROLLBACK_PENDING:
+        return Operation(OperationKind.END, text=why)
+    return record(PushState.ROLLBACK_PENDING, pending=why)

@@ -6,8 +6,8 @@ import asyncio
 
 from abbe.service.clock import Clock
 from abbe.service.errors import UnsafeToMove
-from abbe.service.push.entries import GENESIS, WORD, Doc, Entry, Journal, follow
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.entries import GENESIS, WORD, Doc, Journal, JournalEntry, follow
+from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import PushEntryRecord
 from abbe.service.storage.store import Store
@@ -28,7 +28,7 @@ class StoreBook:
         Number of the push.
     head : str
         Digest of the last entry of the machine.
-    journal : tuple of Entry
+    journal : tuple of JournalEntry
         The push so far.
     """
 
@@ -71,7 +71,7 @@ class StoreBook:
         if book is None:
             return cls(store, chain, clock, 1, GENESIS, ())
         last = (await book.entries())[-1]
-        if last.state not in TERMINAL or last.state is State.OPERATOR:
+        if last.state not in TERMINAL or last.state is PushState.OPERATOR:
             raise UnsafeToMove(f"push {last.push} of {chain} stands at {last.state}", "finish it first")
         return cls(store, chain, clock, last.push + 1, last.digest, ())
 
@@ -79,7 +79,7 @@ class StoreBook:
         """The push so far."""
         return self._journal
 
-    async def append(self, journal: Journal, state: State, doc: Doc) -> Entry:
+    async def append(self, journal: Journal, state: PushState, doc: Doc) -> JournalEntry:
         """Write the next entry; on return it is on disk.
 
         Raises
@@ -96,14 +96,14 @@ class StoreBook:
         return entry
 
 
-def read_entries(store: Store, machine: str, control: str = "") -> list[Entry]:
+def read_entries(store: Store, machine: str, control: str = "") -> list[JournalEntry]:
     """All entries of a machine's control, of all its pushes, whatever the machine was called; ``control`` empty: by the name alone."""
     return [_entry(r) for r in store.push_entries(machine, control)]
 
 
-def _entries_of(store: Store, chain: str) -> list[Entry]:
+def _entries_of(store: Store, chain: str) -> list[JournalEntry]:
     return [_entry(r) for r in store.push_entries_of(chain)]
 
 
-def _entry(r: PushEntryRecord) -> Entry:
-    return Entry(r.push, r.seq, State(r.state), r.doc, r.utc, r.prev, r.digest)
+def _entry(r: PushEntryRecord) -> JournalEntry:
+    return JournalEntry(r.push, r.seq, PushState(r.state), r.doc, r.utc, r.prev, r.digest)

@@ -24,8 +24,8 @@ class Column:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
-    """What the table was computed from. Lengths mm, ``machine_mark``: see `Scene`.
+class TableEvidence:
+    """What the table was computed from. Lengths mm, ``machine_mark``: see `CandidateContext`.
 
     ``ended_s``, ``last_s``: end of the oldest and of the newest run, seconds of the service's UTC; without the second there is one end.
     """
@@ -43,7 +43,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True)
-class Seal:
+class EvidenceSeal:
     """Who vouches for the table: role and SHA-256 of what was signed; empty without a signature."""
 
     role: str = ""
@@ -60,13 +60,13 @@ class Candidate:
     length_unit: str
     columns: tuple[Column, ...]
     base_crc: int
-    evidence: Evidence
+    evidence: TableEvidence
     digest: str
-    seal: Seal = field(default_factory=Seal)
+    seal: EvidenceSeal = field(default_factory=EvidenceSeal)
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class CandidateContext:
     """What the candidate is held against: this machine, its controller, the table in force, and now.
 
     Parameters

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from abbe.service.push.states import FOLLOWS, State
+from abbe.service.push.states import FOLLOWS, PushState
 
 Doc = dict[str, Any]
 GENESIS = "0" * 64
@@ -24,7 +24,7 @@ class JournalBroken(ValueError):  # noqa: N818 - reads as what it is
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class JournalEntry:
     """One transition of one push. Never changed after writing.
 
     Parameters
@@ -33,7 +33,7 @@ class Entry:
         Number of the push.
     seq : int
         Number of the entry in its push, from 0.
-    state : State
+    state : PushState
         State that was reached.
     doc : dict
         What became known with it.
@@ -45,14 +45,14 @@ class Entry:
 
     push: int
     seq: int
-    state: State
+    state: PushState
     doc: Doc
     utc: str
     prev: str
     digest: str
 
 
-Journal = tuple[Entry, ...]
+Journal = tuple[JournalEntry, ...]
 
 
 def canonical(value: object) -> bytes:
@@ -60,21 +60,21 @@ def canonical(value: object) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False).encode()
 
 
-def digest_of(push: int, seq: int, state: State, doc: Doc, utc: str, prev: str) -> str:
+def digest_of(push: int, seq: int, state: PushState, doc: Doc, utc: str, prev: str) -> str:
     """SHA-256 of an entry's content and of the digest before it."""
     return hashlib.sha256(canonical([push, seq, str(state), doc, utc, prev])).hexdigest()
 
 
-def follow(journal: Journal, push: int, state: State, doc: Doc, utc: str, head: str) -> Entry:
+def follow(journal: Journal, push: int, state: PushState, doc: Doc, utc: str, head: str) -> JournalEntry:
     """Make the next entry of a push.
 
     Parameters
     ----------
-    journal : tuple of Entry
+    journal : tuple of JournalEntry
         The push so far; empty for its first entry.
     push : int
         Its number.
-    state : State
+    state : PushState
         State that was reached.
     doc : dict
         What became known with it.
@@ -91,14 +91,14 @@ def follow(journal: Journal, push: int, state: State, doc: Doc, utc: str, head: 
     last = journal[-1].state if journal else None
     if not _may_follow(push, last, state):
         raise JournalBroken(f"push {push}: {state} cannot follow {last or 'nothing'}")
-    return Entry(push, len(journal), state, doc, utc, head, digest_of(push, len(journal), state, doc, utc, head))
+    return JournalEntry(push, len(journal), state, doc, utc, head, digest_of(push, len(journal), state, doc, utc, head))
 
 
-def _may_follow(push: int, last: State | None, state: State) -> bool:
-    return state in FOLLOWS[last] or (push == WORD and last is None and state is State.ACCEPTED)
+def _may_follow(push: int, last: PushState | None, state: PushState) -> bool:
+    return state in FOLLOWS[last] or (push == WORD and last is None and state is PushState.ACCEPTED)
 
 
-def check_chain(entries: Sequence[Entry], head: str = GENESIS) -> None:
+def check_chain(entries: Sequence[JournalEntry], head: str = GENESIS) -> None:
     """Check all entries of a machine, in the order of writing.
 
     Raises
@@ -106,7 +106,7 @@ def check_chain(entries: Sequence[Entry], head: str = GENESIS) -> None:
     JournalBroken
         Which entry does not follow, or was changed.
     """
-    last: dict[int, Entry] = {}
+    last: dict[int, JournalEntry] = {}
     for entry in entries:
         before = last.get(entry.push)
         name = f"push {entry.push}, entry {entry.seq}"

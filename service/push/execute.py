@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from abbe.service.push.entries import Doc, Entry, Journal
+from abbe.service.push.entries import Doc, Journal, JournalEntry
 from abbe.service.push.learn import after_record, learn
 from abbe.service.push.machine import next_operation
-from abbe.service.push.operations import Kind, Known, Op, Outcome
-from abbe.service.push.order import Order
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.operations import Knowledge, Operation, OperationKind, Outcome
+from abbe.service.push.order import OperationOrder
+from abbe.service.push.states import TERMINAL, PushState
 
 
 class Port(Protocol):
     """Does one operation on a controller, or asks whoever has to answer. Raises nothing for what a controller or a link does."""
 
-    async def execute(self, op: Op, journal: Journal) -> Outcome:
+    async def execute(self, op: Operation, journal: Journal) -> Outcome:
         """Do it; `journal` is the push so far."""
         ...
 
@@ -29,7 +29,7 @@ class Book(Protocol):
         """All entries so far."""
         ...
 
-    async def append(self, journal: Journal, state: State, doc: Doc) -> Entry:
+    async def append(self, journal: Journal, state: PushState, doc: Doc) -> JournalEntry:
         """Write the next entry; on return it is on disk. Raises if it is not, or if somebody else wrote one meanwhile."""
         ...
 
@@ -38,7 +38,7 @@ class Book(Protocol):
 class Ended:
     """Where a push, or its recovery, stands now. ``state`` None: nothing was begun. Not ``settled``: it has to be gone on with."""
 
-    state: State | None
+    state: PushState | None
     journal: Journal
     why: str
 
@@ -52,7 +52,7 @@ def _nobody() -> str:
     return ""
 
 
-async def push(port: Port, book: Book, order: Order, *, stop: Callable[[], str] = _nobody) -> Ended:
+async def push(port: Port, book: Book, order: OperationOrder, *, stop: Callable[[], str] = _nobody) -> Ended:
     """Bring a table into a controller, from the snapshot to KEEP, or back.
 
     Parameters
@@ -60,23 +60,25 @@ async def push(port: Port, book: Book, order: Order, *, stop: Callable[[], str] 
     stop : callable
         Asked before every operation: a reason to end, or an empty text. What is active and not verified goes back.
     """
-    return await _drive(port, book, (), Known(mine=True), order, stop)
+    return await _drive(port, book, (), Knowledge(mine=True), order, stop)
 
 
 async def recover(port: Port, book: Book) -> Ended:
     """Finish what an interrupted push left, from its journal and from what the controller says. May be repeated at will."""
-    return await _drive(port, book, await book.entries(), Known(), None, _nobody)
+    return await _drive(port, book, await book.entries(), Knowledge(), None, _nobody)
 
 
-async def _drive(port: Port, book: Book, journal: Journal, known: Known, order: Order | None, stop: Callable[[], str]) -> Ended:
+async def _drive(
+    port: Port, book: Book, journal: Journal, known: Knowledge, order: OperationOrder | None, stop: Callable[[], str]
+) -> Ended:
     while True:
         text = stop()
         if text and not known.stop:
             known = known._replace(stop=text)
         op = next_operation(journal, known, order)
-        if op.kind is Kind.END:
+        if op.kind is OperationKind.END:
             return Ended(journal[-1].state if journal else None, journal, op.text)
-        if op.kind is Kind.RECORD:
+        if op.kind is OperationKind.RECORD:
             assert op.state is not None
             entry = await book.append(journal, op.state, op.doc or {})
             journal, known = (*journal, entry), after_record(known, entry.state)

@@ -2,43 +2,43 @@
 
 from __future__ import annotations
 
-from abbe.service.push.operations import Approval, Done, Doubt, Kind, Known, Op, Outcome, Refused, Truth
-from abbe.service.push.states import State
+from abbe.service.push.operations import Approval, Done, Doubt, Knowledge, Operation, OperationKind, Outcome, Refused, Truth
+from abbe.service.push.states import PushState
 
-_QUESTIONS = frozenset({Kind.VALIDATE, Kind.APPROVE, Kind.PROBE, Kind.VERIFY})
+_QUESTIONS = frozenset({OperationKind.VALIDATE, OperationKind.APPROVE, OperationKind.PROBE, OperationKind.VERIFY})
 
 
-def after_record(known: Known, state: State) -> Known:
+def after_record(known: Knowledge, state: PushState) -> Knowledge:
     """After a journal entry everything about the controller is asked anew; what belongs to the process stays."""
-    return Known(
+    return Knowledge(
         mine=known.mine,
         lease=known.lease,
         backs=known.backs,
         approved_until_s=known.approved_until_s,
         stop=known.stop,
         wrote_last=True,
-        rested=state is State.ROLLBACK_PENDING,
+        rested=state is PushState.ROLLBACK_PENDING,
     )
 
 
-def learn(known: Known, op: Op, outcome: Outcome) -> Known:
+def learn(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     """Take an outcome into account.
 
     Parameters
     ----------
-    known : Known
+    known : Knowledge
         Before.
-    op : Op
+    op : Operation
         What was asked; neither RECORD nor END.
     outcome : Done, Refused or Doubt
         What came of it.
     """
     known = known._replace(doubts=known.doubts + 1 if isinstance(outcome, Doubt) else 0)
-    if op.kind is Kind.LOOK:
+    if op.kind is OperationKind.LOOK:
         return _looked(known, op, outcome)
-    if op.kind in (Kind.READ, Kind.READ_AGAIN):
+    if op.kind in (OperationKind.READ, OperationKind.READ_AGAIN):
         return _read(known, op, outcome)
-    if op.kind in (Kind.WRITE, Kind.READ_CHUNK):
+    if op.kind in (OperationKind.WRITE, OperationKind.READ_CHUNK):
         return _chunk(known, op, outcome)
     if op.kind in _QUESTIONS:
         until = outcome.value.until_s if isinstance(outcome, Done) and isinstance(outcome.value, Approval) else known.approved_until_s
@@ -46,7 +46,7 @@ def learn(known: Known, op: Op, outcome: Outcome) -> Known:
     return _commanded(known, op, outcome)
 
 
-def _looked(known: Known, op: Op, outcome: Outcome) -> Known:
+def _looked(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     if not isinstance(outcome, Done) or not isinstance(outcome.value, Truth):
         return known
     if op.mark:
@@ -54,19 +54,19 @@ def _looked(known: Known, op: Op, outcome: Outcome) -> Known:
     return known._replace(truth=outcome.value)
 
 
-def _read(known: Known, op: Op, outcome: Outcome) -> Known:
+def _read(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     if isinstance(outcome, Doubt):
         return known
     done = isinstance(outcome, Done)
-    if op.kind is Kind.READ:
+    if op.kind is OperationKind.READ:
         return known._replace(image=outcome.value if isinstance(outcome, Done) else b"", truth=None)
     return known._replace(meaning=str(outcome.value) if done and isinstance(outcome, Done) else "unreadable", truth=None)
 
 
-def _chunk(known: Known, op: Op, outcome: Outcome) -> Known:
-    if op.kind is Kind.WRITE and op.text == FORGET:
+def _chunk(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
+    if op.kind is OperationKind.WRITE and op.text == FORGET:
         return known._replace(forgets=known.forgets + 1, wrote=True, truth=None)
-    if op.kind is Kind.WRITE:
+    if op.kind is OperationKind.WRITE:
         if isinstance(outcome, Refused):
             return known._replace(verdict=outcome, wrote=True, truth=None)
         again = int(known.differs)
@@ -81,15 +81,15 @@ def _chunk(known: Known, op: Op, outcome: Outcome) -> Known:
     return known._replace(differs=True, unsure=False, truth=None)
 
 
-def _commanded(known: Known, op: Op, outcome: Outcome) -> Known:
+def _commanded(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     known = known._replace(truth=None, start=None, image=None, meaning=None)
-    if op.kind is Kind.LEASE:
+    if op.kind is OperationKind.LEASE:
         lease = known.lease if isinstance(outcome, Refused) else op.owner
         return known._replace(verdict=outcome, lease=lease, leases=known.leases + 1)
-    if op.kind is Kind.RELEASE:  # refused: somebody else has it, and the old owner is shut out all the same
+    if op.kind is OperationKind.RELEASE:  # refused: somebody else has it, and the old owner is shut out all the same
         known = known._replace(releases=known.releases + 1, stop=known.stop or op.text)
         return known if isinstance(outcome, Doubt) else known._replace(fenced=True, lease=0)
-    if op.kind is Kind.SEAL:
+    if op.kind is OperationKind.SEAL:
         return known._replace(sealed=known.sealed + 1, verdict=outcome if isinstance(outcome, Refused) else None)
     return known._replace(asked=True, verdict=outcome, backs=known.backs + int(op.text == BACK))
 

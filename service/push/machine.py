@@ -14,10 +14,10 @@ from abbe.service.push.back import DOUBTS, OWNERS, go_back, in_force, record, se
 from abbe.service.push.entries import Doc, Journal, facts
 from abbe.service.push.learn import FORGET
 from abbe.service.push.levels import objection
-from abbe.service.push.operations import Approval, Done, Kind, Known, Op, Refused, Truth, Verdict
-from abbe.service.push.order import Order
+from abbe.service.push.operations import Approval, Done, Knowledge, Operation, OperationKind, Refused, Truth, Verdict
+from abbe.service.push.order import OperationOrder
 from abbe.service.push.staging import BRACKETS, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
-from abbe.service.push.states import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, State
+from abbe.service.push.states import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, PushState
 
 STILL_S = 1.0
 """The axes must have stood for this long before anything is staged."""
@@ -25,16 +25,16 @@ LEASE_LEFT_MS = 5000
 """Less than this left of the lease: it may end between the last look and the activation."""
 
 
-def next_operation(journal: Journal, known: Known, order: Order | None = None) -> Op:
+def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | None = None) -> Operation:
     """Decide what to do next.
 
     Parameters
     ----------
     journal : tuple of Entry
         All entries of one push; empty before its first.
-    known : Known
+    known : Knowledge
         What this process learned since its start, or since the last entry.
-    order : Order, optional
+    order : OperationOrder, optional
         What is to be pushed; only needed while the journal is empty.
 
     Returns
@@ -43,7 +43,7 @@ def next_operation(journal: Journal, known: Known, order: Order | None = None) -
         One operation. After it: `abbe.service.push.learn`, or for RECORD the entry and `after_record`.
     """
     if not journal:
-        return _begin(known, order) if order is not None else Op(Kind.END, text="nothing was begun")
+        return _begin(known, order) if order is not None else Operation(OperationKind.END, text="nothing was begun")
     state, f = journal[-1].state, facts(journal)
     if state in TERMINAL:
         return _leave(f, known)
@@ -56,110 +56,114 @@ def next_operation(journal: Journal, known: Known, order: Order | None = None) -
     return _AFTER[state](f, known)
 
 
-def _leave(f: Doc, known: Known) -> Op:
+def _leave(f: Doc, known: Knowledge) -> Operation:
     """The push is over: its lease goes back, also one that a process left which died after the last entry."""
     if known.doubts >= DOUBTS or known.fenced:
-        return Op(Kind.END)
+        return Operation(OperationKind.END)
     if known.lease:
-        return Op(Kind.RELEASE, owner=known.lease)
+        return Operation(OperationKind.RELEASE, owner=known.lease)
     if known.mine:
-        return Op(Kind.END)
+        return Operation(OperationKind.END)
     if known.truth is None:
-        return Op(Kind.LOOK)
-    return Op(Kind.RELEASE, owner=known.truth.owner) if f["owner"] <= known.truth.owner <= f["owner"] + OWNERS else Op(Kind.END)
+        return Operation(OperationKind.LOOK)
+    return (
+        Operation(OperationKind.RELEASE, owner=known.truth.owner)
+        if f["owner"] <= known.truth.owner <= f["owner"] + OWNERS
+        else Operation(OperationKind.END)
+    )
 
 
-def _begin(known: Known, order: Order) -> Op:
+def _begin(known: Knowledge, order: OperationOrder) -> Operation:
     """Read the table in force, twice, between two looks."""
     if known.stop or known.doubts >= DOUBTS:
-        return Op(Kind.END, text=known.stop or "the controller does not answer")
+        return Operation(OperationKind.END, text=known.stop or "the controller does not answer")
     active = known.start.active if known.start else 0
     step = bracket(known, active, 0, again=True)
-    if isinstance(step, Op):
+    if isinstance(step, Operation):
         return step
     image = known.image or b""
     if step is None or step.truth.states[active] != SEALED or zlib.crc32(image) != step.truth.crc[active]:
         if known.brackets < BRACKETS:
-            return Op(Kind.LOOK, mark=True)
-        return Op(Kind.END, text="the table in force does not have the CRC that the controller states, or keeps changing")
+            return Operation(OperationKind.LOOK, mark=True)
+        return Operation(OperationKind.END, text="the table in force does not have the CRC that the controller states, or keeps changing")
     truth = step.truth
     base = {"boot": truth.boot, "gen": truth.gen, "map": truth.map, "base_bank": active, "base_crc": truth.crc[active]}
     base |= {"base_image": image.hex(), "base_meaning": known.meaning, "target": 1 - active}
-    return record(State.SNAPSHOT, **base, **order.doc())
+    return record(PushState.SNAPSHOT, **base, **order.doc())
 
 
-def _abandon(f: Doc, known: Known, state: State, why: str) -> Op:
+def _abandon(f: Doc, known: Knowledge, state: PushState, why: str) -> Operation:
     """Before activation: give the lease back, and end. The table in force was never touched."""
-    if state not in (State.SNAPSHOT, State.VALIDATED) and not known.fenced and known.doubts < 2 * DOUBTS:
-        return Op(Kind.RELEASE, owner=f["owner"], text=why)
-    return record(State.ABORTED, why=why)
+    if state not in (PushState.SNAPSHOT, PushState.VALIDATED) and not known.fenced and known.doubts < 2 * DOUBTS:
+        return Operation(OperationKind.RELEASE, owner=f["owner"], text=why)
+    return record(PushState.ABORTED, why=why)
 
 
-def _validate(f: Doc, known: Known) -> Op:
+def _validate(f: Doc, known: Knowledge) -> Operation:
     no = objection(f["level"], attended=f["attended"])
     if no:
-        return record(State.REJECTED, reasons=[no])
+        return record(PushState.REJECTED, reasons=[no])
     if known.verdict is None:
-        return Op(Kind.VALIDATE)
+        return Operation(OperationKind.VALIDATE)
     if isinstance(known.verdict, Done):
         reasons = list(known.verdict.value)
-        return record(State.REJECTED, reasons=reasons) if reasons else record(State.VALIDATED)
-    return record(State.REJECTED, reasons=[known.verdict.text])
+        return record(PushState.REJECTED, reasons=reasons) if reasons else record(PushState.VALIDATED)
+    return record(PushState.REJECTED, reasons=[known.verdict.text])
 
 
-def _approve(f: Doc, known: Known) -> Op:
+def _approve(f: Doc, known: Knowledge) -> Operation:
     if known.verdict is None:
-        return Op(Kind.APPROVE)
+        return Operation(OperationKind.APPROVE)
     if not isinstance(known.verdict, Done) or not isinstance(known.verdict.value, Approval):
         text = "no answer" if isinstance(known.verdict, Done) else known.verdict.text
-        return record(State.REJECTED, reasons=[f"not approved: {text}"])
+        return record(PushState.REJECTED, reasons=[f"not approved: {text}"])
     approval = known.verdict.value
     if approval.digest != approval_digest(f, approval.expiry):
-        return record(State.REJECTED, reasons=["what was approved is not this table on this base under these limits"])
-    return record(State.APPROVED, approval=approval.digest, approved_by=approval.by, expiry=approval.expiry)
+        return record(PushState.REJECTED, reasons=["what was approved is not this table on this base under these limits"])
+    return record(PushState.APPROVED, approval=approval.digest, approved_by=approval.by, expiry=approval.expiry)
 
 
-def _lease(f: Doc, known: Known) -> Op:
+def _lease(f: Doc, known: Knowledge) -> Operation:
     if known.verdict is None:
-        return Op(Kind.LEASE, owner=f["owner"])
+        return Operation(OperationKind.LEASE, owner=f["owner"])
     if isinstance(known.verdict, Refused):
-        return _abandon(f, known, State.APPROVED, f"the lease is another's: {known.verdict.text}")
+        return _abandon(f, known, PushState.APPROVED, f"the lease is another's: {known.verdict.text}")
     if isinstance(known.verdict, Done):
-        return record(State.LEASED)
+        return record(PushState.LEASED)
     if known.truth is None:
-        return Op(Kind.LOOK)
+        return Operation(OperationKind.LOOK)
     if known.truth.owner == f["owner"]:
-        return record(State.LEASED)
-    return _abandon(f, known, State.APPROVED, "the lease could not be taken")
+        return record(PushState.LEASED)
+    return _abandon(f, known, PushState.APPROVED, "the lease could not be taken")
 
 
-def _precheck(f: Doc, known: Known) -> Op:
+def _precheck(f: Doc, known: Knowledge) -> Operation:
     truth = known.truth
     if truth is None:
-        return Op(Kind.LOOK)
+        return Operation(OperationKind.LOOK)
     why = _changed(f, truth, f["gen"]) or ("the axes have not stood long enough" if truth.still_s < STILL_S else "")
     if not why and truth.states[f["target"]] == LAID_ASIDE:
         why = "a table is laid aside for the control's next start: start it anew, or take that table away first"
     if why:
-        return _abandon(f, known, State.LEASED, why)
-    return record(State.STAGING, still_s=truth.still_s)
+        return _abandon(f, known, PushState.LEASED, why)
+    return record(PushState.STAGING, still_s=truth.still_s)
 
 
-def _stage(f: Doc, known: Known) -> Op:
+def _stage(f: Doc, known: Knowledge) -> Operation:
     image = Image(
         f["target"], bytes.fromhex(f["image"]), f["crc"], f["meaning"], f["owner"], f["gen"], f["boot"], f["base_crc"], f["chunk_words"]
     )
     step = stage(image, known)
     if isinstance(step, Coherent):
-        return record(State.STAGED, staged_gen=step.truth.gen)
-    return _abandon(f, known, State.STAGING, step.why) if isinstance(step, Failed) else step
+        return record(PushState.STAGED, staged_gen=step.truth.gen)
+    return _abandon(f, known, PushState.STAGING, step.why) if isinstance(step, Failed) else step
 
 
-def _arm(f: Doc, known: Known) -> Op:
+def _arm(f: Doc, known: Knowledge) -> Operation:
     """The last look before the activation: everything once more."""
     truth = known.truth
     if truth is None:
-        return Op(Kind.LOOK)
+        return Operation(OperationKind.LOOK)
     why = _changed(f, truth, f["staged_gen"])
     if not why and truth.crc[f["target"]] != f["crc"]:
         why = "the staged bank changed"
@@ -168,8 +172,8 @@ def _arm(f: Doc, known: Known) -> Op:
     if not why and truth.lease_ms < LEASE_LEFT_MS:
         why = "the lease is about to end"
     if why:
-        return _abandon(f, known, State.STAGED, why)
-    return record(State.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"])
+        return _abandon(f, known, PushState.STAGED, why)
+    return record(PushState.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"])
 
 
 def _changed(f: Doc, truth: Truth, gen: int) -> str:
@@ -187,10 +191,10 @@ def _changed(f: Doc, truth: Truth, gen: int) -> str:
     return f"not safe now: {truth.unsafe}" if truth.unsafe else ""
 
 
-def _activate(f: Doc, known: Known) -> Op:
+def _activate(f: Doc, known: Knowledge) -> Operation:
     """One command; whatever came of it is asked from the controller, never guessed, and never sent again."""
     if known.mine and known.wrote_last and not known.asked and not known.stop:
-        return Op(Kind.ACTIVATE, bank=f["target"], crc=f["expect_crc"], gen=f["expect_gen"], owner=f["owner"])
+        return Operation(OperationKind.ACTIVATE, bank=f["target"], crc=f["expect_crc"], gen=f["expect_gen"], owner=f["owner"])
     if known.mine and known.asked and not known.fenced and not known.stop:
         step = _confirm(f, known)
         if step is not None:
@@ -198,119 +202,121 @@ def _activate(f: Doc, known: Known) -> Op:
     return _unconfirmed(f, known)
 
 
-def _confirm(f: Doc, known: Known) -> Op | None:
+def _confirm(f: Doc, known: Knowledge) -> Operation | None:
     """The new table is active and is, byte for byte, the approved one. None: it is not, or that cannot be shown."""
     if known.doubts >= DOUBTS:
         return None
     if known.start is not None and (in_force(f, known.start) != "candidate" or known.start.boot != f["boot"]):
         return None
     step = bracket(known, f["target"], len(f["image"]) // 4, again=False)
-    if isinstance(step, Op):
+    if isinstance(step, Operation):
         return step
     if step is not None and known.image == bytes.fromhex(f["image"]):
-        return record(State.PROBATION, probation_gen=step.truth.gen)
-    return Op(Kind.LOOK, mark=True) if known.brackets < BRACKETS else None
+        return record(PushState.PROBATION, probation_gen=step.truth.gen)
+    return Operation(OperationKind.LOOK, mark=True) if known.brackets < BRACKETS else None
 
 
-def _unconfirmed(f: Doc, known: Known) -> Op:
+def _unconfirmed(f: Doc, known: Knowledge) -> Operation:
     """Shut out a command that may still be on its way, then look which table is in force."""
     if known.doubts >= 2 * DOUBTS:
-        return Op(Kind.END, text="the controller does not answer: whether the new table is active is not known")
+        return Operation(OperationKind.END, text="the controller does not answer: whether the new table is active is not known")
     if not known.fenced:
-        return Op(Kind.RELEASE, owner=f["owner"])
+        return Operation(OperationKind.RELEASE, owner=f["owner"])
     if known.truth is None:
-        return Op(Kind.LOOK)
+        return Operation(OperationKind.LOOK)
     which = in_force(f, known.truth)
     if which == "base":
         return _not_in_force(f, known, known.truth)
     if which == "candidate":
-        return record(State.ROLLBACK, why=known.stop or "activated, but not confirmed")
-    return record(State.OPERATOR, why="the active table is neither the old nor the new one", **seen(f, known.truth))
+        return record(PushState.ROLLBACK, why=known.stop or "activated, but not confirmed")
+    return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **seen(f, known.truth))
 
 
-def _not_in_force(f: Doc, known: Known, truth: Truth) -> Op:
+def _not_in_force(f: Doc, known: Knowledge, truth: Truth) -> Operation:
     """The old table acts. A control that laid the new one aside for its next start has to forget it: nobody will have verified it."""
     if truth.states[f["target"]] == LAID_ASIDE and truth.crc[f["target"]] == f["crc"]:
         return _forget(f, known, truth)
     if known.forgets:
-        return record(State.ABORTED, why="this control uses a new table only after its next start: it cannot be verified in a push")
+        return record(PushState.ABORTED, why="this control uses a new table only after its next start: it cannot be verified in a push")
     text = known.verdict.text if isinstance(known.verdict, Refused) else "the activation did not happen"
-    return record(State.ABORTED, why=known.stop or text)
+    return record(PushState.ABORTED, why=known.stop or text)
 
 
-def _forget(f: Doc, known: Known, truth: Truth) -> Op:
+def _forget(f: Doc, known: Knowledge, truth: Truth) -> Operation:
     """A bank that is written to is no table any more; only whoever has the lease writes."""
     if known.forgets >= DOUBTS:
         why = "the control has laid the new table aside, uses it after its next start, and does not forget it: do not start it anew"
-        return record(State.OPERATOR, why=why, **seen(f, truth))
+        return record(PushState.OPERATOR, why=why, **seen(f, truth))
     if known.lease and truth.owner == known.lease:
         data = bytes.fromhex(f["image"])[: 2 * f["chunk_words"]]
-        return Op(Kind.WRITE, bank=f["target"], count=len(data) // 2, data=data, text=FORGET)
+        return Operation(OperationKind.WRITE, bank=f["target"], count=len(data) // 2, data=data, text=FORGET)
     if truth.owner or known.leases >= DOUBTS:
-        return Op(Kind.END, text="the control would use the new table after its next start, and another owner has the lease")
-    return Op(Kind.LEASE, owner=f["owner"] + 1)  # fenced off, and less than any lease on the way back
+        return Operation(
+            OperationKind.END, text="the control would use the new table after its next start, and another owner has the lease"
+        )
+    return Operation(OperationKind.LEASE, owner=f["owner"] + 1)  # fenced off, and less than any lease on the way back
 
 
-def _probation(f: Doc, known: Known) -> Op:
-    return _proved(f, known, Kind.PROBE, State.PROBED)
+def _probation(f: Doc, known: Knowledge) -> Operation:
+    return _proved(f, known, OperationKind.PROBE, PushState.PROBED)
 
 
-def _verify(f: Doc, known: Known) -> Op:
-    return _proved(f, known, Kind.VERIFY, State.VERIFIED)
+def _verify(f: Doc, known: Knowledge) -> Operation:
+    return _proved(f, known, OperationKind.VERIFY, PushState.VERIFIED)
 
 
-def _proved(f: Doc, known: Known, question: Kind, then: State) -> Op:
+def _proved(f: Doc, known: Knowledge, question: OperationKind, then: PushState) -> Operation:
     """Move the machine and ask; every answer but a clear yes leads back."""
     why = _why_back(known)
     if why:
-        return record(State.ROLLBACK, why=why)
+        return record(PushState.ROLLBACK, why=why)
     if known.verdict is None:
         truth = known.truth
         if truth is None:
-            return Op(Kind.LOOK)
+            return Operation(OperationKind.LOOK)
         if (truth.boot, truth.gen) != (f["boot"], f["probation_gen"]) or in_force(f, truth) != "candidate":
-            return record(State.ROLLBACK, why="the controller restarted, or somebody changed a table, during probation")
-        return record(State.ROLLBACK, why=f"not safe now: {truth.unsafe}") if truth.unsafe else Op(question)
+            return record(PushState.ROLLBACK, why="the controller restarted, or somebody changed a table, during probation")
+        return record(PushState.ROLLBACK, why=f"not safe now: {truth.unsafe}") if truth.unsafe else Operation(question)
     if isinstance(known.verdict, Done) and isinstance(known.verdict.value, Verdict) and known.verdict.value.passed:
         return record(then, **{question.value: known.verdict.value.text})
     verdict = known.verdict
     text = verdict.value.text if isinstance(verdict, Done) and isinstance(verdict.value, Verdict) else getattr(verdict, "text", "no answer")
-    return record(State.ROLLBACK, why=f"{question.value}: {text}")
+    return record(PushState.ROLLBACK, why=f"{question.value}: {text}")
 
 
-def _keep(f: Doc, known: Known) -> Op:
+def _keep(f: Doc, known: Knowledge) -> Operation:
     """Once more: what is in force is what was approved and verified, byte for byte."""
     why = _why_back(known)
     if why:
-        return record(State.ROLLBACK, why=why)
+        return record(PushState.ROLLBACK, why=why)
     step = _confirm(f, known)
     if step is None:
-        return record(State.ROLLBACK, why="the table in force is not the one that was verified")
-    if step.state is not State.PROBATION:
+        return record(PushState.ROLLBACK, why="the table in force is not the one that was verified")
+    if step.state is not PushState.PROBATION:
         return step
     if (step.doc or {}).get("probation_gen") != f["probation_gen"]:
-        return record(State.ROLLBACK, why="somebody changed a table while it was verified")
-    return record(State.KEEP)
+        return record(PushState.ROLLBACK, why="somebody changed a table while it was verified")
+    return record(PushState.KEEP)
 
 
-def _why_back(known: Known) -> str:
+def _why_back(known: Knowledge) -> str:
     """Unconfirmed means back: after a crash, when somebody asks to stop, when nothing answers."""
     if not known.mine:
         return "interrupted before it was verified"
     return known.stop or ("the controller does not answer" if known.doubts >= DOUBTS else "")
 
 
-_FORWARD: dict[State, Callable[[Doc, Known], Op]] = {
-    State.SNAPSHOT: _validate,
-    State.VALIDATED: _approve,
-    State.APPROVED: _lease,
-    State.LEASED: _precheck,
-    State.STAGING: _stage,
-    State.STAGED: _arm,
+_FORWARD: dict[PushState, Callable[[Doc, Knowledge], Operation]] = {
+    PushState.SNAPSHOT: _validate,
+    PushState.VALIDATED: _approve,
+    PushState.APPROVED: _lease,
+    PushState.LEASED: _precheck,
+    PushState.STAGING: _stage,
+    PushState.STAGED: _arm,
 }
-_AFTER: dict[State, Callable[[Doc, Known], Op]] = {
-    State.ACTIVATING: _activate,
-    State.PROBATION: _probation,
-    State.PROBED: _verify,
-    State.VERIFIED: _keep,
+_AFTER: dict[PushState, Callable[[Doc, Knowledge], Operation]] = {
+    PushState.ACTIVATING: _activate,
+    PushState.PROBATION: _probation,
+    PushState.PROBED: _verify,
+    PushState.VERIFIED: _keep,
 }

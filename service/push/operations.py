@@ -7,10 +7,10 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from abbe.service.push.entries import Doc
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 
 
-class Kind(Enum):
+class OperationKind(Enum):
     """Operations of the protocol. Only WRITE, SEAL, ACTIVATE, LEASE and RELEASE change anything in the controller."""
 
     LOOK = "look"
@@ -43,13 +43,13 @@ class Kind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Op:
+class Operation:
     """One operation. Fields that a kind does not need are left as they are.
 
     ``first`` and ``count`` are registers; ``data`` is what is written or expected; ``mark`` begins a bracket of reads between two looks.
     """
 
-    kind: Kind
+    kind: OperationKind
     bank: int = -1
     first: int = 0
     count: int = 0
@@ -58,7 +58,7 @@ class Op:
     gen: int = 0
     owner: int = 0
     mark: bool = False
-    state: State | None = None
+    state: PushState | None = None
     doc: Doc | None = None
     text: str = ""
 
@@ -131,7 +131,7 @@ class Doubt:
 Outcome = Done | Refused | Doubt
 
 
-class Known(NamedTuple):
+class Knowledge(NamedTuple):
     """What a process has learned since its start or since the last journal entry; a crash loses all of it.
 
     A plain tuple: a sweep over all faults makes millions. A process that did not begin the push (``mine`` false) knows nothing: from that

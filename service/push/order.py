@@ -8,7 +8,7 @@ from abbe.service.push.entries import Doc
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class OperationOrder:
     """A table that shall be brought into a controller.
 
     Parameters

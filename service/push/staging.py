@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from abbe.service.push.operations import Kind, Known, Op, Refused, Truth
+from abbe.service.push.operations import Knowledge, Operation, OperationKind, Refused, Truth
 
 BRACKETS = 4
 REWRITES_PER_CHUNK = 2
@@ -43,7 +43,7 @@ class Coherent:
     truth: Truth
 
 
-def bracket(known: Known, bank: int, count: int, *, again: bool) -> Op | Coherent | None:
+def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operation | Coherent | None:
     """Next operation of a full read between two looks.
 
     Parameters
@@ -59,18 +59,18 @@ def bracket(known: Known, bank: int, count: int, *, again: bool) -> Op | Coheren
         None: the two looks differ, somebody changed something meanwhile.
     """
     if known.start is None:
-        return Op(Kind.LOOK, mark=True)
+        return Operation(OperationKind.LOOK, mark=True)
     if known.image is None:
-        return Op(Kind.READ, bank=bank, count=count)
+        return Operation(OperationKind.READ, bank=bank, count=count)
     if again and known.meaning is None:
-        return Op(Kind.READ_AGAIN, bank=bank, count=len(known.image) // 2)
+        return Operation(OperationKind.READ_AGAIN, bank=bank, count=len(known.image) // 2)
     if known.truth is None:
-        return Op(Kind.LOOK)
+        return Operation(OperationKind.LOOK)
     same = (known.start.boot, known.start.gen, known.start.active) == (known.truth.boot, known.truth.gen, known.truth.active)
     return Coherent(known.truth) if same else None
 
 
-def stage(image: Image, known: Known) -> Op | Failed | Coherent:
+def stage(image: Image, known: Knowledge) -> Operation | Failed | Coherent:
     """Next operation of staging, or its end.
 
     Returns
@@ -84,20 +84,20 @@ def stage(image: Image, known: Known) -> Op | Failed | Coherent:
     if known.chunk * image.chunk_words < words:
         return _chunk(image, known)
     if not known.sealed:
-        return Op(Kind.SEAL, bank=image.bank, owner=image.owner)
+        return Operation(OperationKind.SEAL, bank=image.bank, owner=image.owner)
     return _read_back(image, known, words)
 
 
-def _chunk(image: Image, known: Known) -> Op | Failed:
+def _chunk(image: Image, known: Knowledge) -> Operation | Failed:
     first = known.chunk * image.chunk_words
     data = image.data[2 * first : 2 * (first + image.chunk_words)]
-    write = Op(Kind.WRITE, bank=image.bank, first=first, count=len(data) // 2, data=data)
+    write = Operation(OperationKind.WRITE, bank=image.bank, first=first, count=len(data) // 2, data=data)
     if not known.wrote:
         return write
     if not known.differs:
-        return Op(Kind.READ_CHUNK, bank=image.bank, first=first, count=len(data) // 2, data=data)
+        return Operation(OperationKind.READ_CHUNK, bank=image.bank, first=first, count=len(data) // 2, data=data)
     if known.truth is None:
-        return Op(Kind.LOOK)
+        return Operation(OperationKind.LOOK)
     # Another content than ours is overwritten only while the generation says that nobody but us has written.
     if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):
         return Failed("somebody else wrote into the bank, or the controller restarted; what it holds now was left alone", foreign=True)
@@ -106,9 +106,9 @@ def _chunk(image: Image, known: Known) -> Op | Failed:
     return write
 
 
-def _read_back(image: Image, known: Known, words: int) -> Op | Failed | Coherent:
+def _read_back(image: Image, known: Knowledge, words: int) -> Operation | Failed | Coherent:
     step = bracket(known, image.bank, words, again=True)
-    if isinstance(step, Op):
+    if isinstance(step, Operation):
         return step
     if step is None:
         return _again(known, "the generation changed while the bank was read back")
@@ -118,7 +118,7 @@ def _read_back(image: Image, known: Known, words: int) -> Op | Failed | Coherent
     if truth.crc[1 - image.bank] != image.in_force or truth.active == image.bank:
         return Failed("the table in force changed during staging")
     if truth.states[image.bank] != SEALED and known.sealed < SEALS:
-        return Op(Kind.SEAL, bank=image.bank, owner=image.owner)
+        return Operation(OperationKind.SEAL, bank=image.bank, owner=image.owner)
     if known.image != image.data or known.meaning != image.meaning:
         what = "bytes" if known.image != image.data else "meaning (independent decoder)"
         return _again(known, f"the bank does not hold what was sent: {what}")
@@ -127,5 +127,5 @@ def _read_back(image: Image, known: Known, words: int) -> Op | Failed | Coherent
     return step
 
 
-def _again(known: Known, why: str) -> Op | Failed:
-    return Op(Kind.LOOK, mark=True) if known.brackets < BRACKETS else Failed(why)
+def _again(known: Knowledge, why: str) -> Operation | Failed:
+    return Operation(OperationKind.LOOK, mark=True) if known.brackets < BRACKETS else Failed(why)

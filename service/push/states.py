@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 
-class State(StrEnum):
+class PushState(StrEnum):
     """Where a push stands. The value is what stands in the journal."""
 
     SNAPSHOT = "SNAPSHOT"
@@ -44,13 +44,13 @@ class State(StrEnum):
     """A person has looked and vouches for what is in force."""
 
 
-S = State
+S = PushState
 
 TERMINAL = frozenset({S.REJECTED, S.ABORTED, S.KEEP, S.ROLLED_BACK, S.OPERATOR, S.ACCEPTED})
 BEFORE_ACTIVATION = frozenset({S.SNAPSHOT, S.VALIDATED, S.APPROVED, S.LEASED, S.STAGING, S.STAGED})
 GOING_BACK = frozenset({S.ROLLBACK, S.RESTAGING, S.ACTIVATING_BACK, S.ROLLBACK_PENDING})
 
-FOLLOWS: dict[State | None, frozenset[State]] = {
+FOLLOWS: dict[PushState | None, frozenset[PushState]] = {
     None: frozenset({S.SNAPSHOT}),
     S.SNAPSHOT: frozenset({S.VALIDATED, S.REJECTED, S.ABORTED}),
     S.VALIDATED: frozenset({S.APPROVED, S.REJECTED, S.ABORTED}),

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from itertools import pairwise
 
-from abbe.service.push.candidate import Candidate, Column, Scene, Seal
+from abbe.service.push.candidate import Candidate, CandidateContext, Column, EvidenceSeal
 from abbe.service.push.entries import canonical
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.validate_numbers import number_reasons
@@ -23,12 +23,12 @@ SIGNERS = frozenset({"metrologist"})
 def content_digest(candidate: Candidate) -> str:
     """SHA-256 of everything in a candidate but its own digest and seal; ``"not canonical"`` where a value cannot be hashed (NaN, Inf)."""
     try:
-        return hashlib.sha256(canonical(asdict(replace(candidate, digest="", seal=Seal())))).hexdigest()
+        return hashlib.sha256(canonical(asdict(replace(candidate, digest="", seal=EvidenceSeal())))).hexdigest()
     except ValueError:
         return "not canonical"
 
 
-def reasons_against(candidate: Candidate, scene: Scene, limits: PushLimits) -> list[str]:
+def reasons_against(candidate: Candidate, scene: CandidateContext, limits: PushLimits) -> list[str]:
     """Check a proposed table against machine, controller and limits.
 
     Returns
@@ -41,7 +41,7 @@ def reasons_against(candidate: Candidate, scene: Scene, limits: PushLimits) -> l
     return [*form, *numbers, *_evidence(candidate, scene, limits), *_policy(candidate, scene, limits), *_seal(candidate)]
 
 
-def _binding(c: Candidate, scene: Scene) -> Iterator[str]:
+def _binding(c: Candidate, scene: CandidateContext) -> Iterator[str]:
     if c.machine != scene.machine:
         yield f"MACHINE: the table is for {c.machine!r}, this is {scene.machine!r}"
     if c.map_version != scene.map_version:
@@ -54,7 +54,7 @@ def _binding(c: Candidate, scene: Scene) -> Iterator[str]:
         yield f"BASE: measured with table {c.base_crc:08X}, active is {scene.active_crc:08X}"
 
 
-def _form(c: Candidate, scene: Scene) -> Iterator[str]:
+def _form(c: Candidate, scene: CandidateContext) -> Iterator[str]:
     names = [(column.moved, column.corrected) for column in c.columns]
     if sorted(names) != [(a, i) for a in AXES for i in AXES]:
         yield f"FORM AXES: needs each of X, Y, Z over each of them once, has {len(names)} columns"
@@ -68,7 +68,7 @@ def _form(c: Candidate, scene: Scene) -> Iterator[str]:
             yield f"FORM {reason} (table of {column.corrected} over {column.moved})"
 
 
-def _column_form(column: Column, scene: Scene) -> str:
+def _column_form(column: Column, scene: CandidateContext) -> str:
     position, n = column.position_mm, len(column.position_mm)
     if n < 2 or len(column.correction_mm) != n or (column.left_mm and len(column.left_mm) != n):
         return f"SIZE: {n} positions, {len(column.correction_mm)} corrections, {len(column.left_mm)} residuals"
@@ -88,7 +88,7 @@ def _column_form(column: Column, scene: Scene) -> str:
     return ""
 
 
-def _evidence(c: Candidate, scene: Scene, limits: PushLimits) -> Iterator[str]:
+def _evidence(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
     e = c.evidence
     low, high = limits.temperature_c
     newest_s = e.ended_s if e.last_s is None else e.last_s
@@ -111,7 +111,7 @@ def _evidence(c: Candidate, scene: Scene, limits: PushLimits) -> Iterator[str]:
         yield "CERTIFICATE: a calibration had expired when it was measured"
 
 
-def _policy(c: Candidate, scene: Scene, limits: PushLimits) -> Iterator[str]:
+def _policy(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
     """What only holds when nobody is there: an unattended loop may not walk away, nor hurry."""
     if scene.attended:
         return

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from itertools import pairwise
 
-from abbe.service.push.candidate import Candidate, Column, Scene
+from abbe.service.push.candidate import Candidate, CandidateContext, Column
 from abbe.service.push.limits import PushLimits
 
 LARGEST = 32767
@@ -15,7 +15,7 @@ WHOLE = 0.01
 """How far from a whole unit of the table a value may be: float noise only, so that rounding it costs nothing more."""
 
 
-def number_reasons(candidate: Candidate, scene: Scene, limits: PushLimits) -> Iterator[str]:
+def number_reasons(candidate: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
     """All reasons against the numbers of a candidate whose form is right."""
     odd = [reason for column in candidate.columns if (reason := _odd(column))]
     if odd:
@@ -82,7 +82,7 @@ def _reverse(column: Column) -> Iterator[str]:
         yield f"DIRECTIONS: the two columns are exchanged (measured {seen_um:.1f} µm, the table adds {made_um:.1f} µm)"
 
 
-def _whole(c: Candidate, scene: Scene, limits: PushLimits) -> Iterator[str]:
+def _whole(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
     """Shadow simulation: the residual with the new table, from what was measured with the one in force."""
     values = [x for column in c.columns for x in column.correction_mm]
     active = [x for column in c.columns for x in _active(column, scene)]
@@ -103,7 +103,7 @@ def _whole(c: Candidate, scene: Scene, limits: PushLimits) -> Iterator[str]:
         yield f"{word}: {before_mm * 1e3:.2f} to {after_mm * 1e3:.2f} µm rms in the shadow"
 
 
-def _active(column: Column, scene: Scene) -> tuple[float, ...]:
+def _active(column: Column, scene: CandidateContext) -> tuple[float, ...]:
     return scene.active.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
 
 

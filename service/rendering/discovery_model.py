@@ -38,7 +38,7 @@ class Trace:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class PlaceMap:
     """Where in one plane of the volume the gap lives.
 
     ``x_mm``, ``y_mm``: centres of cells that were measured, shape (n,); ``times_noise``: rms of the gap there over its noise; ``spot``:
@@ -97,7 +97,7 @@ class DiscoveryPage:
     gaps: Sequence[GapRow]
     runs: Sequence[RunGap]
     traces: Sequence[Trace]
-    places: Sequence[Place]
+    places: Sequence[PlaceMap]
     tests: Sequence[tuple[str, str, str, str]]
     next_test: Sequence[str]
     rejected: Sequence[tuple[str, str]]

@@ -9,7 +9,7 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.service.campaign_data.packed_arrays import unpacked
 from abbe.service.discovery.changed_words import changed_lines, changed_words
-from abbe.service.discovery.discover import Job, Journal
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
 from abbe.service.discovery.discovery_states import closed, entering
 from abbe.service.discovery.discovery_words import (
     ROLES,
@@ -21,7 +21,7 @@ from abbe.service.discovery.discovery_words import (
     where_lines,
 )
 from abbe.service.effects.model_book import REMEDIES, name_of
-from abbe.service.rendering.discovery_model import DiscoveryPage, EffectCard, GapRow, Place, RunGap, Trace
+from abbe.service.rendering.discovery_model import DiscoveryPage, EffectCard, GapRow, PlaceMap, RunGap, Trace
 from abbe.service.rendering.numbers import plain
 
 AXES = "XYZ"
@@ -32,7 +32,7 @@ FEWEST = 3
 REJECTED = 40
 
 
-def page_facts(job: Job, journal: Journal, made: str) -> tuple[dict[str, str], dict[str, Any]]:
+def page_facts(job: DiscoveryJob, journal: DiscoveryJournal, made: str) -> tuple[dict[str, str], dict[str, Any]]:
     """Head, states and provenance of a discovery's page; ``made``: when, as text."""
     machine, source = job.campaign.site.name, job.source
     facts = {"machine": machine, "chain": job.case.machine.chain, "runs": str(len(job.campaign.runs)), "made": made}
@@ -155,7 +155,7 @@ def _traces(finding: dict[str, Any], measured: dict[str, dict[str, Any]]) -> lis
     return out
 
 
-def _place(finding: dict[str, Any], measured: dict[str, dict[str, Any]], a: int, b: int) -> Place | None:
+def _place(finding: dict[str, Any], measured: dict[str, dict[str, Any]], a: int, b: int) -> PlaceMap | None:
     """Cells of one plane with the rms of the gap before over its noise."""
     points, ratio = _points(finding, measured)
     if not len(points):
@@ -172,7 +172,7 @@ def _place(finding: dict[str, Any], measured: dict[str, dict[str, Any]], a: int,
     spot, at = None, finding["where"].get("position_mm")
     if at is not None:
         spot = (float(at[a]), float(at[b]), float(finding["where"].get("radius_mm", 0.0)))
-    return Place(AXES[a], AXES[b], centre[:, 0], centre[:, 1], times, spot)
+    return PlaceMap(AXES[a], AXES[b], centre[:, 0], centre[:, 1], times, spot)
 
 
 def _points(finding: dict[str, Any], measured: dict[str, dict[str, Any]]) -> tuple[F1, F1]:

@@ -12,8 +12,8 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.errors import NotStored, TableMismatch
 from abbe.service.push.book import read_entries
-from abbe.service.push.entries import WORD, Entry, JournalBroken, check_chain, facts
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.entries import WORD, JournalBroken, JournalEntry, check_chain, facts
+from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.rendering.document import Document, Figure, Picture, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
@@ -31,13 +31,13 @@ from abbe.service.verification.verify import COVERAGE
 MANY = 10**6
 AXES = "XYZ"
 VERDICTS: dict[str, tuple[Sign, str]] = {"pass": ("ok", "Passed"), "fail": ("bad", "Failed")}
-ENDS: dict[State, tuple[Sign, str]] = {
-    State.KEEP: ("ok", "Kept"),
-    State.ACCEPTED: ("open", "Accepted by a person"),
-    State.ROLLED_BACK: ("bad", "Taken back: the old table is in force"),
-    State.REJECTED: ("open", "Refused: nothing was written"),
-    State.ABORTED: ("open", "Never in force: the old table stayed"),
-    State.OPERATOR: ("bad", "A person has to look"),
+ENDS: dict[PushState, tuple[Sign, str]] = {
+    PushState.KEEP: ("ok", "Kept"),
+    PushState.ACCEPTED: ("open", "Accepted by a person"),
+    PushState.ROLLED_BACK: ("bad", "Taken back: the old table is in force"),
+    PushState.REJECTED: ("open", "Refused: nothing was written"),
+    PushState.ABORTED: ("open", "Never in force: the old table stayed"),
+    PushState.OPERATOR: ("bad", "A person has to look"),
 }
 
 
@@ -152,7 +152,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
         if tables is None
         else [Picture("The new table: what is added to the command.", table_plot(_curves(tables)), wide=True)],
     )
-    return of_then(document, store, machine, journal[-1].utc, []) if journal[-1].state is State.KEEP else document
+    return of_then(document, store, machine, journal[-1].utc, []) if journal[-1].state is PushState.KEEP else document
 
 
 def _is_of(store: Store, record: VerificationRecord, machine: str, push: int) -> bool:
@@ -164,7 +164,7 @@ def _machine_doc(store: Store, machine: str) -> Doc:
     return next(m.doc for m in reversed(store.machines()) if m.name == machine)
 
 
-def _about(store: Store, journal: Sequence[Entry], known: Doc) -> dict[str, str]:
+def _about(store: Store, journal: Sequence[JournalEntry], known: Doc) -> dict[str, str]:
     out = {"Begun": journal[0].utc, "Last entry": journal[-1].utc, "State": str(journal[-1].state)}
     if "crc" in known:
         out["New table"] = f"CRC {known['crc']:08X}, bank {known['target']}"
@@ -179,7 +179,7 @@ def _about(store: Store, journal: Sequence[Entry], known: Doc) -> dict[str, str]
     return out
 
 
-def _verdict(journal: Sequence[Entry], known: Doc) -> tuple[Sign, str, str]:
+def _verdict(journal: Sequence[JournalEntry], known: Doc) -> tuple[Sign, str, str]:
     state = journal[-1].state
     sign, word = ENDS.get(state, ("open", "Not ended"))
     reasons = "; ".join(str(r) for r in known.get("reasons", []))
@@ -187,7 +187,7 @@ def _verdict(journal: Sequence[Entry], known: Doc) -> tuple[Sign, str, str]:
     return sign, word, (why or f"it stands at {state}") + ("" if state in TERMINAL else f" (state {state})")
 
 
-def _chain(entries: Sequence[Entry]) -> list[str]:
+def _chain(entries: Sequence[JournalEntry]) -> list[str]:
     try:
         check_chain(entries)
     except JournalBroken as error:

@@ -10,7 +10,7 @@ from abbe.service.report.report_parts import Doc
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, Images, images_of
 from abbe.service.tables.table_gate import STRANGE
-from abbe.service.tables.unverified import Known, known_tables
+from abbe.service.tables.unverified import KnownState, known_tables
 
 WORD = "Unverified table"
 
@@ -54,7 +54,7 @@ def _corrects(crc: int, table: Doc, images: Images) -> bool:
     return bool(table.get("acting")) if image is None else int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
 
 
-def _remark(crc: int, known: Known, chain: str) -> str:
+def _remark(crc: int, known: KnownState, chain: str) -> str:
     """Whose table it is and who accepted it for this machine; empty where its own journal says that it is right."""
     elsewhere, here, push = known.elsewhere(crc, chain), known.fine.get(crc, {}).get(chain), known.pushed.get(crc)
     if elsewhere is not None:

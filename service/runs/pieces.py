@@ -18,7 +18,7 @@ MOST_LOST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class RunPiece:
     """A run that was broken off, and up to where on the whole path (mm from its first point) its readings count."""
 
     run: int
@@ -32,7 +32,7 @@ class SoFar:
     ``arc_mm`` and ``deviation_mm``, shape (n,): of the last piece, along the whole path. ``boot_id``: of the box that read.
     """
 
-    pieces: tuple[Piece, ...]
+    pieces: tuple[RunPiece, ...]
     counted_from_mm: float
     arc_mm: F1
     deviation_mm: F1
@@ -45,9 +45,9 @@ def arc_of(points: Sequence[Sequence[float]]) -> F1:
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
-def pieces_of(start: Doc) -> tuple[Piece, ...]:
+def pieces_of(start: Doc) -> tuple[RunPiece, ...]:
     """The broken runs whose readings belong to a run, oldest first; none for a run that was measured in one go."""
-    return tuple(Piece(int(one["run"]), float(one["to_mm"])) for one in (start.get("path") or {}).get("pieces", []))
+    return tuple(RunPiece(int(one["run"]), float(one["to_mm"])) for one in (start.get("path") or {}).get("pieces", []))
 
 
 def read_so_far(record: RunRecord, columns: Doc) -> SoFar | None:
@@ -77,7 +77,7 @@ def read_so_far(record: RunRecord, columns: Doc) -> SoFar | None:
     good_mm = float(at_mm[known].max(initial=0.0))  # a bar that was out of range before anything else stopped has read no farther
     if good_mm - counted_mm < max(STRETCH_MM, STRETCH_S * feed_mm_s) or int(known.sum()) < LEAST_READINGS:
         return None
-    pieces = (*pieces_of(record.start_doc), Piece(record.id, offset + good_mm))
+    pieces = (*pieces_of(record.start_doc), RunPiece(record.id, offset + good_mm))
     deviation = np.asarray(columns["deviation_mm"], dtype=np.float64)[valid]
     return SoFar(pieces, offset + counted_mm, offset + at_mm[known], deviation[known], int(end["box_boot_id"]))
 

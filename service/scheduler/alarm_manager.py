@@ -12,36 +12,36 @@ import structlog
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.audit.chain import Event
 from abbe.service.clock import Clock
-from abbe.service.compensation.push_approved import Approved, Order, next_approved
+from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
-from abbe.service.scheduler.ports import Doc, Errand, JobWatcher, SlotState
+from abbe.service.scheduler.ports import Doc, FollowUp, JobWatcher, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.scheduler.slots import Needs, Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.records import AlarmEntryRecord
-from abbe.service.tables.push_outcome import OPEN, STOPPED, Outcome, by_journal, in_force, last_push
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Kind, folded, next_step
+from abbe.service.tables.push_outcome import OPEN, STOPPED, PushOutcome, by_journal, in_force, last_push
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
 
 log = structlog.get_logger("abbe.alarm")
 
 CODES = {
-    Kind.RAISED: "ALM-001",
-    Kind.CLEARED: "ALM-002",
-    Kind.PROPOSED: "ALM-003",
-    Kind.ENDED: "ALM-004",
-    Kind.FAILED: "ALM-005",
-    Kind.PUSHED: "ALM-006",
+    AlarmKind.RAISED: "ALM-001",
+    AlarmKind.CLEARED: "ALM-002",
+    AlarmKind.PROPOSED: "ALM-003",
+    AlarmKind.ENDED: "ALM-004",
+    AlarmKind.FAILED: "ALM-005",
+    AlarmKind.PUSHED: "ALM-006",
 }
 """Lines that the broker is told of, and how the message is called."""
 SAID = {OPEN: "is open", STOPPED: "was stopped"}
 """Words of outcomes that make no sentence by themselves."""
-NOTHING_YET = Outcome("failed", "the service ended before anything was written")
+NOTHING_YET = PushOutcome("failed", "the service ended before anything was written")
 LAST_WORDS_S = 1.0
 """A service that ends has five seconds for everything."""
 
@@ -65,7 +65,7 @@ class Duties:
     warn_days: float
     campaign: str
     investigate: Callable[[Alarm, Note, ProgressSink, Control], Awaitable[None]]
-    push: Callable[[Order], Awaitable[Outcome]] | None = None
+    push: Callable[[PushOrder], Awaitable[PushOutcome]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class AlarmManager(RetryingStore):
         entry = await self._line(None if looked.now is None else looked.now.number, looked.kind, line)
         return f"alarm {entry.alarm} {looked.kind}: {looked.found.text}"
 
-    async def due(self) -> Errand | None:
+    async def due(self) -> FollowUp | None:
         """Return what may start now: first the check after a push, then a push, then an investigation."""
         try:
             entries = await asyncio.to_thread(self._store.alarm_entries, self._machine)
@@ -134,37 +134,37 @@ class AlarmManager(RetryingStore):
 
         Which table is in force is read from the journal. Nothing of it is begun again here.
         """
-        last = {e.alarm: e for e in entries if e.kind in (Kind.PUSHING, Kind.PUSHED)}
+        last = {e.alarm: e for e in entries if e.kind in (AlarmKind.PUSHING, AlarmKind.PUSHED)}
         told = False
         for entry in last.values():
-            if entry.kind == Kind.PUSHED and entry.doc.get("word") != OPEN:
+            if entry.kind == AlarmKind.PUSHED and entry.doc.get("word") != OPEN:
                 continue
             proposal, after = int(entry.doc["proposal"]), int(entry.doc.get("after", 0))
             now = await asyncio.to_thread(in_force, self._store, self._machine, proposal, after) or NOTHING_YET
-            if entry.kind == Kind.PUSHING or now.word != OPEN:
-                text = f"{now.text} (it was interrupted with the service)" if entry.kind == Kind.PUSHING else now.text
-                await self._tell_pushed(entry.alarm, proposal, after, Outcome(now.word, text))
+            if entry.kind == AlarmKind.PUSHING or now.word != OPEN:
+                text = f"{now.text} (it was interrupted with the service)" if entry.kind == AlarmKind.PUSHING else now.text
+                await self._tell_pushed(entry.alarm, proposal, after, PushOutcome(now.word, text))
                 told = True
         return await asyncio.to_thread(self._store.alarm_entries, self._machine) if told else entries
 
-    async def _tell_pushed(self, alarm: int, proposal: int, after: int, done: Outcome) -> None:
+    async def _tell_pushed(self, alarm: int, proposal: int, after: int, done: PushOutcome) -> None:
         text = f"proposal {proposal} {SAID.get(done.word, done.word)}: {done.text}"
-        await self._line(alarm, Kind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
+        await self._line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
 
-    def _check_again(self, alarms: Sequence[Alarm]) -> Errand | None:
+    def _check_again(self, alarms: Sequence[Alarm]) -> FollowUp | None:
         """After a push that was kept the check that raised the alarm is made once at once: the trend begins anew with it."""
         for one in alarms:
-            pushed = one.last(Kind.PUSHED)
+            pushed = one.last(AlarmKind.PUSHED)
             schedule = self._schedule_of(one)
             if pushed is None or pushed.doc.get("word") != "kept" or one.held_seq > pushed.seq or schedule is None:
                 continue
             if (one.number, pushed.seq) not in self._checked_again:
                 # Marked when it begins: an errand that may not start yet is offered again.
                 begun = partial(self._checked_again.add, (one.number, pushed.seq))
-                return Errand(f"{schedule.name} (after push)", schedule, begun=begun)
+                return FollowUp(f"{schedule.name} (after push)", schedule, begun=begun)
         return None
 
-    async def _push(self, entries: Sequence[AlarmEntryRecord]) -> Errand | None:
+    async def _push(self, entries: Sequence[AlarmEntryRecord]) -> FollowUp | None:
         if self._duties.push is None:
             return None
         now_s = self._clock.utc().timestamp()
@@ -175,15 +175,15 @@ class AlarmManager(RetryingStore):
         asked = self._schedule_of(one) if one is not None else None
         needs = Needs() if asked is None else asked.needs
         terms = Schedule(f"push of proposal {found.proposal}", "", "UTC", "push", needs=replace(needs, idle=True))
-        return Errand(terms.name, terms, partial(self._pushed, found, terms), "push")
+        return FollowUp(terms.name, terms, partial(self._pushed, found, terms), "push")
 
-    def _investigation(self, alarms: Sequence[Alarm]) -> Errand | None:
+    def _investigation(self, alarms: Sequence[Alarm]) -> FollowUp | None:
         for one in alarms:
             schedule = self._schedule_of(one)
             if schedule is not None and schedule.on_alarm == "propose" and next_step(one) is not None:
                 needs = replace(schedule.needs, idle=True)  # a machine at work, or in another process's hands, is waited for
                 terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self._duties.campaign, needs=needs)
-                return Errand(terms.name, terms, partial(self._investigated, one, terms), "investigation")
+                return FollowUp(terms.name, terms, partial(self._investigated, one, terms), "investigation")
         return None
 
     def _schedule_of(self, one: Alarm) -> Schedule | None:
@@ -194,7 +194,7 @@ class AlarmManager(RetryingStore):
     async def _investigated(self, one: Alarm, terms: Schedule, control: Control) -> str:
         last = SlotState("done: nothing")
 
-        async def note(kind: Kind, doc: Doc) -> Alarm:
+        async def note(kind: AlarmKind, doc: Doc) -> Alarm:
             nonlocal last
             await self._line(one.number, kind, doc)
             last = SlotState(f"done: {kind}", doc["text"])
@@ -206,7 +206,7 @@ class AlarmManager(RetryingStore):
         except MachineInUse as busy:
             return _waits(busy)
         except Exception as error:
-            await note(Kind.FAILED, _failed(error))
+            await note(AlarmKind.FAILED, _failed(error))
             # A defect of this program ends the service, as in a check; but its line stays: the next one must not fall over it again.
             if _is_defect(error):
                 raise
@@ -226,11 +226,11 @@ class AlarmManager(RetryingStore):
 
         async def tell_begun() -> None:
             if not told:
-                told.append(await self._line(found.alarm, Kind.PUSHING, begun))
+                told.append(await self._line(found.alarm, AlarmKind.PUSHING, begun))
 
         self._begin(terms)
         try:
-            said = await control.unless_aborted(self._push_now(Order(found.proposal, tell_begun, self._progress, control)))
+            said = await control.unless_aborted(self._push_now(PushOrder(found.proposal, tell_begun, self._progress, control)))
         except MachineInUse as busy:
             return _waits(busy)
         except asyncio.CancelledError:
@@ -242,7 +242,9 @@ class AlarmManager(RetryingStore):
                 raise
             await tell_begun()
             ended = isinstance(error, Stopped | Aborted)
-            said = Outcome(STOPPED if ended else "failed", "; ".join([record.cause_of(error)["what"], *getattr(error, "__notes__", [])]))
+            said = PushOutcome(
+                STOPPED if ended else "failed", "; ".join([record.cause_of(error)["what"], *getattr(error, "__notes__", [])])
+            )
         finally:
             control.now(State.ENDED)
             self._end()
@@ -250,7 +252,7 @@ class AlarmManager(RetryingStore):
         await self._tell_pushed(found.alarm, found.proposal, after, done)
         return SlotState(f"done: {done.word}", done.text)
 
-    async def _push_now(self, order: Order) -> Outcome:
+    async def _push_now(self, order: PushOrder) -> PushOutcome:
         assert self._duties.push is not None
         return await self._duties.push(order)
 
@@ -261,7 +263,7 @@ class AlarmManager(RetryingStore):
                 done = await asyncio.to_thread(in_force, self._store, self._machine, found.proposal, after) or NOTHING_YET
                 log.warning("the push was stopped with the service", word=done.word, text=done.text)
                 text = f"{done.text} (stopped with the service)"
-                await self._tell_pushed(found.alarm, found.proposal, after, Outcome(done.word, text))
+                await self._tell_pushed(found.alarm, found.proposal, after, PushOutcome(done.word, text))
         except (AbbeError, TimeoutError) as trouble:
             log.warning("the push was stopped with the service; the next start says where it stands", cause=str(trouble))
 
@@ -277,7 +279,7 @@ class AlarmManager(RetryingStore):
         for watcher in self._telling.watchers:
             watcher.job_ended(None)
 
-    async def _line(self, number: int | None, kind: Kind, doc: Doc) -> AlarmEntryRecord:
+    async def _line(self, number: int | None, kind: AlarmKind, doc: Doc) -> AlarmEntryRecord:
         """Write a line with its message and its record in the audit."""
         messages = []
         if self._telling.topic is not None and kind in CODES:
@@ -292,7 +294,7 @@ class AlarmManager(RetryingStore):
         if messages:
             self._telling.posted()
         log.warning(doc["text"], alarm=entry.alarm, kind=str(kind))
-        if kind is not Kind.HELD:
+        if kind is not AlarmKind.HELD:
             target = f"{self._machine}, alarm {entry.alarm}" if entry.alarm != NO_ALARM else self._machine
             try:
                 event = Event(this_account(), "abbe serve", target, str(kind), {"text": doc["text"]})

@@ -31,7 +31,7 @@ HEADINGS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class FleetFigure:
     """One figure of a check: value, expanded uncertainty (k = 2) and limit, in the unit at the end of its name; None: not known."""
 
     name: str
@@ -41,7 +41,7 @@ class Figure:
 
 
 @dataclass(frozen=True, slots=True)
-class Stand:
+class MachineStatus:
     """Where one machine stands: what its service does, and what its last check found.
 
     Parameters
@@ -55,7 +55,7 @@ class Stand:
     check_utc, verdict : str
         The last check; empty without one. Where its verdict is not of the table in force: ``unverified``; ``verified`` by the push that
         brought the table and was measured before and after; ``unknown``.
-    figures : tuple of Figure
+    figures : tuple of FleetFigure
         Those of the last check that are judged, in its order; none where its verdict is not of the table in force.
     verified : VerifiedBy
         What measured the table in force, or since what nothing has.
@@ -68,14 +68,14 @@ class Stand:
     heard_utc: str = ""
     check_utc: str = ""
     verdict: str = ""
-    figures: tuple[Figure, ...] = ()
+    figures: tuple[FleetFigure, ...] = ()
     next_due_utc: str = ""
     next_recipe: str = ""
     verified: VerifiedBy = field(default_factory=lambda: VerifiedBy("unknown", "never"))
 
 
 @dataclass(frozen=True, slots=True)
-class MachineLine(Stand):
+class MachineLine(MachineStatus):
     """What is known of one machine: where it stands, and what its checks say of the days ahead.
 
     Parameters
@@ -93,7 +93,7 @@ class MachineLine(Stand):
     limit_days: tuple[float, float, float] | None = None
 
 
-def stands(store: ServiceStore, now: datetime) -> list[Stand]:
+def stands(store: ServiceStore, now: datetime) -> list[MachineStatus]:
     """Where every machine of a database stands, by name. Only its last check is read, so that it costs the same after years.
 
     Parameters
@@ -125,7 +125,9 @@ def _line(store: ServiceStore, name: str, said: StationRecord | None, checks: Se
     )
 
 
-def _stand(store: ServiceStore, name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> Stand:
+def _stand(
+    store: ServiceStore, name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime
+) -> MachineStatus:
     """``checks``: newest first."""
     state = state_of(said, now)
     due = said.doc.get("due", []) if said is not None and state not in {NOT_RUNNING, NO_SERVICE} else []
@@ -133,7 +135,7 @@ def _stand(store: ServiceStore, name: str, said: StationRecord | None, checks: S
     last = next((one for one in checks if not of_push_taken_back(one)), None)
     known = verified_by(store, name)
     verdict = "" if last is None and known.holds else known.verdict("" if last is None else last.verdict)
-    return Stand(
+    return MachineStatus(
         machine=name,
         state=state,
         heard_utc=said.seen_utc if said is not None else "",
@@ -155,11 +157,11 @@ def state_of(said: StationRecord | None, now: datetime) -> str:
     return str(said.doc.get("state", NOT_RUNNING))
 
 
-def figures_of(doc: Mapping[str, Any]) -> tuple[Figure, ...]:
+def figures_of(doc: Mapping[str, Any]) -> tuple[FleetFigure, ...]:
     """The figures of a check that are judged; of a check that could not be completed there are none."""
     values, expanded = doc.get("values", {}), doc.get("uncertainties", {})
     judged = {name: limit for name, limit in doc.get("limits", {}).items() if values.get(name) is not None}
-    return tuple(Figure(name, values[name], expanded.get(name), limit) for name, limit in judged.items())
+    return tuple(FleetFigure(name, values[name], expanded.get(name), limit) for name, limit in judged.items())
 
 
 def _days(one: FigureTrend) -> tuple[float, float, float]:
@@ -175,7 +177,7 @@ def row(line: MachineLine) -> tuple[str, ...]:
     return (line.machine, state, _minute(line.check_utc), line.verdict, line.verified.text, figures, due, _limit_words(line))
 
 
-def _words(one: Figure) -> str:
+def _words(one: FleetFigure) -> str:
     expanded = "" if one.expanded is None else f" ± {one.expanded:.1f}"
     limit = "" if one.limit is None else f" (limit {one.limit:g})"
     return f"{one.name} {one.value:.1f}{expanded}{limit}"

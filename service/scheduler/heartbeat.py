@@ -25,7 +25,7 @@ MEASURING = "measuring"
 WAITING = "waiting"
 
 
-class Desk(Protocol):
+class HeartbeatDesk(Protocol):
     """The part of the store that is written here."""
 
     def put_station(self, machine: str, doc: Doc) -> None:
@@ -40,7 +40,7 @@ class Station:
     ----------
     machine, version : str
         Name of the machine; version of this program.
-    store : Desk
+    store : HeartbeatDesk
         Where to.
     next_due : callable
         The timetable's next slots.
@@ -54,7 +54,7 @@ class Station:
         self,
         machine: str,
         version: str,
-        store: Desk,
+        store: HeartbeatDesk,
         next_due: Callable[[], Sequence[tuple[Schedule, datetime]]],
         clock: Clock,
         attention: Sequence[str] = (),

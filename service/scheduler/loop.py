@@ -16,7 +16,7 @@ import structlog
 
 from abbe.service.clock import Clock
 from abbe.service.scheduler import outcomes
-from abbe.service.scheduler.ports import Carry, Doc, Errand, Errands, Ledger, Readiness, SlotState, carried_alone
+from abbe.service.scheduler.ports import Carry, Doc, Errands, FollowUp, Readiness, SlotLedger, SlotState, carried_alone
 from abbe.service.scheduler.ready import AlwaysReady
 from abbe.service.scheduler.slots import Schedule, next_slot, previous_slot, slots_after
 from abbe.service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
@@ -45,7 +45,7 @@ class Alarms(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class LoopTerms:
     """On what terms slots start.
 
     Parameters
@@ -79,7 +79,7 @@ class Scheduler:
     ----------
     schedules : sequence of Schedule
         The timetable.
-    ledger : Ledger
+    ledger : SlotLedger
         Remembers slots across restarts; its ``claim`` makes each of them run once.
     job : callable
         ``await job(schedule, slot)`` returns the state to write for the slot.
@@ -87,19 +87,19 @@ class Scheduler:
         Told of missed and skipped slots and of clock jumps.
     clock : Clock
         All waiting and all "now".
-    terms : Terms, optional
+    terms : LoopTerms, optional
         Maintenance windows, preconditions, pace.
     """
 
     def __init__(
-        self, schedules: Sequence[Schedule], ledger: Ledger, job: Job, alarms: Alarms, clock: Clock, terms: Terms | None = None
+        self, schedules: Sequence[Schedule], ledger: SlotLedger, job: Job, alarms: Alarms, clock: Clock, terms: LoopTerms | None = None
     ) -> None:
         self._schedules = tuple(schedules)
         self._ledger = ledger
         self._job = job
         self._alarms = alarms
         self._clock = clock
-        self._terms = terms or Terms()
+        self._terms = terms or LoopTerms()
         self._cursor: dict[str, datetime] = {}
         self._ahead: dict[str, Iterator[datetime]] = {}
         self._upcoming: dict[str, datetime | None] = {}
@@ -265,7 +265,7 @@ class Scheduler:
             errand.begun()
         tasks.create_task(self._run_errand(errand), name=errand.name)
 
-    async def _run_errand(self, errand: Errand) -> None:
+    async def _run_errand(self, errand: FollowUp) -> None:
         try:
             if errand.work is not None:
                 await self._terms.carry(errand)
@@ -279,7 +279,7 @@ class Scheduler:
         ended = outcomes.stopped(schedule.name, slot)
         try:
             state = await self._job(schedule, slot)
-            ended = outcomes.Outcome(state, "", state.reason if isinstance(state, SlotState) else "")
+            ended = outcomes.SlotOutcome(state, "", state.reason if isinstance(state, SlotState) else "")
         except Exception:
             ended = outcomes.broken_off(schedule.name, slot)  # a defect: the service ends with it, and nobody has stopped it
             raise
@@ -319,7 +319,7 @@ class Scheduler:
             for nap in naps:
                 nap.cancel()
 
-    async def _end(self, schedule: Schedule, slot: datetime, outcome: outcomes.Outcome, *, tell: bool = True) -> None:
+    async def _end(self, schedule: Schedule, slot: datetime, outcome: outcomes.SlotOutcome, *, tell: bool = True) -> None:
         await self._ledger.finish(schedule.name, slot, outcome.state, outcome.text)
         if tell:
             await self._tell(outcome.code, outcome.text)

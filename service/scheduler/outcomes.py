@@ -16,7 +16,7 @@ from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.waiting import Hindrance, Waiting
 
 
-class Outcome(NamedTuple):
+class SlotOutcome(NamedTuple):
     """State for the ledger, code of the alarm, sentence for both."""
 
     state: str
@@ -24,53 +24,55 @@ class Outcome(NamedTuple):
     text: str
 
 
-def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> Outcome:
+def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> SlotOutcome:
     """Nobody was there to start it in time."""
     allowed = span(timedelta(seconds=schedule.grace_s))
     how = span(late)
-    return Outcome(f"missed: {how} late", "SCH-001", f"{_slot(schedule.name, slot)} was missed: found {how} late, allowed are {allowed}")
+    return SlotOutcome(
+        f"missed: {how} late", "SCH-001", f"{_slot(schedule.name, slot)} was missed: found {how} late, allowed are {allowed}"
+    )
 
 
-def overrun(name: str, slot: datetime) -> Outcome:
+def overrun(name: str, slot: datetime) -> SlotOutcome:
     """The schedule's own check before it takes longer than the timetable has it."""
-    return Outcome("skipped: busy", "SCH-002", f"{_slot(name, slot)} was skipped: {name!r} was still running")
+    return SlotOutcome("skipped: busy", "SCH-002", f"{_slot(name, slot)} was skipped: {name!r} was still running")
 
 
-def kept_from_starting(waiting: Waiting, hindrance: Hindrance) -> Outcome:
+def kept_from_starting(waiting: Waiting, hindrance: Hindrance) -> SlotOutcome:
     """It waited as long as it may."""
     verb = hindrance.state.partition(":")[0]
     code = "SCH-002" if verb == "skipped" else "SCH-001"
-    return Outcome(hindrance.state, code, f"{_slot(waiting.schedule.name, waiting.slot)} was {verb}: {hindrance.text}")
+    return SlotOutcome(hindrance.state, code, f"{_slot(waiting.schedule.name, waiting.slot)} was {verb}: {hindrance.text}")
 
 
-def superseded(waiting: Waiting, newer: datetime) -> Outcome:
+def superseded(waiting: Waiting, newer: datetime) -> SlotOutcome:
     """It still waited when the next slot of its schedule came due."""
     text = f"{_slot(waiting.schedule.name, waiting.slot)} was skipped: slot {newer:%F %R} UTC is due as well"
     why = f"; it had to wait because {waiting.hindrance.text}" if waiting.hindrance is not None else ""
-    return Outcome("skipped: newer slot", "SCH-002", text + why)
+    return SlotOutcome("skipped: newer slot", "SCH-002", text + why)
 
 
-def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindrance | None = None) -> Outcome:
+def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindrance | None = None) -> SlotOutcome:
     """A later slot's run stands for it."""
     why = f"; it had to wait because {hindrance.text}" if hindrance is not None else ""
-    return Outcome(
+    return SlotOutcome(
         f"missed: see {by:%FT%RZ}", "SCH-005", f"{_slot(waiting_name, slot)} was missed: the run of slot {by:%F %R} UTC stands for it{why}"
     )
 
 
-def broken_off(name: str, slot: datetime) -> Outcome:
+def broken_off(name: str, slot: datetime) -> SlotOutcome:
     """The service ended, by a power cut say, while the check ran. It is not run again: nobody knows how far it got."""
-    return Outcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service ended while it ran")
+    return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service ended while it ran")
 
 
-def stopped(name: str, slot: datetime) -> Outcome:
+def stopped(name: str, slot: datetime) -> SlotOutcome:
     """The service was stopped while it was measured: said at once, or nobody would miss it before the next start."""
-    return Outcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service was stopped while it ran")
+    return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service was stopped while it ran")
 
 
-def whole_span(name: str, first: datetime, last: datetime) -> Outcome:
+def whole_span(name: str, first: datetime, last: datetime) -> SlotOutcome:
     """Too many slots to write each of them down."""
-    return Outcome(
+    return SlotOutcome(
         "missed: whole span", "SCH-004", f"{name}: every slot from {first:%F %R} to {last:%F %R} UTC was missed; they are too many to list"
     )
 

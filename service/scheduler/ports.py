@@ -97,7 +97,7 @@ Work = Callable[[Control], Awaitable[str]]
 
 
 @dataclass(frozen=True, slots=True)
-class Errand:
+class FollowUp:
     """Work that no slot asks for: it has the machine alone, as a check, and starts on a schedule's terms.
 
     ``work``: what is done under somebody's control, and how it ended; None: the schedule's check, under ``name``. ``kind``: what it is to
@@ -111,11 +111,11 @@ class Errand:
     begun: Callable[[], None] | None = None
 
 
-Carry = Callable[[Errand], Awaitable[str]]
+Carry = Callable[[FollowUp], Awaitable[str]]
 """``await carry(errand)``: does an errand's work so that people can see and steer it; returns how it ended."""
 
 
-async def carried_alone(errand: Errand) -> str:
+async def carried_alone(errand: FollowUp) -> str:
     """Do an errand's work where nobody can steer it."""
     assert errand.work is not None
     return await errand.work(Control())
@@ -124,7 +124,7 @@ async def carried_alone(errand: Errand) -> str:
 class Errands(Protocol):
     """Who knows what else is to be done."""
 
-    async def due(self) -> Errand | None:
+    async def due(self) -> FollowUp | None:
         """Return what may start now, or None."""
         ...
 
@@ -136,7 +136,7 @@ class OpenSlot(NamedTuple):
     ran: bool
 
 
-class Ledger(Protocol):
+class SlotLedger(Protocol):
     """Remembers which slots were dealt with, across restarts and across processes."""
 
     async def claim(self, schedule: str, slot_utc: datetime) -> bool:

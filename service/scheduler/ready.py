@@ -24,26 +24,26 @@ MOVED_MM = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SeenDevices:
     """One look at the devices: the controller's status, and the air's temperature where there is a laser."""
 
     status: ControllerStatus
     air_c: float | None = None
 
 
-Look = Callable[[bool], Awaitable[Seen]]
+Look = Callable[[bool], Awaitable[SeenDevices]]
 """``await look(with_air)``: opens the devices, reads, closes them."""
 
 
 def look_at(urls: DeviceUrls) -> Look:
     """Return how to look at the devices behind ``urls``. It is refused while a job has the machine."""
 
-    async def look(with_air: bool) -> Seen:
+    async def look(with_air: bool) -> SeenDevices:
         with alone(urls.cnc):
             pass  # not held: who comes to measure meanwhile must not be turned away by somebody who only looks
         async with open_session(DeviceUrls(cnc=urls.cnc, laser=urls.laser if with_air else None)) as session:
             air = (await session.laser.peek()).air_temp_c if session.laser is not None else None
-            return Seen(await session.controller.status(), air)
+            return SeenDevices(await session.controller.status(), air)
 
     return look
 
@@ -95,7 +95,7 @@ class Ready:
         except (DriverError, AbbeError, OSError) as trouble:
             return f"the devices cannot be asked: {trouble}"
 
-    def _of_devices(self, needs: Needs, seen: Seen) -> str:
+    def _of_devices(self, needs: Needs, seen: SeenDevices) -> str:
         if needs.operator == "absent" and somebody_at_work(seen.status):
             return "somebody is at the machine: the door is open, or the mode is not remote"
         if needs.idle:

@@ -17,7 +17,7 @@ import numpy as np
 from abbe.drivers.api import BarSample, ControllerStatus
 from abbe.models.arrays import F1
 from abbe.service.errors import RunInterrupted, StretchDiffers
-from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, Piece, SoFar, arc_of
+from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, RunPiece, SoFar, arc_of
 from abbe.service.sequences.steps import Point, RecordPath
 
 LEAD_S, LEAD_MM = 0.5, 5.0
@@ -95,7 +95,7 @@ class Onward:
     that has.
     """
 
-    pieces: tuple[Piece, ...]
+    pieces: tuple[RunPiece, ...]
     offset_mm: float
     whole_mm: float
     feed_mm_s: float
@@ -124,7 +124,7 @@ def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, Onwa
         return None
     ends = last if step.measured else len(arc) - 1
     rest = RecordPath(step.points_mm[begin:], step.feed_mm_min, step.rate_hz, step.direction, (twice - begin, ends - begin))
-    pieces = (*so_far.pieces[:-1], Piece(so_far.pieces[-1].run, float(arc[twice])))
+    pieces = (*so_far.pieces[:-1], RunPiece(so_far.pieces[-1].run, float(arc[twice])))
     offset = float(arc[begin])
     known = (so_far.arc_mm[on] - offset, so_far.deviation_mm[on])
     return rest, begin, Onward(pieces, offset, float(arc[-1]), feed_mm_s, *known, so_far.boot_id)

@@ -11,14 +11,14 @@ from abbe.service.sequences.interlocks import Watching, air_trouble, beam_troubl
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedTable:
     """Boot id of the controller and CRC of the active table when the campaign began."""
 
     boot_id: int
     table_crc: int
 
 
-async def check_world(session: Session, expected: Expected | None, watching: Watching, *, beam: bool) -> ControllerStatus:
+async def check_world(session: Session, expected: ExpectedTable | None, watching: Watching, *, beam: bool) -> ControllerStatus:
     """Look at everything again; gives the controller's status.
 
     Parameters
@@ -46,7 +46,7 @@ async def check_world(session: Session, expected: Expected | None, watching: Wat
     return status
 
 
-def check_expected(expected: Expected, boot_id: int, table_crc: int) -> None:
+def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> None:
     """Refuse another run of the controller, or another table.
 
     Raises

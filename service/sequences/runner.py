@@ -19,7 +19,7 @@ from abbe.service.sequences.interlocks import AT_WORK, PAUSED, PROGRAM, REMOTE, 
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.path_resume import Onward, Way
 from abbe.service.sequences.paths import BAD_BITS, OUT_BITS, bar_trouble, follow_path, record_path
-from abbe.service.sequences.preconditions import Expected
+from abbe.service.sequences.preconditions import ExpectedTable
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
 from abbe.service.sequences.steps import (
     ChangeBar,
@@ -102,7 +102,7 @@ class Runner:
         What the watcher looks at.
     journal : Journal, optional
         Where checkpoints go.
-    expected : Expected, optional
+    expected : ExpectedTable, optional
         What must not have changed when a pause ends.
     """
 
@@ -112,7 +112,7 @@ class Runner:
         control: Control | None = None,
         watching: Watching | None = None,
         journal: Journal | None = None,
-        expected: Expected | None = None,
+        expected: ExpectedTable | None = None,
     ) -> None:
         self._s = session
         self._control = control or Control()

@@ -11,7 +11,7 @@ from abbe.service.errors import BeamLost, DoorOpen, Interlock
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import CAN_CLEAR, Suspending, Watching, somebody_at_work
 from abbe.service.sequences.journal import GOES_ON, WAITS, Journal
-from abbe.service.sequences.preconditions import Expected, check_world
+from abbe.service.sequences.preconditions import ExpectedTable, check_world
 
 LOOK_S = 0.1
 NO_SIGNAL_BITS = 0b10010
@@ -19,7 +19,7 @@ NO_SIGNAL_BITS = 0b10010
 
 
 async def paused(
-    session: Session, control: Control, watching: Watching, expected: Expected | None, journal: Journal, *, beam: bool = False
+    session: Session, control: Control, watching: Watching, expected: ExpectedTable | None, journal: Journal, *, beam: bool = False
 ) -> bool:
     """Wait until a pause is taken back and everything is as it has to be; what is not is said, and the pause goes on.
 
@@ -94,7 +94,7 @@ def may_suspend(trouble: Interlock, suspending: Suspending) -> bool:
 
 
 async def suspended(
-    session: Session, control: Control, watching: Watching, expected: Expected | None, journal: Journal, trouble: Interlock
+    session: Session, control: Control, watching: Watching, expected: ExpectedTable | None, journal: Journal, trouble: Interlock
 ) -> bool:
     """Wait until a condition has cleared and all has been well for the settle time.
 

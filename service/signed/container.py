@@ -55,7 +55,7 @@ class Claims:
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedContent:
     """What the machine at hand is: the claims have to be about it. ``base`` None: not known here, then it is only told."""
 
     machine: str
@@ -79,7 +79,7 @@ def sign(claims: Claims, key: Ed25519PrivateKey) -> bytes:
     )
 
 
-def check(sealed: bytes, files: Mapping[str, bytes], expected: Expected, now: datetime) -> Claims:
+def check(sealed: bytes, files: Mapping[str, bytes], expected: ExpectedContent, now: datetime) -> Claims:
     """The claims, if all of them hold here and now.
 
     Parameters
@@ -88,7 +88,7 @@ def check(sealed: bytes, files: Mapping[str, bytes], expected: Expected, now: da
         Content of FILE.sig.
     files : mapping of str to bytes
         Names and bytes of the files as they lie there.
-    expected : Expected
+    expected : ExpectedContent
         This machine.
     now : datetime
         With time zone.

@@ -19,7 +19,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables import table_gate
 from abbe.service.tables.push_history import wanted_by
 from abbe.service.tables.table_gate import InForceNow
-from abbe.service.tables.unverified import Known, known_tables
+from abbe.service.tables.unverified import KnownState, known_tables
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
     return look
 
 
-async def _seen(controller: Controller, known: Known, chain: str, corrects: dict[int, bool]) -> InForceNow:
+async def _seen(controller: Controller, known: KnownState, chain: str, corrects: dict[int, bool]) -> InForceNow:
     """The gate's look. A table without the CRC that is stated for it is strange."""
     try:
         return await table_gate.look(controller, known, chain, corrects)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
-from abbe.service.push.entries import WORD, Entry, Journal, JournalBroken, check_chain, facts
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.entries import WORD, Journal, JournalBroken, JournalEntry, check_chain, facts
+from abbe.service.push.states import TERMINAL, PushState
 
 KIND = "rollback"
 """Kind of a table that a person ordered back."""
 STILL_ACTIVE = "the unverified table is STILL ACTIVE"
 
 
-def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
+def pushes_of(entries: list[JournalEntry]) -> dict[int, Journal]:
     """Journals of all pushes of a machine, by number; a person's word before the first is none.
 
     Raises
@@ -27,9 +27,9 @@ def pushes_of(entries: list[Entry]) -> dict[int, Journal]:
     return {n: tuple(e for e in entries if e.push == n) for n in numbers}
 
 
-def ended_as(journal: Journal) -> State:
+def ended_as(journal: Journal) -> PushState:
     """The state in which a push stands or came to its end: a person's word for a table, given later, changes nothing of that."""
-    return next((e.state for e in reversed(journal) if e.state is not State.ACCEPTED), State.ACCEPTED)
+    return next((e.state for e in reversed(journal) if e.state is not PushState.ACCEPTED), PushState.ACCEPTED)
 
 
 def push_log(journal: Journal) -> tuple[str, ...]:
@@ -37,13 +37,13 @@ def push_log(journal: Journal) -> tuple[str, ...]:
     lines = []
     for entry in journal:
         words = [str(entry.doc[key]) for key in ("why", "pending", "again", "approved_by", "probe", "verify") if entry.doc.get(key)]
-        if entry.state is State.SNAPSHOT:
+        if entry.state is PushState.SNAPSHOT:
             words = [f"bank {entry.doc['base_bank']}, CRC {entry.doc['base_crc']:08X}; to come: CRC {entry.doc['crc']:08X}"]
         lines.append(": ".join([str(entry.state), *words]) + f" ({entry.utc})")
     return tuple(lines)
 
 
-def wanted_by(entries: list[Entry]) -> tuple[int | None, bool]:
+def wanted_by(entries: list[JournalEntry]) -> tuple[int | None, bool]:
     """Return the CRC that should be in force by the entries of all pushes of a machine, in the order of writing, and whether the last push
     has come to its end. None: no push yet, or it is under way.
 
@@ -52,17 +52,17 @@ def wanted_by(entries: list[Entry]) -> tuple[int | None, bool]:
     if not entries:
         return None, True
     last = entries[-1]
-    if last.state not in TERMINAL or last.state is State.OPERATOR:
+    if last.state not in TERMINAL or last.state is PushState.OPERATOR:
         return None, False
     for entry in reversed(entries):
-        if entry.state is State.ACCEPTED:
+        if entry.state is PushState.ACCEPTED:
             return int(entry.doc["accepted_crc"]), True
-        if entry.state is State.KEEP:
+        if entry.state is PushState.KEEP:
             return int(facts(tuple(e for e in entries if e.push == entry.push))["crc"]), True
     return next((int(e.doc["base_crc"]) for e in entries if "base_crc" in e.doc), None), True
 
 
-def last_kept(entries: list[Entry], rollbacks: frozenset[int]) -> Journal:
+def last_kept(entries: list[JournalEntry], rollbacks: frozenset[int]) -> Journal:
     """The last push of a machine that was kept and can be taken back. ``rollbacks``: numbers of the tables that persons ordered back.
 
     Raises
@@ -70,7 +70,7 @@ def last_kept(entries: list[Entry], rollbacks: frozenset[int]) -> Journal:
     TableRefused
         None was kept, or it was a rollback itself.
     """
-    kept = [j for j in pushes_of(entries).values() if ended_as(j) is State.KEEP]
+    kept = [j for j in pushes_of(entries).values() if ended_as(j) is PushState.KEEP]
     if not kept:
         raise TableRefused("no push of this machine was kept: there is nothing to take back", "nothing was written")
     last = kept[-1]

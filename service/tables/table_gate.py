@@ -13,11 +13,11 @@ from abbe.service.errors import TableMismatch
 from abbe.service.push.book import StoreBook
 from abbe.service.push.entries import Doc
 from abbe.service.push.staging import SEALED
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
-from abbe.service.tables.unverified import Fine, Known, Pushed, known_tables
+from abbe.service.tables.unverified import Fine, KnownState, PushedTable, known_tables
 
 LOOK = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
 STRANGE = "a table that this database did not push"
@@ -36,7 +36,7 @@ class InForceNow:
     """
 
     status: CompStatus
-    unverified: Pushed | None
+    unverified: PushedTable | None
     strange: bool
     elsewhere: Fine | None
 
@@ -46,7 +46,7 @@ class InForceNow:
         return self.status.bank_crc[self.status.active_bank]
 
 
-async def look(controller: Controller, known: Known, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
+async def look(controller: Controller, known: KnownState, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
     """Ask the controller which table acts, and the journals which that is. Its content is read only where ``chain``, the journal of this
     control, does not say that it is right, and once for each CRC where ``corrects`` keeps what was read.
 
@@ -98,19 +98,19 @@ async def check_in_force(controller: Controller, store: Store, site: Site) -> No
         raise TableMismatch(f"the table in force (CRC {now.crc:08X}) was {now.elsewhere.not_here}", ACCEPT)
 
 
-def _journals(store: Store, site: Site) -> tuple[Known, str]:
+def _journals(store: Store, site: Site) -> tuple[KnownState, str]:
     return known_tables(store), store.push_chain(site.name, site.control)
 
 
-def _whose(store: Store, site: Site, push: Pushed) -> str:
+def _whose(store: Store, site: Site, push: PushedTable) -> str:
     if push.chain == store.push_chain(site.name, site.control) and push.machine == site.name:
         return f"push {push.push}"
     at = f" at {push.control}" if push.control and push.control != site.control else ""
     return f"push {push.push} of machine {push.machine!r}{at}"
 
 
-def _remedy(site: Site, push: Pushed) -> str:
-    if push.may_be_active and push.state != State.OPERATOR and push.machine != site.name:
+def _remedy(site: Site, push: PushedTable) -> str:
+    if push.may_be_active and push.state != PushState.OPERATOR and push.machine != site.name:
         return f"start any command with the machine file of {push.machine!r}, which takes it back; or {LOOK}"
     return LOOK
 
@@ -132,7 +132,7 @@ async def vouch(store: Store, site: Site, now: CompStatus, by: str) -> None:
     """Write a person's word for the table in force into the journal of the control, whose last push has come to its end."""
     book = await StoreBook.word(store, site.name, SystemClock(), site.control)
     journal = await book.entries()
-    await book.append(journal, State.ACCEPTED, said(now, by) | ({} if journal else {"machine": site.name, "control": site.control}))
+    await book.append(journal, PushState.ACCEPTED, said(now, by) | ({} if journal else {"machine": site.name, "control": site.control}))
 
 
 def said(now: CompStatus, by: str) -> Doc:

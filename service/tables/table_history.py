@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import read_entries
-from abbe.service.push.entries import WORD, Entry, Journal, facts
-from abbe.service.push.states import State
+from abbe.service.push.entries import WORD, Journal, JournalEntry, facts
+from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import KIND, last_kept, pushes_of, wanted_by
 from abbe.service.tables.push_outcome import BACK, Names, outcome_of
@@ -38,7 +38,7 @@ class PushTold:
 
 
 @dataclass(frozen=True, slots=True)
-class Now:
+class CurrentTable:
     """The table in force by the journal.
 
     ``crc``: None where nobody knows, ``text`` says why. ``how``: "verified" by a measurement, "ordered" back by a person without one,
@@ -53,7 +53,7 @@ class Now:
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
+class RollbackOffer:
     """What can be ordered back: the table of ``push`` (CRC ``crc``) goes, the one with ``to_crc`` comes."""
 
     push: int
@@ -65,9 +65,9 @@ class Offer:
 class Story:
     """Everything of a machine's tables. ``offer``: None where nothing can be taken back, ``refusal`` says why."""
 
-    now: Now
+    now: CurrentTable
     pushes: tuple[PushTold, ...]
-    offer: Offer | None
+    offer: RollbackOffer | None
     refusal: str
 
 
@@ -89,7 +89,7 @@ def story(store: Store, machine: str, control: str = "") -> Story:
     return Story(_now(entries, told), tuple(reversed(told)), offer, refusal)
 
 
-def offered(store: Store, machine: str, control: str = "") -> Offer:
+def offered(store: Store, machine: str, control: str = "") -> RollbackOffer:
     """What can be ordered back now, by the journal (`story`).
 
     Raises
@@ -102,7 +102,7 @@ def offered(store: Store, machine: str, control: str = "") -> Offer:
     return offer_of(read_entries(store, machine, control), _rollbacks({table.id: table.doc for table in store.tables()}))
 
 
-def offer_of(entries: list[Entry], rollbacks: frozenset[int]) -> Offer:
+def offer_of(entries: list[JournalEntry], rollbacks: frozenset[int]) -> RollbackOffer:
     """The same of entries that were read. ``rollbacks``: numbers of tables that were ordered back."""
     if not entries:
         raise TableRefused("no push of this machine is in the journal: there is nothing to take back", "nothing was written")
@@ -117,7 +117,7 @@ def offer_of(entries: list[Entry], rollbacks: frozenset[int]) -> Offer:
             f"the table in force ({crc:08X}) is not the one of push {last[-1].push}, the last that was kept",
             "say which with abbe comp rollback MACHINE.toml --to PUSH; nothing was written",
         )
-    return Offer(last[-1].push, crc, int(known["base_crc"]))
+    return RollbackOffer(last[-1].push, crc, int(known["base_crc"]))
 
 
 def _rollbacks(docs: Mapping[int, Doc]) -> frozenset[int]:
@@ -133,7 +133,7 @@ def _told(journal: Journal, doc: Doc) -> PushTold:
     kind = str(doc.get("kind", "push"))
     outcome = outcome_of(journal, BACK if kind == KIND else Names())
     # What was in force when it ended need not be now: of a push that has ended only the cause is told.
-    ended = {State.KEEP: "verify", State.ROLLED_BACK: "why", State.ABORTED: "why"}.get(last.state)
+    ended = {PushState.KEEP: "verify", PushState.ROLLED_BACK: "why", PushState.ABORTED: "why"}.get(last.state)
     text = outcome.text if ended is None else str(known.get(ended, ""))
     proposal = doc.get("proposal")
     by, reason = str(known.get("approved_by", "")), str(doc.get("reason", ""))
@@ -143,18 +143,18 @@ def _told(journal: Journal, doc: Doc) -> PushTold:
     )  # fmt: skip
 
 
-def _now(entries: list[Entry], told: tuple[PushTold, ...]) -> Now:
+def _now(entries: list[JournalEntry], told: tuple[PushTold, ...]) -> CurrentTable:
     crc, settled = wanted_by(entries)
     if not entries:
-        return Now(None, "", 0, "", "no push of this machine is in the journal")
+        return CurrentTable(None, "", 0, "", "no push of this machine is in the journal")
     if crc is None or not settled:
-        return Now(None, "", told[-1].push, told[-1].ended, told[-1].text)
+        return CurrentTable(None, "", told[-1].push, told[-1].ended, told[-1].text)
     for entry in reversed(entries):
         if entry.push == WORD:
-            return Now(crc, "accepted", 0, entry.utc, "a person vouches for the table that was there before the first push")
+            return CurrentTable(crc, "accepted", 0, entry.utc, "a person vouches for the table that was there before the first push")
         one = next(t for t in told if t.push == entry.push)
-        if entry.state is State.ACCEPTED and int(entry.doc["accepted_crc"]) == crc:
-            return Now(crc, "accepted", one.push, entry.utc, one.text)
-        if entry.state is State.KEEP and one.crc == crc:
-            return Now(crc, "ordered" if one.kind == KIND else "verified", one.push, entry.utc, one.text)
-    return Now(crc, "before", 0, "", "it was there before the first push")
+        if entry.state is PushState.ACCEPTED and int(entry.doc["accepted_crc"]) == crc:
+            return CurrentTable(crc, "accepted", one.push, entry.utc, one.text)
+        if entry.state is PushState.KEEP and one.crc == crc:
+            return CurrentTable(crc, "ordered" if one.kind == KIND else "verified", one.push, entry.utc, one.text)
+    return CurrentTable(crc, "before", 0, "", "it was there before the first push")

@@ -11,8 +11,8 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from abbe.service.push.entries import Entry
-from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, State
+from abbe.service.push.entries import JournalEntry
+from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.storage.records import Doc, PushEntryRecord
 from abbe.service.storage.store import Store
 
@@ -22,7 +22,7 @@ Row = tuple[Hashable, str, Doc]
 
 
 @dataclass(frozen=True, slots=True)
-class Pushed:
+class PushedTable:
     """A push as all journals tell it: under which machine's name, into which control (empty: not noted), and where it stands.
 
     ``chain``: name of its journal.
@@ -37,7 +37,7 @@ class Pushed:
     @property
     def open(self) -> bool:
         """It has not come to its end, or a person has to look."""
-        return self.state not in TERMINAL or self.state == State.OPERATOR
+        return self.state not in TERMINAL or self.state == PushState.OPERATOR
 
     @property
     def may_be_active(self) -> bool:
@@ -66,16 +66,16 @@ class Fine:
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownState:
     """Tables by their CRC, over all journals of a database.
 
     ``unverified``: which push brought it; ``seen``: every table that a push brought or found in force, or that a person vouched for;
     ``pushed``: the last push of each; ``fine``: in which journals it is right, and why.
     """
 
-    unverified: dict[int, Pushed]
+    unverified: dict[int, PushedTable]
     seen: frozenset[int]
-    pushed: dict[int, Pushed]
+    pushed: dict[int, PushedTable]
     fine: dict[int, dict[str, Fine]]
 
     def elsewhere(self, crc: int, chain: str) -> Fine | None:
@@ -84,33 +84,33 @@ class Known:
         return None if chain in where else max(where.values(), key=lambda one: (one.how == "verified", one.utc), default=None)
 
 
-def known_tables(store: Store) -> Known:
+def known_tables(store: Store) -> KnownState:
     """Read the journals of all machines, without the images in them."""
     marks = store.push_marks()
     unverified = _unverified([((m.machine, m.push), m.state, m.doc) for m in marks])
-    last: dict[Hashable, Pushed] = {}
+    last: dict[Hashable, PushedTable] = {}
     crc: dict[Hashable, int] = {}
     fine: dict[int, dict[str, Fine]] = {}
     seen: set[int] = set()
     for mark in marks:
         key, doc = (mark.machine, mark.push), mark.doc
         named = (last[key].machine, last[key].control) if key in last else (doc.get("machine", mark.machine), doc.get("control", ""))
-        last[key] = Pushed(mark.machine, mark.push, mark.state, str(named[0]), str(named[1]))
+        last[key] = PushedTable(mark.machine, mark.push, mark.state, str(named[0]), str(named[1]))
         seen.update(int(doc[name]) for name in ("base_crc", "crc", "accepted_crc") if name in doc)
-        if mark.state == State.SNAPSHOT and "crc" in doc:
+        if mark.state == PushState.SNAPSHOT and "crc" in doc:
             base = int(doc["base_crc"])
             if base in fine or base not in crc.values():
                 _add(fine, base, "found in force", last[key], mark)
             crc[key] = int(doc["crc"])
-        elif mark.state == State.KEEP and key in crc:
+        elif mark.state == PushState.KEEP and key in crc:
             _add(fine, crc[key], "verified", last[key], mark)
         elif "accepted_crc" in doc:
             _add(fine, int(doc["accepted_crc"]), "accepted", last[key], mark)
     pushed = {number: last[key] for key, number in crc.items()}
-    return Known({number: last[key] for number, key in unverified.items()}, frozenset(seen), pushed, fine)
+    return KnownState({number: last[key] for number, key in unverified.items()}, frozenset(seen), pushed, fine)
 
 
-def _add(fine: dict[int, dict[str, Fine]], crc: int, how: How, push: Pushed, mark: PushEntryRecord) -> None:
+def _add(fine: dict[int, dict[str, Fine]], crc: int, how: How, push: PushedTable, mark: PushEntryRecord) -> None:
     """Note why a table is right in a journal; that a later push found it in force says less than what is there."""
     one = Fine(how, push.machine, push.push, mark.utc, str(mark.doc.get("by", "")) if how == "accepted" else "")
     where, chain = fine.setdefault(crc, {}), push.chain
@@ -118,7 +118,7 @@ def _add(fine: dict[int, dict[str, Fine]], crc: int, how: How, push: Pushed, mar
         where[chain] = one
 
 
-def unverified_crcs(entries: Sequence[Entry]) -> dict[int, int]:
+def unverified_crcs(entries: Sequence[JournalEntry]) -> dict[int, int]:
     """Which tables of one journal were neither kept nor vouched for: CRC -> number of the push."""
     found = _unverified([(e.push, e.state, e.doc) for e in entries])
     return {crc: push for crc, push in found.items() if isinstance(push, int)}
@@ -130,14 +130,14 @@ def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
     pushed: dict[Hashable, int] = {}
     fine: set[int] = set()
     for push, state, doc in rows:
-        if state == State.SNAPSHOT and "crc" in doc:
+        if state == PushState.SNAPSHOT and "crc" in doc:
             base, crc = int(doc["base_crc"]), int(doc["crc"])
             if base not in candidates:
                 fine.add(base)
             pushed[push] = crc
             candidates.setdefault(crc, push)
-        elif state == State.KEEP and push in pushed:
+        elif state == PushState.KEEP and push in pushed:
             fine.add(pushed[push])
-        elif state == State.ACCEPTED and "accepted_crc" in doc:
+        elif state == PushState.ACCEPTED and "accepted_crc" in doc:
             fine.add(int(doc["accepted_crc"]))
     return {crc: push for crc, push in candidates.items() if crc not in fine}

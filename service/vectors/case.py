@@ -18,13 +18,13 @@ Shape = tuple[int | None, ...]
 LAYOUT = "compare the file with the layout of shared/vectors"
 
 
-class Seen(set[Path]):
+class VectorResult(set[Path]):
     """Paths of the numbers of a file that were read so far, and the last part that was looked at, for messages."""
 
     last: Path = ()
 
 
-class Case:
+class VectorCase:
     """One object, list or number of a vector file.
 
     Parameters
@@ -34,10 +34,10 @@ class Case:
     seen : paths of the numbers read so far, shared by all parts of a file
     """
 
-    def __init__(self, value: Any, path: Path, seen: Seen | None = None) -> None:
+    def __init__(self, value: Any, path: Path, seen: VectorResult | None = None) -> None:
         self.value = value
         self.path = path
-        self._seen = Seen() if seen is None else seen
+        self._seen = VectorResult() if seen is None else seen
 
     @property
     def label(self) -> str:
@@ -49,7 +49,7 @@ class Case:
         """Part of the file that was looked at last."""
         return "/".join(str(p) for p in self._seen.last or self.path)
 
-    def at(self, *keys: str | int) -> Case:
+    def at(self, *keys: str | int) -> VectorCase:
         """Part under nested keys or indices.
 
         Raises
@@ -65,7 +65,7 @@ class Case:
                 where = "/".join(str(p) for p in (*self.path, *keys[:k]))
                 raise FileFormatError(f"{where}: {key!r} is missing", LAYOUT) from None
         self._seen.last = (*self.path, *keys)
-        return Case(here, (*self.path, *keys), self._seen)
+        return VectorCase(here, (*self.path, *keys), self._seen)
 
     def has(self, key: str) -> bool:
         """Whether an object holds a key."""
@@ -85,12 +85,12 @@ class Case:
             raise FileFormatError(f"{self.label}: expected at least one key, the object is empty", LAYOUT)
         return list(self.value)
 
-    def items(self) -> Iterator[tuple[str, Case]]:
+    def items(self) -> Iterator[tuple[str, VectorCase]]:
         """Key and part of an object, in file order; never of an empty one."""
         for key in self.keys():
             yield key, self.at(key)
 
-    def named(self, *names: str) -> Iterator[tuple[str, Case]]:
+    def named(self, *names: str) -> Iterator[tuple[str, VectorCase]]:
         """Key and part of an object that must have these keys and no others, in the order of ``names``.
 
         Raises
@@ -104,7 +104,7 @@ class Case:
         for name in names:
             yield name, self.at(name)
 
-    def parts(self, *, or_none: bool = False) -> list[Case]:
+    def parts(self, *, or_none: bool = False) -> list[VectorCase]:
         """Elements of a list.
 
         Raises

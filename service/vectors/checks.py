@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 
 Unit = Literal["mm", "rad", "1"]
 LIMIT: dict[str, float] = {"mm": 1e-9, "rad": 1e-12, "1": np.inf}
@@ -94,7 +94,7 @@ class Checks:
         self,
         name: str,
         computed: ArrayLike,
-        stored: Case,
+        stored: VectorCase,
         *,
         unit: Unit,
         floor: float = 1e-15,
@@ -109,7 +109,7 @@ class Checks:
             Quantity; the same name in every case of a file.
         computed : array_like
             From the public functions, using the inputs of the case only.
-        stored : Case
+        stored : VectorCase
             The part of the file that holds the expected value.
         unit : "mm" | "rad" | "1"
         floor : float
@@ -122,7 +122,7 @@ class Checks:
         self._compare(self.quantities, Quantity(name, unit, floor, rounding, relative), computed, stored)
 
     def check_form(
-        self, name: str, expected: ArrayLike, stored: Case, *, unit: Unit = "1", floor: float = 1e-18, rounding: str = ""
+        self, name: str, expected: ArrayLike, stored: VectorCase, *, unit: Unit = "1", floor: float = 1e-18, rounding: str = ""
     ) -> None:
         """Check numbers that nothing computes against the form that they must have: digits of print, a rotation, a grid.
 
@@ -135,7 +135,7 @@ class Checks:
         """
         self._compare(self.forms, Quantity(name, unit, floor, rounding, 0.0), expected, stored)
 
-    def _compare(self, known: dict[str, Quantity], this: Quantity, computed: ArrayLike, stored: Case) -> None:
+    def _compare(self, known: dict[str, Quantity], this: Quantity, computed: ArrayLike, stored: VectorCase) -> None:
         q = known.setdefault(this.name, this)
         if this.unit != q.unit:
             raise TypeError(f"{self.file}: {q.name} is compared in {q.unit} and in {this.unit}")
@@ -168,7 +168,7 @@ class Checks:
         if text not in self.assumptions:
             self.assumptions.append(text)
 
-    def leave_out(self, name: str, part: Case, why: str) -> None:
+    def leave_out(self, name: str, part: VectorCase, why: str) -> None:
         """State that numbers of a file cannot be computed from its inputs, and why."""
         self.not_computable.append(NotComputable(name, part.skip(), why))
 

@@ -8,7 +8,7 @@ from abbe.models.papers.kwon.frames import best_fit_errors, nearest_rotation, th
 from abbe.models.papers.kwon.geometry import PER_LEG, Geometry
 from abbe.models.papers.kwon.kinematics import forward, forward_as_printed, inverse, jacobian, square_commands
 from abbe.models.papers.kwon.sensitivity import parameter_jacobian
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 
 HALF_MM = 1.0
@@ -18,7 +18,7 @@ MIDDLE_MM = 1.0
 ROOTS = "roots of 1e4 mm2"
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare everything that the file's own inputs determine."""
     geometry = _geometry(case.at("geometry"))
     for part in case.at("fk").parts():
@@ -35,12 +35,12 @@ def read(case: Case, checks: Checks) -> None:
     _frame(case.at("frame"), checks)
 
 
-def _geometry(part: Case) -> Geometry:
+def _geometry(part: VectorCase) -> Geometry:
     names = {"R": "R_mm", "r": "r_mm", "l": "l_mm", "lup": "l_up_mm", "ldw": "l_dw_mm", "theta": "theta_rad", "le": "le_mm"}
     return Geometry(**{field: part.number(name) for name, field in names.items()})  # type: ignore[arg-type]
 
 
-def _pose(geometry: Geometry, part: Case, checks: Checks) -> None:
+def _pose(geometry: Geometry, part: VectorCase, checks: Checks) -> None:
     command, p = part.array("lambda", shape=(3,))[None], part.array("P", shape=(3,))[None]
     checks.compare("forward solution", forward(geometry, command)[0], part.at("P"), unit="mm", floor=2e-13, rounding=ROOTS)
     for name in ("ik", "lambda"):  # the inverse solution has to return the command
@@ -50,14 +50,14 @@ def _pose(geometry: Geometry, part: Case, checks: Checks) -> None:
     checks.compare("(4) as printed", printed, part.at("P_printed_eq4"), unit="mm", floor=4e-13, rounding=ROOTS)
 
 
-def _example(geometry: Geometry, part: Case, checks: Checks) -> None:
+def _example(geometry: Geometry, part: VectorCase, checks: Checks) -> None:
     command = part.array("lambda", shape=(3,))[None]
     checks.compare("forward solution", forward(geometry, command)[0], part.at("P"), unit="mm", floor=2e-13, rounding=ROOTS)
     printed = forward_as_printed(geometry, command)[0]
     checks.compare("(4) as printed", printed, part.at("P_printed"), unit="mm", floor=4e-13, rounding=ROOTS)
 
 
-def _frame(part: Case, checks: Checks) -> None:
+def _frame(part: VectorCase, checks: Checks) -> None:
     nominal3, measured3 = part.array("nominal3", shape=(3, 3)), part.array("measured3", shape=(3, 3))
     targets, measured = part.array("targets", shape=(None, 3)), part.array("measured", shape=(None, 3))
     sides = "differences of 300-mm coordinates over 2 mm"
@@ -71,7 +71,7 @@ def _frame(part: Case, checks: Checks) -> None:
     _truth(part.at("T_pm_to_cmm"), checks)
 
 
-def _truth(part: Case, checks: Checks) -> None:
+def _truth(part: VectorCase, checks: Checks) -> None:
     """The placement behind the measured points: a rotation it must be; where it stands only the unknown machine errors could tell."""
     rotation = part.array(shape=(4, 4))[:3, :3]
     for i, row in enumerate(nearest_rotation(rotation)):

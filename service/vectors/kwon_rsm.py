@@ -23,7 +23,7 @@ from abbe.models.papers.kwon.layout import layout
 from abbe.models.papers.kwon.surface import fit_surface
 from abbe.models.papers.kwon.terms import IN_PLANE
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
 DIGITS = 4
@@ -46,7 +46,7 @@ NEAR_MM = 1e-3
 PRINT = "quotient of two numbers of four digits"
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare everything that the file's own inputs determine."""
     keys = case.keys()
     found = {key.split("@")[0] for key in keys if "@Z=" in key} | {key.removeprefix("table2 ") for key in keys if key.startswith("table2 ")}
@@ -61,7 +61,7 @@ def read(case: Case, checks: Checks) -> None:
     _anova(case.at("anova_vector"), checks)
 
 
-def _three_numbers(key: str, part: Case) -> tuple[float, float, float]:
+def _three_numbers(key: str, part: VectorCase) -> tuple[float, float, float]:
     """Both degrees of freedom and the level of a key such as ``F(9,71,.01)``."""
     match = re.fullmatch(r"F\((\d+),(\d+),(0?\.\d+)\)", key)
     if match is None:
@@ -69,7 +69,7 @@ def _three_numbers(key: str, part: Case) -> tuple[float, float, float]:
     return float(match[1]), float(match[2]), float(match[3])
 
 
-def _planes(case: Case, component: str, checks: Checks) -> None:
+def _planes(case: VectorCase, component: str, checks: Checks) -> None:
     """Coefficients and sums of one component on the implied and on the printed plane."""
     implied, printed = (_find(case, component, word) for word in ("implied", "printed"))
     z_implied = case.number("implied_plane_Z")
@@ -88,21 +88,21 @@ def _planes(case: Case, component: str, checks: Checks) -> None:
             )
 
 
-def _find(case: Case, component: str, word: str) -> Case:
+def _find(case: VectorCase, component: str, word: str) -> VectorCase:
     for key, part in case.items():
         if key.startswith(f"{component}@Z=") and word in key:
             return part
     raise FileFormatError(f"{case.label}: {component} has no {word} plane", LAYOUT)
 
 
-def _sums(part: Case, checks: Checks) -> None:
+def _sums(part: VectorCase, checks: Checks) -> None:
     sums = grid_sums(np.array([part.number("coef", in_plane_label(t)) for t in IN_PLANE]))
     checks.compare("largest on the grid, um", sums.largest * UM, part.at("max_um"), unit="1", floor=1e-13)
     checks.compare("sum of squares about the mean", sums.ss_mean, part.at("ss_mean"), unit="1", floor=1e-16)
     checks.compare("sum of squares about zero", sums.ss_zero, part.at("ss_zero"), unit="1", floor=1e-16)
 
 
-def _ranks(case: Case, checks: Checks) -> None:
+def _ranks(case: VectorCase, checks: Checks) -> None:
     for key in PLANES:
         case.at(key)
     for key, part in case.items():
@@ -113,7 +113,7 @@ def _ranks(case: Case, checks: Checks) -> None:
             checks.compare("rank of 20 monomials", layout(points).rank, part, unit="1")
 
 
-def _table2(part: Case, checks: Checks) -> None:
+def _table2(part: VectorCase, checks: Checks) -> None:
     ss_reg, ss_res = REGRESSION_DOF * part.number("SSR/20"), RESIDUAL_DOF * part.number("SSE/60")
     for key, factor in (("SSR/20", REGRESSION_DOF), ("SSE/60", RESIDUAL_DOF)):
         checks.check_form("sums as printed", _printed(factor * part.number(key)) / factor, part.at(key))
@@ -142,7 +142,7 @@ def _table2(part: Case, checks: Checks) -> None:
     checks.compare("Table 2, F_printed", nearest, part.at("F_printed"), unit="1", floor=0.0, relative=NEAR_F, rounding=rounding)
 
 
-def _anova(part: Case, checks: Checks) -> None:
+def _anova(part: VectorCase, checks: Checks) -> None:
     xy, y = part.array("xy", shape=(None, 2)), part.array("y", shape=(None,))
     surface = fit_surface(np.column_stack([xy, np.zeros(xy.shape[0])]), y)
     grid = square_grid()[:, :2]

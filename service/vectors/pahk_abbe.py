@@ -9,10 +9,10 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.line_fit import straight_line
 from abbe.models.notation.pahk import pahk_type
-from abbe.models.papers.pahk.offset import Setup, as_measured, refer_to_origin
+from abbe.models.papers.pahk.offset import OffsetSetup, as_measured, refer_to_origin
 from abbe.models.papers.pahk.tables import ParameterTables, Triple
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.pahk_parameters import AXES, squareness
 
@@ -24,7 +24,7 @@ FLOORS = {"positioning": (1.2e-13, SUBTRACTED, LAST), "straightness": (1e-16, LI
 FLOOR_RAD = 2e-19
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare what the file's "measured" and "true" values hold, in both directions."""
     length = case.array("L", shape=(3,))
     for name, part in case.at("types").items():
@@ -35,7 +35,7 @@ def read(case: Case, checks: Checks) -> None:
         _machine(name, part, length, grid, checks)
 
 
-def _machine(name: str, part: Case, length: F1, grid: F2, checks: Checks) -> None:
+def _machine(name: str, part: VectorCase, length: F1, grid: F2, checks: Checks) -> None:
     kind, offset = pahk_type(name), part.array("offset", shape=(3,))
     truth = ParameterTables(
         (grid[0], grid[1], grid[2]),
@@ -43,7 +43,7 @@ def _machine(name: str, part: Case, length: F1, grid: F2, checks: Checks) -> Non
         _three(lambda j: _cubic(grid[j] / length[j], _coefficients(part, "E", j))),
         squareness(part.at("squareness_true")),
     )
-    setup = Setup(offset)
+    setup = OffsetSetup(offset)
     still = np.stack([_cubic(offset[j : j + 1] / length[j], _coefficients(part, "E", j))[0] for j in range(3)])
     seen = as_measured(kind, truth, setup, still)
     measured = ParameterTables(truth.positions_mm, _tables(part.at("measured")), truth.e_rad, squareness(part.at("squareness_measured")))
@@ -67,7 +67,7 @@ def _three(of_axis: Callable[[int], F2]) -> Triple:
     return of_axis(0), of_axis(1), of_axis(2)
 
 
-def _coefficients(part: Case, key: str, axis: int) -> F2:
+def _coefficients(part: VectorCase, key: str, axis: int) -> F2:
     """c1, c2, c3 of the three directions of an axis, shape (3 directions, 3)."""
     return np.stack([part.array("coef", key, direction + AXES[axis], shape=(3,)) for direction in AXES])
 
@@ -87,5 +87,5 @@ def _translations(x: F1, length: float, coefficients: F2, axis: int) -> F2:
     return d
 
 
-def _tables(part: Case) -> Triple:
+def _tables(part: VectorCase) -> Triple:
     return _three(lambda j: np.stack([part.array(direction + AXES[j], shape=(None,)) for direction in AXES], axis=1))

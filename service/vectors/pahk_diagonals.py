@@ -8,14 +8,14 @@ from abbe.models.arrays import F2
 from abbe.models.notation.pahk import pahk_type
 from abbe.models.papers.pahk.diagonals import space_diagonals
 from abbe.models.papers.pahk.tables import ParameterTables, Triple
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.pahk_parameters import pair, squareness
 
 SUBTRACTED = "two lengths of 1142 mm were subtracted"
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare both forms of every diagonal; every function is zero at the start of its axis and as given at the full travel."""
     volume = case.array("volume", shape=(3,))
     for name, part in case.at("types").items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abbe.models.notation.pahk import pahk_type
 from abbe.models.papers.pahk.random_errors import RandomErrors, parameter_jacobian, printed_eq5_mm, quadrature_mm
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.pahk_parameters import pair, squareness
 
@@ -15,7 +15,7 @@ PRINTED_TYPE = "MB1"
 """P (5) is printed for this machine: its cases must have it."""
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare RX, RY, RZ of every case; the coverage factor is the inputs', whatever it is."""
     for name, part in case.at("types").items():
         for point in part.parts():

@@ -7,7 +7,7 @@ import numpy as np
 from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, pahk_type
 from abbe.models.papers.pahk.volume_map import Form, chain_deviation_mm
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.pahk_parameters import pair, squareness
 
@@ -20,7 +20,7 @@ FORMS: dict[str, tuple[Form, float, str]] = {
 """Key of the file, form of the chain, rounding of the stored number in mm and its reason."""
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare every deviation of every type."""
     for name, part in case.at("types").items():
         kind = pahk_type(name)
@@ -32,7 +32,7 @@ def read(case: Case, checks: Checks) -> None:
             _point(kind, point, checks)
 
 
-def _point(kind: PahkType, point: Case, checks: Checks) -> None:
+def _point(kind: PahkType, point: VectorCase, checks: Checks) -> None:
     axes = point.array("X", shape=(3,))[None]
     machine = pahk_machine(kind, np.array([[0.0, 1.0]] * 3), point.array("probe", shape=(3,)))
     motions = motions_from_pahk(kind, axes, pair(point, "d")[None], pair(point, "E")[None], squareness(point))

@@ -10,7 +10,7 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.functions.line_fit import slope_through_origin, straight_line
 from abbe.models.papers.pahk.squareness_only import squareness_diagonals_mm
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 
 DECIMALS_UM = 1
@@ -29,7 +29,7 @@ TYPES = {"pahk_A": "MB1", "pahk_B": "MH2"}
 """Pahk's machines (section 4); where only squareness acts, all types with X on the tool side give the same diagonals."""
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare everything that the file's own inputs determine."""
     _table3(case, checks)
     _table2(case.at("table2"), checks)
@@ -38,7 +38,7 @@ def read(case: Case, checks: Checks) -> None:
         _pahk(case.at(name), TYPES.get(name, "MB1"), checks)
 
 
-def _table3(case: Case, checks: Checks) -> None:
+def _table3(case: VectorCase, checks: Checks) -> None:
     x, laser, bar = (case.array(key, shape=(None,)) for key in ("x", "laser_um", "ballbar_um"))
     slope_bar = case.number("table2", "dxx", 1)
     column = np.round(slope_bar * x * 1e3, DECIMALS_UM)
@@ -52,7 +52,7 @@ def _table3(case: Case, checks: Checks) -> None:
     checks.compare("intercept of the ordinary line, um", intercept, case.at("intercept_um"), unit="1", floor=5e-14, rounding=sums)
 
 
-def _table2(table: Case, checks: Checks) -> None:
+def _table2(table: VectorCase, checks: Checks) -> None:
     for name, row in table.named(*ROWS):
         laser, bar, difference = row.array(shape=(3,))
         sign = -1.0 if name in REVERSED else 1.0
@@ -62,7 +62,7 @@ def _table2(table: Case, checks: Checks) -> None:
         checks.check_form("five digits as printed", _as_printed(row.array()), row, floor=1e-20, rounding="decimal as float64")
 
 
-def _pahk(part: Case, type_name: str, checks: Checks) -> None:
+def _pahk(part: VectorCase, type_name: str, checks: Checks) -> None:
     volume, squareness = part.array("volume", shape=(3,)), part.array("squareness_xy_xz_yz", shape=(3,))
     diagonals = squareness_diagonals_mm(type_name, volume, squareness)
     for name, stored in part.at("squareness_only_um").named(*diagonals):

@@ -11,7 +11,7 @@ from abbe.models.arrays import F1
 from abbe.models.papers.probe.calibration import calibrate
 from abbe.models.papers.probe.combined import combined_deviation_mm, printed_eq17_mm
 from abbe.models.papers.probe.frame import direction, direction_angles, probe_frame, to_probe
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 
 Lobe = Callable[[F1, F1], F1]
@@ -21,7 +21,7 @@ LOBE = re.compile(rf"lobe\(ph,th\)={NUMBER} sin\(ph\)\^2 cos\(3th\+{NUMBER}\)\+{
 COORDINATES = "coordinates of up to 150 mm were subtracted"
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Compare everything in the file."""
     for part in case.at("directions").parts():
         _direction(part, checks)
@@ -45,7 +45,7 @@ def stated_lobe(note: str) -> Lobe | None:
     return lobe
 
 
-def _direction(part: Case, checks: Checks) -> None:
+def _direction(part: VectorCase, checks: Checks) -> None:
     frame = probe_frame(part.array("A"), part.array("B"))
     checks.compare("Tp", frame, part.at("Tp"), unit="1", floor=4e-16)
     seen = to_probe(frame, part.array("n_machine", shape=(3,)))
@@ -55,7 +55,7 @@ def _direction(part: Case, checks: Checks) -> None:
     checks.compare("longitude", longitude, part.at("longitude"), unit="rad", floor=2e-15)
 
 
-def _sphere(part: Case, lobe: Lobe | None, checks: Checks) -> None:
+def _sphere(part: VectorCase, lobe: Lobe | None, checks: Checks) -> None:
     centres, angles = part.array("ball_centres", shape=(None, 3)), part.array("colat_lon", shape=(None, 2))
     middle, normal = part.array("centre", shape=(3,)), direction(angles[:, 0], angles[:, 1])
     away = np.linalg.norm(centres - middle, axis=1)
@@ -81,7 +81,7 @@ def _sphere(part: Case, lobe: Lobe | None, checks: Checks) -> None:
         checks.compare(name, value, part.at(key), unit="mm", floor=5e-14, rounding=COORDINATES)
 
 
-def _combined(part: Case, lobe: Lobe | None, checks: Checks) -> None:
+def _combined(part: VectorCase, lobe: Lobe | None, checks: Checks) -> None:
     n, off = part.array("n_outward", shape=(3,)), part.array("Delta", shape=(3,))
     frame = probe_frame(part.array("A"), part.array("B"))
     if lobe is None:

@@ -27,10 +27,10 @@ from abbe.service.vectors import (
     yang_ranks,
     yang_volumetric,
 )
-from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
-Reader = Callable[[Case, Checks], None]
+Reader = Callable[[VectorCase, Checks], None]
 
 READERS: dict[str, Reader] = {
     "pahk_abbe.json": pahk_abbe.read,
@@ -77,7 +77,7 @@ def examine(path: Path) -> Checks:
 def _read(path: Path, checks: Checks) -> None:
     if path.name not in READERS:
         raise FileFormatError(f"{path}: there is no reader for this name", f"known names: {', '.join(READERS)}")
-    case = Case(_document(path), (path.name,))
+    case = VectorCase(_document(path), (path.name,))
     try:
         # What cannot be computed is a deviation in the answer and not a line of numpy's on stderr.
         with np.errstate(all="ignore"), warnings.catch_warnings():

@@ -8,7 +8,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.monomials import ErrorArrays, monomials
-from abbe.models.papers.wang.experiments import Plan, distance_errors_mm, interpolated_mm, problem, readings
+from abbe.models.papers.wang.experiments import WangPlan, distance_errors_mm, interpolated_mm, problem, readings
 from abbe.models.papers.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm
 from abbe.models.papers.wang.model import displacement_eq11, exact_positions_mm, monomial_field
 from abbe.models.papers.wang.squareness import AcuteSquareness, diagonal_totals_eq12, squareness_eq13_printed
@@ -17,7 +17,7 @@ from abbe.models.solvers.designs import ranks, shortest_solution
 from abbe.models.solvers.step_diagonal import closure_mm, demeaned, increments, squareness_contrast, wang_eq7, wang_four
 from abbe.models.volumetric import volume_grid
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
 # wang_step_diagonal.json, last parts: plans behind its ranks, and its demonstration of what compensation leaves (math.md 5.5).
@@ -27,15 +27,15 @@ RANK_STEPS = 20
 RANK_POSITIONS = 20
 """math.md 4.6 has 20 steps; with 20 positions per line, and only so, all effective ranks of the file come out."""
 ORDERS2 = ("XYZ", "ZYX")
-RANK_PLANS: dict[str, Callable[[F1], Plan]] = {
-    "ideal mirror": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS, tilts=False),
-    "8 tilt unknowns": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS),
-    "8 tilt + linear laser X": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS, axes="X"),
-    "8 tilt + linear laser X,Y": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS, axes="XY"),
-    "8 tilt + linear laser X,Y,Z": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS, axes="XYZ"),
-    "two orders XYZ,ZYX, 16 tilt": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS, ORDERS2),
-    "two orders + linear X,Y,Z, 16 tilt": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS, ORDERS2, axes="XYZ"),
-    "two orders + linear XYZ on 2 edges, 16 tilt": lambda t: Plan(t, RANK_STEPS, RANK_POSITIONS, ORDERS2, axes="XYZ", edges=(0, 1)),
+RANK_PLANS: dict[str, Callable[[F1], WangPlan]] = {
+    "ideal mirror": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, tilts=False),
+    "8 tilt unknowns": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS),
+    "8 tilt + linear laser X": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, axes="X"),
+    "8 tilt + linear laser X,Y": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, axes="XY"),
+    "8 tilt + linear laser X,Y,Z": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, axes="XYZ"),
+    "two orders XYZ,ZYX, 16 tilt": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, ORDERS2),
+    "two orders + linear X,Y,Z, 16 tilt": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, ORDERS2, axes="XYZ"),
+    "two orders + linear XYZ on 2 edges, 16 tilt": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, ORDERS2, axes="XYZ", edges=(0, 1)),
 }
 NODES = 5
 DEGREE = 3
@@ -43,18 +43,18 @@ ANGLE_SCALE = 1.0 / 500.0
 """Relative weight of angles, squareness and tilts against millimetres in the file's minimum-norm solution (as in yang_ballbar_complete)."""
 IDEAL, TILTED = "with_angles|none", "with_angles|tilt_0.5mrad"
 NOISY = "same with 0.1um noise"
-DEMO_PLANS: dict[str, Callable[[F1, int], Plan] | None] = {
+DEMO_PLANS: dict[str, Callable[[F1, int], WangPlan] | None] = {
     "no_compensation": None,
     "wang_eq7_ideal_mirror": None,
     "wang_eq7_tilt_0.5mrad": None,
-    "rigid_lsq_1order_linXYZ_1edge (rank 36/39)": lambda t, n: Plan(t, n, n + 1, axes="XYZ"),
-    "rigid_lsq_2orders_linXYZ_2edges (rank 39/39)": lambda t, n: Plan(t, n, n + 1, ORDERS2, axes="XYZ", edges=(0, 1)),
+    "rigid_lsq_1order_linXYZ_1edge (rank 36/39)": lambda t, n: WangPlan(t, n, n + 1, axes="XYZ"),
+    "rigid_lsq_2orders_linXYZ_2edges (rank 39/39)": lambda t, n: WangPlan(t, n, n + 1, ORDERS2, axes="XYZ", edges=(0, 1)),
     NOISY: None,
 }
 UM = 1e3
 
 
-def demonstration(case: Case, checks: Checks, n: int, inc: F1, errors_of: Callable[[Case, F2, F1], ErrorArrays]) -> None:
+def demonstration(case: VectorCase, checks: Checks, n: int, inc: F1, errors_of: Callable[[VectorCase, F2, F1], ErrorArrays]) -> None:
     """Worst error of all distances in a grid before and after each compensation, of the machine ``with_angles`` (found out: it fits)."""
     travel, demo, machine = n * inc, case.at("compensation_demo"), case.at("cases", TILTED)
     grid = volume_grid(np.stack([np.zeros(3), travel], axis=1), NODES)
@@ -86,7 +86,7 @@ def demonstration(case: Case, checks: Checks, n: int, inc: F1, errors_of: Callab
     checks.leave_out("worst distance after compensation, with noise", demo.at(NOISY), "the draws of the noise are not in the file")
 
 
-def _rigid(plan: Plan, grid_mm: F2, deviation: Callable[[F2], F2], tilts: dict[str, F1]) -> F2:
+def _rigid(plan: WangPlan, grid_mm: F2, deviation: Callable[[F2], F2], tilts: dict[str, F1]) -> F2:
     """Map of the cubic rigid-body model by least squares with mirror tilts as unknowns."""
     a, setup = problem(plan, DEGREE)
     terms = monomials(DEGREE)
@@ -99,7 +99,7 @@ LAST = "last digits"
 CURVES = tuple(i + a for a in "XYZ" for i in "XYZ")
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Every case, then squareness, ranks and the demonstration."""
     n = case.number("n")
     if n != int(n):
@@ -124,7 +124,7 @@ def read(case: Case, checks: Checks) -> None:
     demonstration(case, checks, int(n), inc, errors_of)
 
 
-def errors_of(part: Case, axes_mm: F2, travel_mm: F1) -> ErrorArrays:
+def errors_of(part: VectorCase, axes_mm: F2, travel_mm: F1) -> ErrorArrays:
     """The machine of a case: ``d_coef["YX"]`` powers 1, 2, .. of x / travel in delta_y(X) (mm), ``a_coef`` likewise (rad)."""
     u = np.asarray(axes_mm) / travel_mm
     d, e = np.zeros((len(u), 3, 3)), np.zeros((len(u), 3, 3))
@@ -137,14 +137,14 @@ def errors_of(part: Case, axes_mm: F2, travel_mm: F1) -> ErrorArrays:
     return ErrorArrays(d, e, np.array([xy, xz, yz]))
 
 
-def tilts_of(part: Case) -> dict[str, F1]:
+def tilts_of(part: VectorCase) -> dict[str, F1]:
     """Mirror tilts of a case, two angles per diagonal; none: ideal mirrors."""
     if not part.at("tilt").value:
         return {}
     return {name: angles.array(shape=(2,)) for name, angles in part.at("tilt").named(*DIAGONALS)}
 
 
-def _readings(part: Case, checks: Checks, n: int, inc: F1) -> None:
+def _readings(part: VectorCase, checks: Checks, n: int, inc: F1) -> None:
     tilts, travel = tilts_of(part), n * inc
     box = np.stack([np.zeros(3), travel], axis=1)
     for name in DIAGONALS:
@@ -156,7 +156,7 @@ def _readings(part: Case, checks: Checks, n: int, inc: F1) -> None:
         checks.compare("readings, exact", found, stored, unit="mm", floor=6e-13, rounding=rounding)
 
 
-def _curves(part: Case, checks: Checks, n: int, inc: F1) -> None:
+def _curves(part: VectorCase, checks: Checks, n: int, inc: F1) -> None:
     """Everything that follows from the readings of the file themselves."""
     q = increments({name: part.array("readings", name) for name in DIAGONALS})
     for name, values in q.items():
@@ -175,7 +175,7 @@ def _curves(part: Case, checks: Checks, n: int, inc: F1) -> None:
     checks.compare("closure", np.abs(closure_mm(q)).max(), part.at("closure_max"), unit="mm", floor=1e-17, rounding=LAST)
 
 
-def _squareness(part: Case, checks: Checks) -> None:
+def _squareness(part: VectorCase, checks: Checks) -> None:
     length, scale = part.array("L", shape=(3,)), part.array("scale_ppm", shape=(3,))
     acute = AcuteSquareness(*(-part.number("theta_obtuse", k) for k in ("tyz", "txz", "txy")))
     for name, total in diagonal_totals_eq12(acute, length, scale).items():

@@ -12,12 +12,12 @@ from abbe.models.notation.yang import YangErrors, workpiece_mm
 from abbe.models.papers.yang.ballbar import measured_mm
 from abbe.models.papers.yang.complete import delta_exact, monomial_errors, monomial_field
 from abbe.models.papers.yang.conditioning import design_eq9
-from abbe.models.papers.yang.experiments import BAR_POINTS, EXPERIMENTS, Plan, all_helices
+from abbe.models.papers.yang.experiments import BAR_POINTS, EXPERIMENTS, YangPlan, all_helices
 from abbe.models.paths.helix import helix_points
 from abbe.models.solvers.designs import map_noise_gain, shortest_solution
 from abbe.models.volumetric import volume_grid
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
 RADII_MM = (175.0, 100.0)
@@ -31,7 +31,7 @@ DEGREES = 4
 UM = 1e3
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Readings, the two small fits, and the complete fit with the noise gains."""
     checks.assume(
         f"the figures of the fit are of two bars of {RADII_MM[0]:g} and {RADII_MM[1]:g} mm at every origin; runs are listed of one"
@@ -50,7 +50,7 @@ def read(case: Case, checks: Checks) -> None:
     checks.leave_out("worst error of the map with noise", case.at("result", "recovered_map_max_error_um_with_0.5um_noise"), why)
 
 
-def _monomial(case: Case) -> Monomial:
+def _monomial(case: VectorCase) -> Monomial:
     kinds: dict[str, Kind] = {"d": "d", "e": "e", "S": "S"}
     kind, letters, power = case.text(0), case.text(1), case.number(2)
     if kind not in kinds or len(letters) != 2 or not set(letters) <= set("xyz") or power != int(power):
@@ -58,43 +58,45 @@ def _monomial(case: Case) -> Monomial:
     return Monomial(kinds[kind], "xyz".index(letters[0]), "xyz".index(letters[1]), int(power))
 
 
-def _plan(case: Case) -> Plan:
+def _plan(case: VectorCase) -> YangPlan:
     degree = case.number("degree")
     if degree != int(degree):
         raise FileFormatError(f"{case.label}/degree: expected a whole number, got {degree!r}", "")
     origins = np.array([run.array("origin", shape=(3,)) for run in _cups(case)])
-    return Plan(case.array("L", shape=(3,)), case.array("tool", shape=(3,)), origins, RADII_MM, case.number("turns"), STEPS, int(degree))
+    return YangPlan(
+        case.array("L", shape=(3,)), case.array("tool", shape=(3,)), origins, RADII_MM, case.number("turns"), STEPS, int(degree)
+    )
 
 
-def _cups(case: Case) -> list[Case]:
+def _cups(case: VectorCase) -> list[VectorCase]:
     """One run of every origin, in the order of the file."""
-    found: dict[tuple[float, ...], Case] = {}
+    found: dict[tuple[float, ...], VectorCase] = {}
     for run in case.at("runs").parts():
         found.setdefault(tuple(run.array("origin")), run)
     return list(found.values())
 
 
-def _nodes(plan: Plan) -> F2:
+def _nodes(plan: YangPlan) -> F2:
     """Scales at which the file's figures of the map are taken."""
     return volume_grid(np.outer(plan.travel_mm, INNER), NODES)
 
 
-def _errors(case: Case, terms: tuple[Monomial, ...], slide_mm: F2) -> YangErrors:
+def _errors(case: VectorCase, terms: tuple[Monomial, ...], slide_mm: F2) -> YangErrors:
     return monomial_errors(terms, case.array("theta"), slide_mm, case.array("L"))
 
 
-def _tip(case: Case, terms: tuple[Monomial, ...], slide_mm: F2) -> F2:
+def _tip(case: VectorCase, terms: tuple[Monomial, ...], slide_mm: F2) -> F2:
     """Actual tool tip over the workpiece for scales."""
     tool = case.array("tool")
     return np.asarray(workpiece_mm(slide_mm) + tool + delta_exact(_errors(case, terms, slide_mm), slide_mm, tool))
 
 
-def _bar(case: Case, terms: tuple[Monomial, ...], run: Case, radius_mm: float) -> F1:
+def _bar(case: VectorCase, terms: tuple[Monomial, ...], run: VectorCase, radius_mm: float) -> F1:
     points = helix_points(run.array("origin"), radius_mm, turns=case.number("turns"), n=BAR_POINTS)
     return measured_mm(_tip(case, terms, points), run.array("true_centre"), radius_mm, case.number("bar_offset"))
 
 
-def _readings(case: Case, checks: Checks, terms: tuple[Monomial, ...], plan: Plan) -> None:
+def _readings(case: VectorCase, checks: Checks, terms: tuple[Monomial, ...], plan: YangPlan) -> None:
     why = "difference of lengths of 175 mm between coordinates of 800 mm"
     for run in case.at("runs").parts():
         checks.compare("dR", _bar(case, terms, run, run.number("R")), run.at("dR"), unit="mm", floor=4e-13, rounding=why)
@@ -105,7 +107,7 @@ def _readings(case: Case, checks: Checks, terms: tuple[Monomial, ...], plan: Pla
     )
 
 
-def _small_fits(case: Case, checks: Checks) -> None:
+def _small_fits(case: VectorCase, checks: Checks) -> None:
     run = case.at("runs", 0)
     points = helix_points(run.array("origin"), run.number("R"), turns=case.number("turns"), n=BAR_POINTS)
     last = "last digits of a least-squares solution"
@@ -120,7 +122,7 @@ def _small_fits(case: Case, checks: Checks) -> None:
                 checks.compare("cup offset of run 0", found[k], part.at(k), unit="mm", floor=1e-14, rounding=last)
 
 
-def _complete_fit(case: Case, checks: Checks, terms: tuple[Monomial, ...], plan: Plan) -> None:
+def _complete_fit(case: VectorCase, checks: Checks, terms: tuple[Monomial, ...], plan: YangPlan) -> None:
     """All coefficients, five cups and the bar's length in one linear step from the exact readings of both bars."""
     a, setup = all_helices(plan, centres=True, lengths="common")
     y = np.concatenate([_bar(case, terms, run, r) for run in _cups(case) for r in plan.radii_mm])
@@ -138,7 +140,7 @@ def _complete_fit(case: Case, checks: Checks, terms: tuple[Monomial, ...], plan:
     checks.compare("largest error of the recovered map", off * UM, part, unit="1", floor=1e-8, rounding=noise + ", times a gain of 76")
 
 
-def _gains(case: Case, checks: Checks, plan: Plan) -> None:
+def _gains(case: VectorCase, checks: Checks, plan: YangPlan) -> None:
     nodes = workpiece_mm(_nodes(plan))
     for key, part in case.items():
         if len(part.parts()) != DEGREES:

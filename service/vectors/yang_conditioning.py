@@ -10,7 +10,7 @@ from abbe.models.arrays import F2
 from abbe.models.papers.yang.conditioning import common_scale_trace_mm, conditioning, design_eq9, spread, two_radii_design
 from abbe.models.paths.helix import Law, helix_points
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
 RADII_MM = (175.0, 100.0)
@@ -26,7 +26,7 @@ INVERTED = "the vector inverted normal equations of condition up to 1900 squared
 DETERMINED = "last digits of a least-squares solution"
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Every key, at least one of each kind: ``six_<law>_<turns>``, ``ten_<turns>``, ``corr9_<turns>turns`` and ``two_radii``."""
     for kind in KINDS:
         if not any(key.startswith(kind) for key, _ in case.items()):
@@ -50,7 +50,7 @@ def _points(law: Law, turns: int, radius_mm: float = RADII_MM[0]) -> F2:
     return helix_points(ORIGIN, radius_mm, turns=turns, n=POINTS, law=law)
 
 
-def _six(part: Case, checks: Checks, points: F2) -> None:
+def _six(part: VectorCase, checks: Checks, points: F2) -> None:
     a = design_eq9(points, ORIGIN, setup=False)
     found, sigma = conditioning(a), spread(a)
     checks.compare("rank, six", found.rank, part.at("rank"), unit="1")
@@ -60,7 +60,7 @@ def _six(part: Case, checks: Checks, points: F2) -> None:
     checks.compare("sigma per µm, six", sigma.sigma_per_mm * PER_UM, part.at("sigma_factor_per_um"), unit="1", floor=1e-20)
 
 
-def _ten(part: Case, checks: Checks, a: F2) -> None:
+def _ten(part: VectorCase, checks: Checks, a: F2) -> None:
     nine = conditioning(a[:, :9])
     checks.compare("rank, ten", conditioning(a).rank, part.at("rank10"), unit="1")
     checks.compare("rank, nine", nine.rank, part.at("rank9"), unit="1")
@@ -73,7 +73,7 @@ def _ten(part: Case, checks: Checks, a: F2) -> None:
     )
 
 
-def _two(case: Case, checks: Checks) -> None:
+def _two(case: VectorCase, checks: Checks) -> None:
     points = tuple(_points("angle", TURNS, r) for r in RADII_MM)
     for key, part in case.named(*TWO_BARS):
         _, centre, _, radius = key.split("_")

@@ -8,7 +8,7 @@ from abbe.models.papers.yang.ballbar import reading_eq6, reading_eq8
 from abbe.models.papers.yang.simplified import SixParameters, ZConvention, delta_eq2, fit_eq9
 from abbe.models.paths.helix import Law, helix_points
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 
 NAMES = ("dxx", "dyy", "dzz", "Sxy", "Sxz", "Syz")
@@ -17,7 +17,7 @@ COORDINATES = "the parameter of 5 turns and coordinates of 600 mm, six units in 
 LAWS: dict[str, Law] = {"angle": "angle", "area": "area"}
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Every set: points, exact and linear reading, both fits."""
     truth = SixParameters(*(case.number("truth", k) for k in NAMES))
     origin, turns = case.array("origin", shape=(3,)), case.number("turns")
@@ -34,7 +34,7 @@ def read(case: Case, checks: Checks) -> None:
         _readings(part, checks, truth, points, origin)
 
 
-def _readings(part: Case, checks: Checks, truth: SixParameters, points: F2, origin: F1) -> None:
+def _readings(part: VectorCase, checks: Checks, truth: SixParameters, points: F2, origin: F1) -> None:
     """Both readings of one set and what eq (9) makes of the exact one."""
     reading, radius = READINGS[part.text("z_reading")], part.number("R")
     d = points - origin

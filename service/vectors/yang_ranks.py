@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.functions.monomials import monomials
-from abbe.models.papers.yang.experiments import EXPERIMENTS, LATERAL_TOOL_MM, LONG_TOOL_MM, MAP_NODES, Experiment, Plan, Problem
+from abbe.models.papers.yang.experiments import EXPERIMENTS, LATERAL_TOOL_MM, LONG_TOOL_MM, MAP_NODES, Experiment, Problem, YangPlan
 from abbe.models.papers.yang.origins import origin_plan
 from abbe.models.solvers.designs import hidden_combination, ranks
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import LAYOUT, Case
+from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
 DECIMALS = 4
@@ -17,7 +17,7 @@ DECIMALS = 4
 NO_TRACE = 1e-9
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """The plan of the assumptions, ranks of every experiment and degree, and the listed null vectors."""
     assumed = case.at("assumed")
     plans = [plan_of(assumed, d + 1) for d in range(len(case.at("N").parts()))]
@@ -38,13 +38,13 @@ def read(case: Case, checks: Checks) -> None:
             _null_vector(vector, checks, problem)
 
 
-def plan_of(case: Case, degree: int) -> Plan:
+def plan_of(case: VectorCase, degree: int) -> YangPlan:
     """The file's assumptions as a plan."""
     steps = case.number("steps")
     if steps != int(steps):
         raise FileFormatError(f"{case.label}/steps: expected a whole number, got {steps!r}", "")
     radii = tuple(float(r) for r in case.array("radii"))
-    return Plan(
+    return YangPlan(
         case.array("L", shape=(3,)),
         case.array("tool", shape=(3,)),
         case.array("origins", shape=(None, 3)),
@@ -55,7 +55,7 @@ def plan_of(case: Case, degree: int) -> Plan:
     )
 
 
-def experiment(case: Case, key: str) -> Experiment:
+def experiment(case: VectorCase, key: str) -> Experiment:
     """Experiment of a key such as ``c1 helix(1)+step diagonals, ideal mirror``: its first word names it."""
     code = key.split()[0]
     if code not in EXPERIMENTS:
@@ -63,7 +63,7 @@ def experiment(case: Case, key: str) -> Experiment:
     return EXPERIMENTS[code]
 
 
-def _null_vector(case: Case, checks: Checks, problem: Problem) -> None:
+def _null_vector(case: VectorCase, checks: Checks, problem: Problem) -> None:
     """The names say which parameters hang together; their ratios, up to the common sign, and that they leave no trace are computed."""
     names = [t.name for t in monomials(1)]
     stored = dict(case.items())

@@ -7,13 +7,13 @@ import numpy as np
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
 from abbe.models.papers.yang.complete import delta_eq1, delta_exact
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 
 SUBTRACTED = "the vector subtracts coordinates of up to 1000 mm"
 
 
-def read(case: Case, checks: Checks) -> None:
+def read(case: VectorCase, checks: Checks) -> None:
     """Every case of the file through the model's three forms."""
     for part in case.at("cases").parts():
         errors = errors_of(part)
@@ -35,7 +35,7 @@ def read(case: Case, checks: Checks) -> None:
         checks.compare("delta, paper's matrices", matrix, part.at("delta_paper_matrix"), unit="mm", floor=3e-13, rounding=SUBTRACTED)
 
 
-def errors_of(part: Case) -> YangErrors:
+def errors_of(part: VectorCase) -> YangErrors:
     """The 21 errors of one case: d["xy"] = delta_xy, e["zx"] = eps_zx, Sxy, Sxz, Syz."""
     d = np.array([[[part.number("d", i + j) for j in "xyz"] for i in "xyz"]])
     e = np.array([[[part.number("e", i + j) for j in "xyz"] for i in "xyz"]])

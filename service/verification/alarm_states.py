@@ -15,7 +15,7 @@ from typing import Any, Protocol
 Doc = dict[str, Any]
 
 
-class Kind(StrEnum):
+class AlarmKind(StrEnum):
     """What a line says. The first four are of the alarm itself, the others of what the service does about it."""
 
     RAISED = "raised"
@@ -32,14 +32,23 @@ class Kind(StrEnum):
     PUSHED = "pushed"
 
 
-OF_WORK = (Kind.BEGUN, Kind.MEASURED, Kind.DISCOVERED, Kind.PROPOSED, Kind.FAILED, Kind.ENDED, Kind.PUSHING, Kind.PUSHED)
+OF_WORK = (
+    AlarmKind.BEGUN,
+    AlarmKind.MEASURED,
+    AlarmKind.DISCOVERED,
+    AlarmKind.PROPOSED,
+    AlarmKind.FAILED,
+    AlarmKind.ENDED,
+    AlarmKind.PUSHING,
+    AlarmKind.PUSHED,
+)
 TRIES = 2
 """So often a step of an investigation may fail, or a campaign not come to its end, before it is left to a person."""
 NO_ALARM = 0
 """Number under which pushes are noted that no alarm has asked for."""
 
 
-class Line(Protocol):
+class AlarmLine(Protocol):
     """An entry of the store."""
 
     @property
@@ -87,7 +96,7 @@ class Signal:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FiredRule:
     """What a check says of alarms. ``judged``: whether its figures can be judged at all (it was measured, and in its air)."""
 
     judged: bool
@@ -101,10 +110,10 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class AlarmStep:
     """One line about the work on an alarm."""
 
-    kind: Kind
+    kind: AlarmKind
     doc: Doc
     utc: str
     seq: int
@@ -129,7 +138,7 @@ class Alarm:
     acknowledged_by: str = ""
     acknowledged_utc: str = ""
     cleared_utc: str = ""
-    work: tuple[Step, ...] = field(default=())
+    work: tuple[AlarmStep, ...] = field(default=())
 
     @property
     def word(self) -> str:
@@ -138,7 +147,7 @@ class Alarm:
             return "acknowledged" if self.acknowledged_by else "raised"
         return "closed" if self.acknowledged_by else "cleared"
 
-    def last(self, *kinds: Kind) -> Step | None:
+    def last(self, *kinds: AlarmKind) -> AlarmStep | None:
         """The last line of one of these kinds."""
         return next((s for s in reversed(self.work) if s.kind in kinds), None)
 
@@ -148,20 +157,20 @@ class Alarm:
         return str(self.work[-1].doc.get("text", "")) if self.work else ""
 
 
-def after_check(now: Alarm | None, found: Found) -> Kind | None:
+def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
     """What a check does to the active alarm of its recipe (None: there is none); None: nothing."""
     if not found.judged:
         return None
     if now is None or not now.active:
-        return Kind.RAISED if found.signals else None
-    return Kind.CLEARED if not found.signals and found.verdict == "pass" else Kind.HELD
+        return AlarmKind.RAISED if found.signals else None
+    return AlarmKind.CLEARED if not found.signals and found.verdict == "pass" else AlarmKind.HELD
 
 
-def folded(lines: Iterable[Line]) -> list[Alarm]:
+def folded(lines: Iterable[AlarmLine]) -> list[Alarm]:
     """All alarms from their lines, oldest first. Lines that cannot follow (an alarm that was never raised) are left out."""
     found: dict[int, Alarm] = {}
     for line in lines:
-        if line.kind == Kind.RAISED:
+        if line.kind == AlarmKind.RAISED:
             if line.alarm not in found and line.alarm != NO_ALARM:
                 found[line.alarm] = _raised(line)
         elif line.alarm in found:
@@ -169,7 +178,7 @@ def folded(lines: Iterable[Line]) -> list[Alarm]:
     return [found[number] for number in sorted(found)]
 
 
-def _raised(line: Line) -> Alarm:
+def _raised(line: AlarmLine) -> Alarm:
     d = line.doc
     signals = tuple(d["signals"])
     return Alarm(
@@ -187,17 +196,17 @@ def _raised(line: Line) -> Alarm:
     )
 
 
-def _followed(alarm: Alarm, line: Line) -> Alarm:
-    d, kind = line.doc, Kind(line.kind)
+def _followed(alarm: Alarm, line: AlarmLine) -> Alarm:
+    d, kind = line.doc, AlarmKind(line.kind)
     alarm = replace(alarm, last_seq=line.seq, changed_utc=line.utc)
-    if kind is Kind.ACKNOWLEDGED:
+    if kind is AlarmKind.ACKNOWLEDGED:
         return alarm if alarm.acknowledged_by else replace(alarm, acknowledged_by=d["name"], acknowledged_utc=line.utc)
     if kind in OF_WORK:
-        return replace(alarm, work=(*alarm.work, Step(kind, d, line.utc, line.seq)))
+        return replace(alarm, work=(*alarm.work, AlarmStep(kind, d, line.utc, line.seq)))
     if not alarm.active:
         return alarm
     alarm = replace(alarm, signals=tuple(d["signals"]), text=d["text"], verification=d["verification"], held_seq=line.seq)
-    return replace(alarm, active=False, cleared_utc=line.utc) if kind is Kind.CLEARED else alarm
+    return replace(alarm, active=False, cleared_utc=line.utc) if kind is AlarmKind.CLEARED else alarm
 
 
 def is_open(alarm: Alarm) -> bool:
@@ -205,17 +214,17 @@ def is_open(alarm: Alarm) -> bool:
     return alarm.word != "closed"
 
 
-def next_step(alarm: Alarm) -> Kind | None:
+def next_step(alarm: Alarm) -> AlarmKind | None:
     """What the service has to do next about an alarm that is to be investigated; None: nothing now.
 
     A try that failed is made once more, after the next check that holds the alarm; a try that was interrupted goes on where its lines end.
     """
-    if not alarm.active or alarm.last(Kind.PROPOSED, Kind.ENDED) is not None:
+    if not alarm.active or alarm.last(AlarmKind.PROPOSED, AlarmKind.ENDED) is not None:
         return None
-    failed = alarm.last(Kind.FAILED)
-    often = sum(s.kind is Kind.FAILED for s in alarm.work) >= TRIES
+    failed = alarm.last(AlarmKind.FAILED)
+    often = sum(s.kind is AlarmKind.FAILED for s in alarm.work) >= TRIES
     if often or (failed is not None and alarm.work[-1] is failed and alarm.held_seq < failed.seq):
         return None
-    if alarm.last(Kind.DISCOVERED) is not None:
-        return Kind.PROPOSED
-    return Kind.DISCOVERED if alarm.last(Kind.MEASURED) is not None else Kind.MEASURED
+    if alarm.last(AlarmKind.DISCOVERED) is not None:
+        return AlarmKind.PROPOSED
+    return AlarmKind.DISCOVERED if alarm.last(AlarmKind.MEASURED) is not None else AlarmKind.MEASURED

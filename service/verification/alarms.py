@@ -11,10 +11,10 @@ import numpy as np
 from abbe.models.trend import MIN_CHECKS, MOST_CHECKS, Forecast, jumps, mean_of
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.push.book import read_entries
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.storage.records import AlarmEntryRecord, Doc, VerificationRecord
 from abbe.service.storage.store import Store
-from abbe.service.verification.alarm_states import Alarm, Found, Kind, Signal, after_check, folded, is_open
+from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, Signal, after_check, folded, is_open
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, in_words, of_series, trends
 from abbe.service.verification.verify import judge
 
@@ -25,7 +25,7 @@ NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class AlarmTerms:
     """What counts: checks of ``recipe`` after ``begins_utc``; ``warn_days``: 0 for no warning ahead.
 
     ``compare``: figure -> value and standard uncertainty before the alarm that is active now: what jumped must not become habit.
@@ -37,24 +37,24 @@ class Terms:
     compare: Mapping[str, tuple[float, float]] | None = None
 
 
-def found_in(records: Sequence[VerificationRecord], terms: Terms) -> Found:
+def found_in(records: Sequence[VerificationRecord], terms: AlarmTerms) -> FiredRule:
     """What the latest check of a recipe says of alarms, beside those before it.
 
     Parameters
     ----------
     records : sequence of VerificationRecord
         Checks of one machine, newest first, as the store gives them.
-    terms : Terms
+    terms : AlarmTerms
         Which of them count.
     """
     mine = [r for r in records if r.doc.get("recipe") == terms.recipe]
     if not mine or not mine[0].doc.get("values") or not mine[0].doc.get("comparable", True):
-        return Found(False, "cannot tell")
+        return FiredRule(False, "cannot tell")
     found = [signal for one in trends(mine, terms.begins_utc) for signal in _of_figure(one, mine, terms)]
-    return Found(True, mine[0].verdict, tuple(found))
+    return FiredRule(True, mine[0].verdict, tuple(found))
 
 
-def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: Terms) -> Iterator[Signal]:
+def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> Iterator[Signal]:
     if one.limit is None or records[0].doc["values"].get(one.figure) is None:
         return
     limit, value, u = one.limit, one.latest, one.expanded / COVERAGE
@@ -79,7 +79,7 @@ def _days_text(name: str, limit: float, unit: str, ahead: Forecast) -> str:
     return f"{name} reaches its limit of {limit:g}{unit} in {in_words(ahead)} days (95 %)"
 
 
-def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: Terms) -> tuple[float, float] | None:
+def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:
     """What the latest figure is compared with while too few checks have shown their spread."""
     kept = (terms.compare or {}).get(one.figure)
     if kept is not None:
@@ -98,9 +98,9 @@ READ_CHECKS = 4 * MOST_CHECKS
 class Looked:
     """What a check means for the alarm of its recipe: ``kind`` None: nothing."""
 
-    kind: Kind | None
+    kind: AlarmKind | None
     now: Alarm | None
-    found: Found
+    found: FiredRule
 
 
 def alarms_of(store: Store, machine: str) -> list[Alarm]:
@@ -129,7 +129,7 @@ def alarm_doc(one: Alarm) -> Doc:
         "cleared_utc": one.cleared_utc or None,
         "outcome": one.outcome,
         "work": [{"kind": str(s.kind), "utc": s.utc, "text": str(s.doc.get("text", ""))} for s in one.work],
-        "proposal": None if (step := one.last(Kind.PROPOSED)) is None else step.doc.get("proposal"),
+        "proposal": None if (step := one.last(AlarmKind.PROPOSED)) is None else step.doc.get("proposal"),
     }
 
 
@@ -146,7 +146,7 @@ def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
     one = alarm_numbered(store, machine, number)
     if one.acknowledged_by:
         raise StoreError(f"alarm {number} of {machine} was acknowledged by {one.acknowledged_by} at {one.acknowledged_utc}")
-    store.add_alarm_entry(machine, number, one.last_seq + 1, Kind.ACKNOWLEDGED, {"name": name})
+    store.add_alarm_entry(machine, number, one.last_seq + 1, AlarmKind.ACKNOWLEDGED, {"name": name})
     return alarm_numbered(store, machine, number)
 
 
@@ -168,7 +168,7 @@ def series_begins(store: Store, machine: str) -> datetime | None:
 
     A push that came back leaves the series as it is; tables that others have written are not known here.
     """
-    changed = [e.utc for e in read_entries(store, machine) if e.state in (State.KEEP, State.ACCEPTED)]
+    changed = [e.utc for e in read_entries(store, machine) if e.state in (PushState.KEEP, PushState.ACCEPTED)]
     return datetime.fromisoformat(changed[-1]) if changed else None
 
 
@@ -178,7 +178,7 @@ def look(store: Store, machine: str, recipe: str, records: Sequence[Verification
     compare = None
     if now is not None and (begins is None or begins < datetime.fromisoformat(now.raised_utc)):
         compare = {d["figure"]: (d["baseline"], d["baseline_u"]) for d in now.first if d["kind"] == "jump"}
-    found = found_in(records, Terms(recipe, begins, warn_days, compare))
+    found = found_in(records, AlarmTerms(recipe, begins, warn_days, compare))
     return Looked(after_check(now, found), now, found)
 
 

@@ -33,7 +33,7 @@ UM = 1e3
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedRun:
     """A run to be compared: name of its machine, its ``abbe-run/1`` object, its readings, its figures."""
 
     label: str
@@ -44,7 +44,7 @@ class Loaded:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class ComparedCurve:
     """Deviation along a run, µm, noise, repeatability and calibration as standard uncertainty (NaN: not known).
 
     ``x``: degrees about the axis of a ball-bar path, mm along a laser line. ``place``: direction of the bar, or ``x`` again, shape (n, k).
@@ -58,7 +58,7 @@ class Curve:
 
 
 @dataclass(frozen=True, eq=False)
-class Difference:
+class RunDifference:
     """Second minus first where both were read: abscissa, µm, standard uncertainty; the largest and the rms."""
 
     x: F1
@@ -90,7 +90,7 @@ class FigureRow:
     sure: bool | None
 
 
-def against(first: Loaded, other: Loaded) -> str:
+def against(first: LoadedRun, other: LoadedRun) -> str:
     """Why two runs cannot be compared, in one line; empty if they can."""
     if first.machine != other.machine:
         names = f"{other.label} was measured on machine {other.machine}, {first.label} on {first.machine}"
@@ -107,7 +107,7 @@ def against(first: Loaded, other: Loaded) -> str:
     return ""
 
 
-def _kind(one: Loaded, key: str) -> Any:
+def _kind(one: LoadedRun, key: str) -> Any:
     """What a set-up says under a key; the axis of a helix also where only its path tells it."""
     setup = one.run["setup"]
     if key == "axis" and one.run["test"] == "ballbar_helix":
@@ -120,7 +120,7 @@ def _feed(mm_min: float) -> str:
     return f"{mm_min:g} mm/min"
 
 
-def remarks(loaded: Sequence[Loaded], feed: Callable[[float], str] = _feed) -> list[str]:
+def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -> list[str]:
     """What the reader has to know: other places, other tables in force, another direction or feed; ``feed`` writes mm/min with its unit."""
     out = []
     first = loaded[0]
@@ -141,7 +141,7 @@ def remarks(loaded: Sequence[Loaded], feed: Callable[[float], str] = _feed) -> l
     return out
 
 
-def _column(one: Loaded, name: str) -> list[float]:
+def _column(one: LoadedRun, name: str) -> list[float]:
     """What a column of a run holds; empty where it has none."""
     return [float(v) for v in (one.run.get("columns") or {}).get(name) or () if v is not None]
 
@@ -153,7 +153,7 @@ def _same(a: Any, b: Any) -> bool:
     return first.shape == second.shape and bool(np.abs(first - second).max() <= SAME_PLACE_MM)
 
 
-def curve(one: Loaded) -> Curve:
+def curve(one: LoadedRun) -> ComparedCurve:
     """Deviation along a run as it is compared.
 
     Of a ball-bar: centre and length of the bar fitted away, noise from second differences, and what mounting it anew changes. Of a laser:
@@ -163,7 +163,7 @@ def curve(one: Loaded) -> Curve:
     return _bar(one) if one.data.kind == "bar" else _laser(one)
 
 
-def _bar(one: Loaded) -> Curve:
+def _bar(one: LoadedRun) -> ComparedCurve:
     data = one.data
     assert data.centre_mm is not None
     left = helix_figure(data).deviation_mm
@@ -171,10 +171,10 @@ def _bar(one: Loaded) -> Curve:
     noise = 1.4826 * float(np.median(np.abs(left[2:] - 2 * left[1:-1] + left[:-2]))) / np.sqrt(6.0)
     angle = np.degrees(about_axis(at, path_axis(one.run, data.axes_mm)))
     place = at / np.linalg.norm(at, axis=1, keepdims=True)
-    return Curve(True, angle, left * UM, np.full(left.size, np.hypot(noise, U_REPEAT_MM) * UM), place)
+    return ComparedCurve(True, angle, left * UM, np.full(left.size, np.hypot(noise, U_REPEAT_MM) * UM), place)
 
 
-def _laser(one: Loaded) -> Curve:
+def _laser(one: LoadedRun) -> ComparedCurve:
     data = one.data
     assert data.beam is not None
     s = np.round((data.axes_mm - data.axes_mm[0]) @ data.beam, 2)
@@ -184,10 +184,10 @@ def _laser(one: Loaded) -> Curve:
     mean = np.array([np.mean(v) for _, v in groups])
     half = np.array([(v[0] - v[1]) / 2 for _, v in groups if len(v) == 2])
     scatter = float(np.std(half, ddof=1)) if half.size > 2 else float("nan")
-    return Curve(False, x, mean * UM, np.hypot(scatter, U_WAVELENGTH * np.abs(x)) * UM, x[:, None])
+    return ComparedCurve(False, x, mean * UM, np.hypot(scatter, U_WAVELENGTH * np.abs(x)) * UM, x[:, None])
 
 
-def difference(first: Curve, second: Curve) -> Difference | None:
+def difference(first: ComparedCurve, second: ComparedCurve) -> RunDifference | None:
     """Second minus first at the places of the first that both have read; None where there are fewer than three."""
     far = NEAR_RAD if first.round else 0.05
     distance, at = cKDTree(second.place).query(first.place)
@@ -196,10 +196,10 @@ def difference(first: Curve, second: Curve) -> Difference | None:
         return None
     at = at[near]
     apart = second.deviation_um[at] - first.deviation_um[near]
-    return Difference(first.x[near], apart, np.hypot(first.u_um[near], second.u_um[at]))
+    return RunDifference(first.x[near], apart, np.hypot(first.u_um[near], second.u_um[at]))
 
 
-def figure_rows(loaded: Sequence[Loaded]) -> list[FigureRow]:
+def figure_rows(loaded: Sequence[LoadedRun]) -> list[FigureRow]:
     """Figures that every run has with a unit, in the order of the first.
 
     The uncertainty of a difference counts both as independent: what both share (the same laser, the same bar) makes it smaller, not larger.

@@ -10,7 +10,7 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.evaluation.iso230_2 import Approaches
-from abbe.models.evaluation.iso230_4 import Circle
+from abbe.models.evaluation.iso230_4 import CircularTest
 from abbe.models.machine import AXES
 from abbe.models.solvers.observations import nominal_reading
 from abbe.service.errors import AbbeError, MeasurementFault
@@ -43,7 +43,7 @@ class CircleTest:
     setup: str
     radius_mm: float
     sense: int
-    path: Circle
+    path: CircularTest
     u_length_mm: float | None
 
 
@@ -92,7 +92,7 @@ def _circle(run: Run) -> CircleTest:
     a, b = ("XYZ".index(c) for c in plane)
     at = data.axes_mm - data.centre_mm
     angle = np.unwrap(np.arctan2(at[:, b], at[:, a]))
-    path = Circle(angle, data.deviation_mm - nominal_reading(data))
+    path = CircularTest(angle, data.deviation_mm - nominal_reading(data))
     sense = 1 if angle[-1] >= angle[0] else -1
     u = run["setup"].get("u_length_mm") if run["setup"].get("length_calibrated") else None
     return CircleTest(run["run_id"], plane, data.setup, float(run["setup"]["radius_mm"]), sense, path, u)

@@ -12,7 +12,7 @@ import numpy as np
 from abbe.models.evaluation.iso230_2 import Positioning, ScaleBudget, Value, positioning
 from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circular
 from abbe.models.evaluation.iso230_6 import BODY, FACE, diagonals
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
 from abbe.service.rendering.document import Figure, Picture
 from abbe.service.rendering.model import PolarTrace
@@ -68,7 +68,7 @@ def evaluate(runs: Sequence[dict[str, Any]], instruments: dict[str, Any] | None 
     for where, tests in along.items():
         _diagonals(out, where, tests, budget)
     if linear or along:
-        known = Inputs()
+        known = StatedInputs()
         numbers = {"wave": known.u_wavelength * 1e6, "kelvin": known.u_scale_temperature_k, "expansion": known.scale_expansion_per_k * 1e6}
         out.statements.append(LASER_STATEMENT.format(**numbers))
     if circles:
@@ -79,7 +79,7 @@ def evaluate(runs: Sequence[dict[str, Any]], instruments: dict[str, Any] | None 
 
 def scale_budget(instruments: dict[str, Any]) -> ScaleBudget:
     """What repeats do not show, from the budget's stated inputs and the instrument's resolution."""
-    known = Inputs()
+    known = StatedInputs()
     scale = float(np.hypot(known.u_wavelength, known.u_scale_temperature_k * known.scale_expansion_per_k))
     return ScaleBudget(scale, float((instruments.get("laser") or {}).get("resolution_mm", 0.0)) / np.sqrt(12.0))
 

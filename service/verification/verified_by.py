@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from abbe.service.errors import StoreError
 from abbe.service.push.book import read_entries
-from abbe.service.push.entries import Entry, JournalBroken, check_chain, facts
-from abbe.service.push.states import State
+from abbe.service.push.entries import JournalBroken, JournalEntry, check_chain, facts
+from abbe.service.push.states import PushState
 from abbe.service.storage.records import Doc, VerificationRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import KIND, wanted_by
@@ -24,7 +24,7 @@ LOOKED = 20
 STRANGE = "CMP-010"
 """Code of the alarm that somebody else has changed the table in force."""
 
-_CHANGES = (State.KEEP, State.ACCEPTED)
+_CHANGES = (PushState.KEEP, PushState.ACCEPTED)
 """States of a push that bring a table into force. One that was taken back leaves things as they were."""
 
 Word = Literal["verified", "unverified", "unknown"]
@@ -137,7 +137,7 @@ def verified_by(store: Store, machine: str, *, control: str = "", strange: bool 
     return of_journal(store, entries, checks, strange=strange or _said_strange(store, machine, entries, checks))
 
 
-def _said_strange(store: Store, machine: str, entries: Sequence[Entry], checks: Sequence[VerificationRecord]) -> bool:
+def _said_strange(store: Store, machine: str, entries: Sequence[JournalEntry], checks: Sequence[VerificationRecord]) -> bool:
     """Whether the machine's service saw a strange table when it was heard last, and neither a table came into force since nor a check found
     the journal's one in force.
     """
@@ -151,7 +151,7 @@ def _said_strange(store: Store, machine: str, entries: Sequence[Entry], checks: 
     return all(datetime.fromisoformat(e.utc) <= seen for e in entries if e.state in _CHANGES)
 
 
-def of_journal(store: Store, entries: Sequence[Entry], checks: Sequence[VerificationRecord], *, strange: bool = False) -> VerifiedBy:
+def of_journal(store: Store, entries: Sequence[JournalEntry], checks: Sequence[VerificationRecord], *, strange: bool = False) -> VerifiedBy:
     """The same of a journal that was read and checks, newest first."""
     crc, settled = wanted_by(list(entries))
     changed = [e for e in entries if e.state in _CHANGES]
@@ -171,9 +171,9 @@ def of_journal(store: Store, entries: Sequence[Entry], checks: Sequence[Verifica
     return VerifiedBy("unknown", "never", **known)
 
 
-def _since(store: Store, entries: Sequence[Entry], change: Entry, known: dict[str, Any]) -> VerifiedBy:
+def _since(store: Store, entries: Sequence[JournalEntry], change: JournalEntry, known: dict[str, Any]) -> VerifiedBy:
     """No check was measured since a table came into force: what brought it says whether a measurement stands behind it."""
-    if change.state is State.ACCEPTED:
+    if change.state is PushState.ACCEPTED:
         return VerifiedBy("unverified", "accepted", change.push, change.utc, **known)
     number = facts(tuple(e for e in entries if e.push == change.push)).get("table")
     if number and _kind(store, int(number)) == KIND:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from abbe.models.verification import Figure, diagonal_figure, helix_figure
+from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure
 from abbe.service.errors import MeasurementFault, TableRefused
 from abbe.service.runs.coverage import check_judged
 from abbe.service.runs.observations import run_data
@@ -27,15 +27,15 @@ Verdict = Literal["pass", "fail", "cannot tell"]
 
 
 @dataclass(frozen=True)
-class Figures:
+class VerificationFigures:
     """What one verification measured: body diagonals by name, and the helix.
 
     ``air_c``: lowest and highest temperature of the air, None where no reading says any. ``tables``: CRC of every table that was active
     while its runs were measured; None stands for a run that does not say so.
     """
 
-    diagonals: Mapping[str, Figure]
-    helix: Figure | None
+    diagonals: Mapping[str, VerificationFigure]
+    helix: VerificationFigure | None
     air_c: tuple[float, float] | None = None
     tables: frozenset[int | None] = frozenset()
 
@@ -46,12 +46,12 @@ class Figures:
         return all(np.isfinite(f.value_mm) and np.isfinite(f.u_mm) for f in every)
 
     @property
-    def worst(self) -> Figure:
+    def worst(self) -> VerificationFigure:
         """The body diagonal with the largest range."""
         return max(self.diagonals.values(), key=lambda f: f.value_mm)
 
 
-def figures(runs: list[dict[str, Any]]) -> Figures:
+def figures(runs: list[dict[str, Any]]) -> VerificationFigures:
     """Figures of a verification's runs (``abbe-run/1`` objects): plain body diagonals and at most one helix.
 
     Raises
@@ -75,7 +75,7 @@ def figures(runs: list[dict[str, Any]]) -> Figures:
         raise MeasurementFault(
             f"these runs are no verification: body diagonal {lost} is missing", "measure the verification campaign again"
         )
-    return Figures(diagonals, helix, _air_c(runs), frozenset(run.get("table", {}).get("crc") for run in runs))
+    return VerificationFigures(diagonals, helix, _air_c(runs), frozenset(run.get("table", {}).get("crc") for run in runs))
 
 
 def _air_c(runs: list[dict[str, Any]]) -> tuple[float, float] | None:
@@ -83,7 +83,7 @@ def _air_c(runs: list[dict[str, Any]]) -> tuple[float, float] | None:
     return (min(air), max(air)) if air else None
 
 
-def check_before(before: Figures) -> None:
+def check_before(before: VerificationFigures) -> None:
     """Refuse a verification that nothing can be compared with, before anything is written.
 
     Raises
@@ -98,18 +98,18 @@ def check_before(before: Figures) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class VerificationDecision:
     """Keep the new table or go back, and why."""
 
     keep: bool
     text: str
 
 
-def _expanded(a: Figure, b: Figure) -> float:
+def _expanded(a: VerificationFigure, b: VerificationFigure) -> float:
     return COVERAGE * float(np.hypot(a.u_mm, b.u_mm))
 
 
-def incomparable(before: Figures, after: Figures, pushed_crc: int | None = None) -> str:
+def incomparable(before: VerificationFigures, after: VerificationFigures, pushed_crc: int | None = None) -> str:
     """Why before and after say nothing about a new table; empty if they can be compared.
 
     Parameters
@@ -132,7 +132,7 @@ def incomparable(before: Figures, after: Figures, pushed_crc: int | None = None)
     return ""
 
 
-def decide(before: Figures, after: Figures, pushed_crc: int | None = None) -> Decision:
+def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: int | None = None) -> VerificationDecision:
     """Keep only if the worst diagonal improved by more than its expanded uncertainty and no other figure got worse (reliability.md H11).
 
     "Worse" is more than the expanded uncertainty of the difference plus `WORSE_SHARE`: a diagonal that happened to be good because errors
@@ -141,25 +141,25 @@ def decide(before: Figures, after: Figures, pushed_crc: int | None = None) -> De
     """
     why = incomparable(before, after, pushed_crc)
     if why:
-        return Decision(False, f"cannot tell whether it is better: {why}")
+        return VerificationDecision(False, f"cannot tell whether it is better: {why}")
     worst = before.worst.value_mm
     gain, needed = worst - after.worst.value_mm, _expanded(before.worst, after.worst)
     change = f"worst body diagonal {worst * 1e3:.1f} → {after.worst.value_mm * 1e3:.1f} µm"
     if gain <= needed:
-        return Decision(False, f"{change}: no improvement beyond its uncertainty of {needed * 1e3:.1f} µm")
+        return VerificationDecision(False, f"{change}: no improvement beyond its uncertainty of {needed * 1e3:.1f} µm")
     if (before.helix is None) != (after.helix is None):
-        return Decision(False, f"{change}, but the helix was measured only once: the rest cannot be judged")
+        return VerificationDecision(False, f"{change}, but the helix was measured only once: the rest cannot be judged")
     pairs = [(f"diagonal {k}", before.diagonals[k], after.diagonals[k], worst) for k in sorted(DIAGONALS)]
     if before.helix is not None and after.helix is not None:
         pairs.append(("helix", before.helix, after.helix, before.helix.value_mm))
     for name, old, new, scale in pairs:
         if _expanded(old, new) > gain:
             blind = f"the {name} is uncertain by {_expanded(old, new) * 1e3:.1f} µm, more than the {gain * 1e3:.1f} µm that were gained"
-            return Decision(False, f"{change}, but cannot tell whether nothing got worse: {blind}")
+            return VerificationDecision(False, f"{change}, but cannot tell whether nothing got worse: {blind}")
         worse = new.value_mm - old.value_mm
         if worse > _expanded(old, new) + WORSE_SHARE * scale:
-            return Decision(False, f"{name} got worse by {worse * 1e3:.1f} µm, although the worst diagonal improved")
-    return Decision(True, f"{change} (U = {needed * 1e3:.1f} µm)")
+            return VerificationDecision(False, f"{name} got worse by {worse * 1e3:.1f} µm, although the worst diagonal improved")
+    return VerificationDecision(True, f"{change} (U = {needed * 1e3:.1f} µm)")
 
 
 def judge(value_um: float, u_um: float, limit_um: float) -> Verdict:
@@ -177,7 +177,7 @@ def overall(verdicts: list[Verdict]) -> Verdict:
     return "cannot tell" if "cannot tell" in verdicts or not verdicts else "pass"
 
 
-def figure_rows(found: Figures) -> dict[str, tuple[float, float]]:
+def figure_rows(found: VerificationFigures) -> dict[str, tuple[float, float]]:
     """Figures as (value, standard uncertainty) in µm, by the names used in limits, JSON and reports."""
     rows = {f"diagonal_{k}_um": (f.value_mm * 1e3, f.u_mm * 1e3) for k, f in found.diagonals.items()}
     rows["body_diagonal_um"] = (found.worst.value_mm * 1e3, found.worst.u_mm * 1e3)

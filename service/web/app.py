@@ -30,7 +30,7 @@ from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
 from abbe.service.web.login.access import PUBLIC, needs
 from abbe.service.web.login.auth_middleware import Guard
-from abbe.service.web.login.authentication import Door
+from abbe.service.web.login.authentication import Authenticator
 from abbe.service.web.login.login import add_login
 from abbe.service.web.metrics import add_metrics
 from abbe.service.web.mtconnect import add_mtconnect
@@ -46,7 +46,7 @@ from abbe.service.web.schemas import Health, Problem, Status, Verification, Veri
 PAGE_ROWS = 60
 
 
-class Source(Protocol):
+class StoreSource(Protocol):
     """Where the answers come from."""
 
     async def status(self) -> Status:
@@ -117,11 +117,11 @@ class Application(FastAPI):
 
 
 def create_app(
-    source: Source,
+    source: StoreSource,
     *,
     version: str,
     hosts: Sequence[str] = ("127.0.0.1", "localhost", "[::1]"),
-    door: Door | None = None,
+    door: Authenticator | None = None,
     plant: FactsSource | None = None,
     parts: Parts | None = None,
     api: Sources | None = None,
@@ -130,13 +130,13 @@ def create_app(
 
     Parameters
     ----------
-    source : Source
+    source : StoreSource
         Where the answers come from.
     version : str
         Of this program, for the OpenAPI document.
     hosts : sequence of str
         Names under which the page may be asked for: a foreign page must not reach it through a name of its own (DNS rebinding).
-    door : Door, optional
+    door : Authenticator, optional
         Users and audit; without it everybody may look, and nobody may change anything.
     plant : FactsSource, optional
         What MTConnect documents tell; without it what the status says.
@@ -174,7 +174,7 @@ def create_app(
     return app
 
 
-def _add_routes(app: FastAPI, source: Source) -> None:
+def _add_routes(app: FastAPI, source: StoreSource) -> None:
     env = environment()
     trouble: dict[int | str, dict[str, object]] = {503: {"model": Problem, "description": "The store or the core does not answer"}}
 

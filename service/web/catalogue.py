@@ -32,7 +32,7 @@ HTTP: dict[int, tuple[str, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ErrorEntry:
     """One code: what it is called inside, what it means, and the HTTP status that it is answered with, where it is answered."""
 
     code: str
@@ -67,12 +67,12 @@ def status_of(kind: type[AbbeError]) -> int:
     return next((STATUS[one] for one in kind.__mro__ if one in STATUS), 500)
 
 
-def entries() -> list[Entry]:
+def entries() -> list[ErrorEntry]:
     """The catalogue, in the order of the codes."""
-    found = {code: Entry(code, f"HTTP {status}", meaning, status) for status, (code, meaning) in HTTP.items()}
+    found = {code: ErrorEntry(code, f"HTTP {status}", meaning, status) for status, (code, meaning) in HTTP.items()}
     for kind in (*_tree(AbbeError), *_tree(DriverError)):
         status = status_of(kind) if issubclass(kind, AbbeError) else None
-        found[kind.code] = Entry(kind.code, kind.__name__, _meaning(kind), None if status == 500 else status)
+        found[kind.code] = ErrorEntry(kind.code, kind.__name__, _meaning(kind), None if status == 500 else status)
     return [found[code] for code in sorted(found)]
 
 

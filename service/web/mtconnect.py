@@ -8,14 +8,14 @@ from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
 from abbe.service.plant.facts import Facts, FactsSource
-from abbe.service.plant.mtconnect import Agent, Refused
+from abbe.service.plant.mtconnect import Agent, MtconnectRefusal
 from abbe.service.users.roles import Permission
 from abbe.service.web.login.access import needs
 
 MEDIA_TYPE = "text/xml"
 
 
-class Door:
+class MtconnectAccess:
     """The agent, and where its facts come from. It starts with the first question, which gives it its ``instanceId``."""
 
     def __init__(self, source: FactsSource) -> None:
@@ -30,13 +30,13 @@ class Door:
         self._agent.update(facts)
         try:
             return Response(write(self._agent, facts, request.query_params), media_type=MEDIA_TYPE)
-        except Refused as refused:
+        except MtconnectRefusal as refused:
             return Response(self._agent.error(refused, facts.now_utc), refused.status, media_type=MEDIA_TYPE)
 
 
 def add_mtconnect(app: FastAPI, source: FactsSource) -> None:
     """Mount the three questions. They are in no OpenAPI document: MTConnect describes them."""
-    door = Door(source)
+    door = MtconnectAccess(source)
 
     @app.get("/mtconnect/probe", include_in_schema=False)
     @needs(Permission.READ)

@@ -18,7 +18,7 @@ from abbe.service.web import words
 from abbe.service.web.schemas import Alarm, Device, Due, Job, Mqtt, Status, Verification, Verified
 
 
-class Standing(Protocol):
+class PageStatus(Protocol):
     """How things stand now. All of it raises CoreSilent while nobody knows."""
 
     @property
@@ -61,7 +61,7 @@ class View:
         Name of the machine.
     version : str
         Version of this program.
-    board : Standing
+    board : PageStatus
         The moment.
     archive : ServiceStore
         The past.
@@ -77,7 +77,7 @@ class View:
         self,
         machine: str,
         version: str,
-        board: Standing,
+        board: PageStatus,
         archive: ServiceStore,
         next_due: Callable[[], Sequence[tuple[Schedule, datetime]]],
         broker: str,

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from abbe.service.identification.executors import Dask, Executor, Here, Processes
-from abbe.service.identification.reanalysis import Task, solve_all, tasks_of
+from abbe.service.identification.reanalysis import ReanalysisTask, solve_all, tasks_of
 from abbe.service.storage.store import Store
 from tests.many_campaigns import dask_cluster, fill
 
@@ -44,7 +44,7 @@ def compared(progress: Callable[[str], None]) -> dict:
     return found
 
 
-def _timed(executor: Executor, tasks: list[Task]) -> tuple[str, float]:
+def _timed(executor: Executor, tasks: list[ReanalysisTask]) -> tuple[str, float]:
     start = time.perf_counter()
     docs = [one.doc for one in solve_all(tasks, executor)]
     return json.dumps(docs), time.perf_counter() - start

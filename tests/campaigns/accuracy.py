@@ -24,7 +24,7 @@ from abbe.models.compensation.grid import grid_table, quantise_grid
 from abbe.models.compensation.tables import nine_tables, quantise
 from abbe.models.planning.instruments import Instruments
 from abbe.models.solvers.joint import JointSolution, solve_joint
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
 from abbe.simulators.campaign.sampler import Conditions
 from tests.campaigns.accuracy_bound import bound_mm
@@ -90,7 +90,7 @@ def one(seed: int, campaign: str, minutes: float, nodes: int) -> Row:
     pairs = random_pairs(inner_box_mm(case.machine), PAIR_COUNT, PAIR_SEED)
     grid = quantise_grid(grid_table(solution, (nodes,) * 3), LSB_MM)
     nine = quantise(nine_tables(solution, (25, 25, 25)), LSB_MM)
-    sources = error_sources(solution, Inputs().as_measured())  # these machines are as warm in use as in the campaign
+    sources = error_sources(solution, StatedInputs().as_measured())  # these machines are as warm in use as in the campaign
     predicted = predict_distances(solution, grid.correction_at, sources=sources)
     exact = figures(true_error_mm(case, pairs, lambda p: -solution.deviation_mm(p)))
     return Row(

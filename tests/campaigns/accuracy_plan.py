@@ -7,7 +7,7 @@ import numpy as np
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
 from abbe.models.planning.measurements import HelixTest, helix_path
-from abbe.models.planning.plan import Plan, Step, plan_campaign
+from abbe.models.planning.plan import Plan, PlanStep, plan_campaign
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.simulators.campaign.sampler import Conditions, Rig
 from tests.campaigns.population import BLOCKS, Case, draw_machine
@@ -29,7 +29,7 @@ def measured(rig: Rig, machine: Machine, plan: Plan) -> tuple[RunData, ...]:
     return tuple(_run(rig, step, expected, cups, mounts) for step, expected in zip(plan.steps, plan.runs, strict=True))
 
 
-def _run(rig: Rig, step: Step, expected: RunData, cups: dict[str, np.ndarray], mounts: dict[str, dict]) -> RunData:
+def _run(rig: Rig, step: PlanStep, expected: RunData, cups: dict[str, np.ndarray], mounts: dict[str, dict]) -> RunData:
     if not isinstance(step.test, HelixTest):
         return replace(expected, deviation_mm=_laser(rig, expected, mounts))
     test = step.test

@@ -30,7 +30,7 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.links.backoff import Backoff
 from abbe.drivers.links.modbus_line import Canary
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 from abbe.simulators.faults.modbus_frames import MBAP, Cutter, Frame, answer, parts
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
@@ -90,7 +90,7 @@ class Ours:
         return await self._link.read(address, count, lead=10)
 
     async def write(self, address: int, values: list[int]) -> None:
-        await self._link.write(address, values, Op.NUMBERED)
+        await self._link.write(address, values, ModbusOperation.NUMBERED)
 
     async def close(self) -> None:
         await self._link.close()

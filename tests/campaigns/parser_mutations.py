@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from abbe.drivers.ballbar.frames import Bad, FrameDecoder
 from abbe.drivers.cnc import registers as cnc
 from abbe.drivers.laser import registers as laser
-from abbe.drivers.links.words import Block, words_of
+from abbe.drivers.links.words import RegisterBlock, words_of
 from abbe.simulators.ballbar.device import Settings
 from abbe.simulators.ballbar.wire import encode_ack, encode_info, encode_settings
 from abbe.simulators.faults.serial_bytes import Sample, flipped
@@ -27,7 +27,7 @@ SHARES = {"ball-bar": 0.7, "rtu": 0.1, "mbap": 0.1, "registers": 0.1}
 BEHIND = 3
 """Honest frames behind every spoilt one. A false frame that passes its check sum by chance (1 in 65,536) swallows up to two of them; the
 third must be there."""
-BLOCKS = tuple(block for module in (laser, cnc) for block in vars(module).values() if isinstance(block, Block))
+BLOCKS = tuple(block for module in (laser, cnc) for block in vars(module).values() if isinstance(block, RegisterBlock))
 
 
 @dataclass

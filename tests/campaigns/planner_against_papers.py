@@ -23,14 +23,14 @@ from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest
 from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, uncertainty_mm
 from abbe.models.planning.search import Chosen, Search
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 
 STROKES = ((600.0, 500.0, 450.0), (812.8, 495.0, 508.0), (1000.0, 600.0, 500.0), (400.0, 400.0, 300.0), (1500.0, 800.0, 700.0))
 TRAVEL_MM = np.array([812.8, 495.0, 508.0])
 OFFSETS_MM = ((0.0, 0.0), (-200.0, -75.0), (-200.0, 75.0), (200.0, -75.0), (200.0, 75.0))
 """Yang's origins across the hemisphere's axis, on his machine (math.md 4.3: the centre and four about it), scaled to other strokes."""
 RADII_MM = (175.0, 100.0)
-TOOLS = Instruments(inputs=Inputs().of_the_data_alone())
+TOOLS = Instruments(inputs=StatedInputs().of_the_data_alone())
 CAMPAIGNS = ("one helix", "5 origins x 2 radii", "4 step diagonals", "both")
 
 

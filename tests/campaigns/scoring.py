@@ -15,14 +15,14 @@ import numpy as np
 from abbe.models.compensation.grid import compensable_nodes, grid_table, nodes_mm
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.uncertainty.frame import RigidFree
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
 from abbe.models.volumetric import remove_rigid
 from tests.campaigns.population import Case, Kind, draw_case
 from tests.campaigns.traces import Bent, Traces, traces, typical_size
 
-INPUTS = Inputs(u_scale_temperature_k=0.0, u_bar_temperature_k=0.0)
+INPUTS = StatedInputs(u_scale_temperature_k=0.0, u_bar_temperature_k=0.0)
 """No temperature is wrong in the population."""
 SHARE = 0.5
 """Data share from which on a parameter counts as stated observable."""

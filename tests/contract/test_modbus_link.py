@@ -9,7 +9,7 @@ import pytest
 from abbe.drivers.errors import BadFrame, DeviceFault, LinkDown, Refused, ReplyTimeout
 from abbe.drivers.links import modbus_link
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.urls import parse_url
 from tests.contract.link_peer import TIMEOUT_S, silent, times
 
@@ -178,7 +178,10 @@ async def test_exception_codes(peer, link, code, error, retryable, write, monkey
     assert link.connections == 1  # an exception is a good reply: the link stays
 
 
-@pytest.mark.parametrize(("op", "code", "requests"), [(Op.LEVEL, 5, 2), (Op.LEVEL, 6, 2), (Op.NUMBERED, 6, 2), (Op.NUMBERED, 5, 1)])
+@pytest.mark.parametrize(
+    ("op", "code", "requests"),
+    [(ModbusOperation.LEVEL, 5, 2), (ModbusOperation.LEVEL, 6, 2), (ModbusOperation.NUMBERED, 6, 2), (ModbusOperation.NUMBERED, 5, 1)],
+)
 async def test_a_busy_device_is_asked_again_only_where_that_does_no_harm(peer, link, op, code, requests):
     async def trick(exchange) -> None:
         exchange.send(exchange.frame(bytes([0x90, code])))
@@ -192,10 +195,10 @@ async def test_a_busy_device_is_asked_again_only_where_that_does_no_harm(peer, l
     assert len(peer.requests) == requests
 
 
-@pytest.mark.parametrize(("op", "requests"), [(Op.LEVEL, 2), (Op.NUMBERED, 1), (Op.TRIGGER, 1)])
+@pytest.mark.parametrize(("op", "requests"), [(ModbusOperation.LEVEL, 2), (ModbusOperation.NUMBERED, 1), (ModbusOperation.TRIGGER, 1)])
 async def test_only_a_level_is_written_again_after_silence(peer, link, op, requests):
     peer.tricks = [silent]
-    if op is Op.LEVEL:
+    if op is ModbusOperation.LEVEL:
         await link.write(100, [1], op)
     else:
         with pytest.raises(ReplyTimeout):
@@ -213,7 +216,7 @@ async def test_nothing_is_sent_again_for_a_caller_who_has_gone(peer, link, answe
             exchange.send(exchange.frame(b"\x90\x06"))
 
     peer.always = trick
-    task = asyncio.create_task(link.write(100, [0], Op.LEVEL))
+    task = asyncio.create_task(link.write(100, [0], ModbusOperation.LEVEL))
     await peer.asked.wait()
     task.cancel()
     with pytest.raises(asyncio.CancelledError):

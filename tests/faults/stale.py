@@ -11,7 +11,7 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.links.backoff import Backoff
 from abbe.drivers.links.modbus_line import Canary
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
@@ -77,7 +77,7 @@ async def _do(link: ModbusLink, device: AddressMap, operation: str, address: int
     if operation == "read":
         return await link.read(address, COUNT) == tuple(device.words[address : address + COUNT])
     values = [address + 7 + i for i in range(COUNT)]
-    await link.write(address, values, Op.TRIGGER if operation == "activate" else Op.NUMBERED)
+    await link.write(address, values, ModbusOperation.TRIGGER if operation == "activate" else ModbusOperation.NUMBERED)
     return device.words[address : address + COUNT] == values
 
 

@@ -14,7 +14,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.errors import Interlock, StillActive, TableRefused
 from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
-from abbe.service.push.states import TERMINAL, State
+from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.sequences.interlocks import Suspending, Watching
 from abbe.service.storage.store import Store
 from abbe.simulators.cnc import bank
@@ -57,7 +57,7 @@ async def test_an_honest_control_is_proved(place):
     comp = b.sim.world.controller.comp
     assert comp.crcs[comp.active] == crc  # the table that was in force is in force again
     entries = read_entries(store, b.site.name)
-    assert [e.state for e in entries if e.state in TERMINAL] == [State.ROLLED_BACK] * 4
+    assert [e.state for e in entries if e.state in TERMINAL] == [PushState.ROLLED_BACK] * 4
 
 
 async def test_a_control_with_another_convention_is_named_and_no_table_is_written_any_more(place, monkeypatch):
@@ -78,7 +78,7 @@ async def test_another_unit_stops_at_the_first_step(place, monkeypatch):
     with pytest.raises(TableRefused, match="takes the numbers for another unit"):
         await commission(b.session, store, b.site, progress=ignore_progress)
     comp = b.sim.world.controller.comp
-    assert read_entries(store, b.site.name)[-1].state is State.ROLLED_BACK
+    assert read_entries(store, b.site.name)[-1].state is PushState.ROLLED_BACK
     assert np.abs(comp.correction(np.array([[300.0, 250.0, 200.0]]))).max() == 0.0
     assert await commissioned(b.session.controller, store, b.site) is False
     assert b.sim.world.ballbar._cup_mm is None  # and cup and bar are away
@@ -104,7 +104,7 @@ async def test_a_door_in_the_middle_ends_it_with_the_old_table_and_says_what_is_
     await recover(b.session.controller, store, site)
     comp = b.sim.world.controller.comp
     assert np.abs(comp.correction(np.array([[300.0, 250.0, 200.0]]))).max() == 0.0
-    assert read_entries(store, b.site.name)[-1].state is State.ROLLED_BACK
+    assert read_entries(store, b.site.name)[-1].state is PushState.ROLLED_BACK
 
 
 async def test_a_unit_too_coarse_for_a_harmless_step_is_refused_before_anything_is_mounted(place, monkeypatch):

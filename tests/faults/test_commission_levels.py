@@ -15,7 +15,7 @@ import pytest
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.service.compensation.commission_levels import RESTART, commission_levels
 from abbe.service.compensation.proved_levels import check_level, standing
-from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.errors import StillActive, TableRefused, UnsafeToMove
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import facts
@@ -164,11 +164,11 @@ def small_tables(b, slope: float = 1e-5) -> NineTables:
     return quantise(NineTables(grids, (curves[0], curves[1], curves[2]), (none[0], none[1], none[2])), 1e-4)
 
 
-async def push(b, store, *, attended: bool, slope: float = 1e-5) -> Pushed:
+async def push(b, store, *, attended: bool, slope: float = 1e-5) -> PushResult:
     async def yes() -> Verdict:
         return Verdict(True, "a stand-in")
 
-    wanted = Wanted(small_tables(b, slope), await read_base(b.session.controller), 100, None, {})
+    wanted = WantedTable(small_tables(b, slope), await read_base(b.session.controller), 100, None, {})
     pushing = Pushing(b.session.controller, store, b.site, attended=attended)
     return await pushing.bring(wanted, Questions(list, "a test", yes, yes))
 
@@ -309,7 +309,7 @@ async def test_an_unfinished_push_goes_first_for_the_bank_at_rest_holds_its_old_
     async def yes() -> Verdict:
         return Verdict(True, "a stand-in")
 
-    wanted = Wanted(small_tables(b), await read_base(b.session.controller), 100, None, {})
+    wanted = WantedTable(small_tables(b), await read_base(b.session.controller), 100, None, {})
     with pytest.raises(StillActive):
         await Pushing(b.session.controller, store, b.site).bring(wanted, Questions(list, "a test", yes, cut))
     at_rest, gen = list(controller.comp.words[1 - controller.comp.active]), controller.comp.generation

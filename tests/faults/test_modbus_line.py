@@ -11,7 +11,7 @@ from abbe.drivers.errors import BadFrame, LinkDown
 from abbe.drivers.links.backoff import Backoff
 from abbe.drivers.links.modbus_line import Canary
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, parse_url
 from abbe.simulators.faults.modbus_frames import RTU, Frame, parts
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
@@ -80,7 +80,7 @@ async def test_a_write_whose_echo_cannot_be_trusted_is_in_doubt():
         await link.read(3000, 1)
         line.play(scenario(Fault("drop_reply", at=1, times=2)))  # the canary behind the write
         with pytest.raises(BadFrame, match="canary"):
-            await link.write(500, [1, 2], Op.NUMBERED)
+            await link.write(500, [1, 2], ModbusOperation.NUMBERED)
         assert device.writes == [(500, (1, 2))]  # sent once: whoever wrote it looks what became of it
         line.play(FaultScenario())
         assert await link.read(500, 2) == (1, 2)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from abbe.drivers.errors import DriverError, WrongDevice, on_behalf_of
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.registry import open_controller
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.faults import rows_modbus as rows
@@ -358,4 +358,4 @@ async def test_m10_a_disturbed_line():
 
 
 def test_every_operation_has_a_rule():
-    assert {op.name for op in Op} == {"READ", "LEVEL", "NUMBERED", "TRIGGER"}
+    assert {op.name for op in ModbusOperation} == {"READ", "LEVEL", "NUMBERED", "TRIGGER"}

@@ -11,7 +11,7 @@ import pytest
 from abbe.drivers.api import BarBatch
 from abbe.drivers.ballbar import driver
 from abbe.drivers.errors import Backpressure, LinkDown
-from abbe.drivers.links.reading import Piece
+from abbe.drivers.links.reading import ReadPiece
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.capture.recovery import ledger_of
 from abbe.service.capture.settings import CaptureSettings
@@ -52,7 +52,7 @@ async def sent_and_pulled(on: Stage, tap: SlowTap) -> None:
             await asyncio.sleep(0.001)
     taken = ring.take
 
-    def late(timeout_s: float) -> list[Piece] | None:
+    def late(timeout_s: float) -> list[ReadPiece] | None:
         pieces = taken(timeout_s)
         threading.Event().wait(0.2)  # a thread that gets no processor: whoever ends the stream now could be before it
         return pieces

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from abbe.drivers.ballbar.frames import Settings
+from abbe.drivers.ballbar.frames import BoxSettings
 from abbe.drivers.errors import DeviceFault, Rebooted, SettingsChanged, on_behalf_of
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.laser.registers import SIGNAL_LOW
@@ -77,7 +77,7 @@ async def test_a_box_that_lost_its_settings_is_refused_until_it_has_them_again(t
     async with stage(tmp_path, "S6", "settings") as on:
         assert on.bar.settings is None
         await on.bar.identify()
-        assert on.bar.settings == Settings(on.bar.settings.tag, number=1, unit=0, range_nm=1_000_000, zero_nm=0)
+        assert on.bar.settings == BoxSettings(on.bar.settings.tag, number=1, unit=0, range_nm=1_000_000, zero_nm=0)
         on.box.world.ballbar.switch(**changed)
         refusal = await on.fails(entered(on.bar.stream(1000)))
         assert isinstance(refusal, SettingsChanged)

@@ -14,7 +14,7 @@ from abbe.models.machine import Machine
 from abbe.models.volumetric import volume_grid
 from abbe.service.cli import run
 from abbe.service.compensation.comp_export import export, identified
-from abbe.service.formats.choice import Judge, best_of, choices
+from abbe.service.formats.choice import FormatJudge, best_of, choices
 from abbe.service.formats.controls import CONTROLS
 from abbe.service.formats.identified import Identified
 from abbe.service.formats.model import AxisTable, Compensation, correction_at
@@ -120,7 +120,7 @@ def test_grid_leaves_less_than_one_axis_tables() -> None:
     found = choices(_known(), CONTROLS["fanuc-30i"], START)
     assert found[2].rms_mm < found[1].rms_mm
     assert best_of(found) is found[2]
-    judge = Judge(_known(), CONTROLS["fanuc-30i"])
+    judge = FormatJudge(_known(), CONTROLS["fanuc-30i"])
     assert float(np.sqrt(np.mean(judge.left_mm(Compensation()) ** 2))) == pytest.approx(found[0].rms_mm)
 
 

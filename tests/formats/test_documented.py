@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from abbe.service.formats.model import AxisTable, Compensation, Curve, ProductTable, correction_at
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable, correction_at
 from abbe.service.formats.proof import all_proofs
 from abbe.service.formats.registry import FORMATS
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.text import TextFile
 from tests.formats.page import PAGE, page
 
@@ -53,11 +53,11 @@ def _added(comp: Compensation, x: float, way: int, axis: int = 0) -> float:
 def test_comp_files_do_what_linuxcnc_was_seen_to_do(shared: Path) -> None:
     """controllers.md 1.4: motor minus commanded position, read from the running control."""
     folder = shared / "examples" / "linuxcnc"
-    x = FORMATS["linuxcnc-1"].read((TextFile("x.comp", (folder / "x.comp").read_text()),), Settings())
+    x = FORMATS["linuxcnc-1"].read((TextFile("x.comp", (folder / "x.comp").read_text()),), FormatSettings())
     seen = ((50, 1, 0.0050), (150, 1, 0.0175), (250, 1, 0.0200), (250, -1, 0.0215), (333, 1, 0.0084), (450, 1, -0.0125), (450, -1, -0.0110))
     for at, way, added in seen:
         assert _added(x, at, way) == pytest.approx(added, abs=2e-6), (at, way)
-    z = FORMATS["linuxcnc-0"].read((TextFile("z.comp", (folder / "z.comp").read_text()),), Settings())
+    z = FORMATS["linuxcnc-0"].read((TextFile("z.comp", (folder / "z.comp").read_text()),), FormatSettings())
     assert _added(z, -100, -1, axis=2) == pytest.approx(-0.0120, abs=1e-9)
     assert _added(z, -125, 1, axis=2) == pytest.approx(-0.00375, abs=1e-9)
 
@@ -66,7 +66,7 @@ def test_comp_files_do_what_linuxcnc_was_seen_to_do(shared: Path) -> None:
 def test_comp_files_come_back_byte_for_byte(shared: Path, name: str) -> None:
     text = (shared / "examples" / "linuxcnc" / name).read_text()
     form = FORMATS["linuxcnc-1"]
-    settings = Settings(decimals=3)
+    settings = FormatSettings(decimals=3)
     assert form.write(form.read((TextFile(name, text),), settings), settings) == (TextFile(name, text),)
 
 
@@ -78,8 +78,8 @@ def test_hal_network_does_what_linuxcnc_was_seen_to_do() -> None:
         AxisTable("X", "Y", p, *[0.012 * (p / 500) ** 2 + 50e-6 * p] * 2),
         AxisTable("X", "Z", p, *[-0.006 * p / 500] * 2),
     )
-    product = ProductTable("Z", Curve("Y", p, 20e-6 * p / 400), Curve("Y", np.array([0.0, 500.0]), np.array([0.0, 500.0])))
-    form, settings = FORMATS["linuxcnc-hal"], Settings(decimals=9)
+    product = ProductTable("Z", AxisCurve("Y", p, 20e-6 * p / 400), AxisCurve("Y", np.array([0.0, 500.0]), np.array([0.0, 500.0])))
+    form, settings = FORMATS["linuxcnc-hal"], FormatSettings(decimals=9)
     comp = form.read(form.write(Compensation(tables, (product,)), settings), settings)
     at = np.array([[100, 200, -100], [250, 100, -50], [500, 400, -300]], dtype=float)
     seen = [[0.008000, 0.005480, 0.000800], [0.005657, 0.015500, -0.002500], [0.000000, 0.037000, 0.002000]]
@@ -106,7 +106,7 @@ def test_siemens_encoder_example_comes_out_byte_for_byte() -> None:
     value = np.zeros(801)
     value[:3] = [-0.003, -0.010, -0.012]
     table = AxisTable("X", "X", -200.0 + np.arange(801), value, value)
-    text = FORMATS["siemens-eec"].write(Compensation((table,)), Settings())[0].text
+    text = FORMATS["siemens-eec"].write(Compensation((table,)), FormatSettings())[0].text
     assert text.startswith(EEC_HEAD)
     assert text.endswith(EEC_TAIL)
     middle = text[len(EEC_HEAD) : -len(EEC_TAIL)].splitlines()
@@ -133,9 +133,9 @@ M17
 def test_siemens_cross_example_comes_back_byte_for_byte() -> None:
     """The variables of 6FC5397-1CP10-5BA0 p. 222 in their order (its own step of 6.73 mm does not divide its range: shortened here)."""
     form = FORMATS["siemens-cec"]
-    comp = form.read((TextFile("NC_CEC.INI", CEC),), Settings())
+    comp = form.read((TextFile("NC_CEC.INI", CEC),), FormatSettings())
     assert (comp.tables[0].axis, comp.tables[0].output) == ("Y", "X")
-    assert form.write(comp, Settings())[0].text == CEC
+    assert form.write(comp, FormatSettings())[0].text == CEC
 
 
 def test_fanuc_example_sums_up_as_drawn() -> None:
@@ -143,7 +143,7 @@ def test_fanuc_example_sums_up_as_drawn() -> None:
     numbers = [2, 1, 1, -2, 0, -1, 0, -1, 2, 1, 0, -1, -1, -2, 0, 1, 2]
     head = ["%", "N03620Q1A1P40", "N03621Q1A1P33", "N03622Q1A1P49", "N03623Q1A1P1", "N03624Q1A1P50"]
     text = "\n".join([*head, *(f"N{10033 + k}Q1P{v}" for k, v in enumerate(numbers)), "%"]) + "\n"
-    settings = Settings(reference_mm=(0.0, 0.0, 0.0), first_point=33)
+    settings = FormatSettings(reference_mm=(0.0, 0.0, 0.0), first_point=33)
     form = FORMATS["fanuc-pitch"]
     comp = form.read((TextFile("PITCH.TXT", text),), settings)
     assert comp.tables[0].position_mm[0] == -400.0
@@ -193,7 +193,7 @@ CENTROID = (
 
 def test_centroid_example_comes_back_byte_for_byte() -> None:
     """cncsnw.com, version 1: 24 values over -1448819 counts, which is 40 mm a point at 40000 counts an inch."""
-    settings = Settings(reference_mm=(0.0, 0.0, 0.0), counts_per_mm=40000 / 25.4)
+    settings = FormatSettings(reference_mm=(0.0, 0.0, 0.0), counts_per_mm=40000 / 25.4)
     form = FORMATS["centroid"]
     comp = form.read((TextFile("cnc-x.tab", CENTROID),), settings)
     assert comp.tables[0].position_mm[0] == pytest.approx(-920.0, abs=1e-3)

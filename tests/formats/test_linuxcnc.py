@@ -15,12 +15,12 @@ import pytest
 
 from abbe.service.formats.model import AxisTable, Compensation, correction_at
 from abbe.service.formats.registry import FORMATS
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from tests.conftest import Require
 
 HUNDREDTHS_OF_NM = 5e-8
 """What the end of a move leaves open, mm; the files' unit is 1 nm."""
-TOLD = Settings(reference_mm=(0.0, 0.0, 0.0))
+TOLD = FormatSettings(reference_mm=(0.0, 0.0, 0.0))
 SCRIPT = """mount -t tmpfs tmpfs /tmp && ip link set lo up && cd "$1" && export LINUXCNC_RUNDIR=/tmp/r
 mkdir -p /tmp/r && chmod 1777 /tmp/r
 ./start2.sh simpy.ini && RTAPI_UID=65534 RTAPI_FIFO_PATH=/tmp/r/rtapi_fifo HOME=/tmp/r timeout 60 /usr/bin/python3 "$2" "$1/seen.json"

@@ -12,7 +12,7 @@ import pytest
 from abbe.drivers.cnc.tables import TableImage, crc32, encode
 from abbe.service.cli import run
 from abbe.service.push.entries import GENESIS, follow
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.storage.records import PushEntryRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import distinct
@@ -95,7 +95,9 @@ def test_of_older_runs_the_database_knows_what_their_table_was(
         if known == "in force before":
             other = encode(TableImage(0, 9, 100, (0.0, 0.0, 0.0), (1e-5, 1e-5, 1e-5), (0, 0, 0), ()))
             store.add_table(machine, None, other, crc32(other), {})
-            entry = follow((), 1, State.SNAPSHOT, {"base_crc": crc32(image), "base_image": image.hex()}, "2026-06-01T10:00:00Z", GENESIS)
+            entry = follow(
+                (), 1, PushState.SNAPSHOT, {"base_crc": crc32(image), "base_image": image.hex()}, "2026-06-01T10:00:00Z", GENESIS
+            )
             store.add_push_entry(PushEntryRecord(0, "sim", 1, entry.seq, str(entry.state), entry.doc, entry.utc, entry.prev, entry.digest))
     found, said = export(number, "--db", url)
     assert (found, words in said) == (code, True), said

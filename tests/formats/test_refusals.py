@@ -11,13 +11,13 @@ from abbe.service.errors import FormatRefused, TableContradicts, TableFileError
 from abbe.service.formats.compare import check_same
 from abbe.service.formats.model import AxisTable, Compensation, Lattice
 from abbe.service.formats.registry import FORMATS
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 from abbe.service.formats.text import TextFile
 
 P = np.array([0.0, 100.0, 200.0])
 V = np.array([0.0, -0.010, 0.004])
 GOOD = Compensation((AxisTable("X", "X", P, V, V - 0.003),))
-TOLD = Settings(reference_mm=(0.0, 0.0, 0.0))
+TOLD = FormatSettings(reference_mm=(0.0, 0.0, 0.0))
 
 BAD_FILES = [
     ("linuxcnc-1", "x.comp", "# made by hand\n0 0 0\n100 0.01 0.01\n", r"x\.comp:1: .*ends the table here"),
@@ -89,7 +89,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("key", "comp", "told", "said"), REFUSED)
-def test_what_does_not_fit_is_not_written(key: str, comp: Compensation, told: Settings, said: str) -> None:
+def test_what_does_not_fit_is_not_written(key: str, comp: Compensation, told: FormatSettings, said: str) -> None:
     with pytest.raises(FormatRefused, match=said):
         FORMATS[key].write(comp, told)
 

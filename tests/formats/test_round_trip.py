@@ -11,20 +11,20 @@ from hypothesis import strategies as st
 
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.machine import AXES, Machine
-from abbe.service.formats.model import AxisTable, Compensation, Curve, Lattice, Motions, ProductTable
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable
 from abbe.service.formats.registry import FORMATS, Format
-from abbe.service.formats.settings import Settings
+from abbe.service.formats.settings import FormatSettings
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [-400.0, 0.0], [-300.0, 100.0]]))
 EXACT_MM = 1e-9
 
 
 @st.composite
-def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, Settings]:
+def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, FormatSettings]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     n = draw(st.integers(3, min(form.limits.points, 40)))
     decimals = draw(st.integers(3, 7))
-    told = Settings(
+    told = FormatSettings(
         reference_mm=None,
         decimals=decimals,
         machine=MACHINE,
@@ -48,8 +48,8 @@ def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, Settings]:
     )
     products = ()
     if form.limits.products and draw(st.booleans()):
-        angle = Curve("Y", grids[1], rng.uniform(-1, 1, grids[1].size) * size * 1e-3)
-        products = (ProductTable("X", angle, Curve("Z", grids[2], np.round(grids[2] - grids[2][0], 3))),)
+        angle = AxisCurve("Y", grids[1], rng.uniform(-1, 1, grids[1].size) * size * 1e-3)
+        products = (ProductTable("X", angle, AxisCurve("Z", grids[2], np.round(grids[2] - grids[2][0], 3))),)
     return Compensation(tables, products), told
 
 
@@ -68,12 +68,12 @@ def _table(rng: np.random.Generator, a: int, o: int, grid: np.ndarray, size: flo
 
 def _motions(rng: np.random.Generator, grids: list[np.ndarray], size: float) -> Motions:
     curves = {
-        n: Curve(AXES[a], grids[a], rng.uniform(-size, size, grids[a].size) * (1.0 if c < 3 else 1e-3)) for n, (a, c) in PLACES.items()
+        n: AxisCurve(AXES[a], grids[a], rng.uniform(-size, size, grids[a].size) * (1.0 if c < 3 else 1e-3)) for n, (a, c) in PLACES.items()
     }
     return Motions(MACHINE, curves, {n: float(v) for n, v in zip(SQUARENESS, rng.uniform(-1e-4, 1e-4, 3), strict=True)})
 
 
-def _unit(form: Format, told: Settings) -> float:
+def _unit(form: Format, told: FormatSettings) -> float:
     if form.key.startswith("fanuc"):
         return told.unit_mm * told.magnification
     return 1.0 / told.counts_per_mm if form.key == "centroid" else told.step_mm

@@ -19,7 +19,7 @@ from abbe.drivers.errors import DeviceFault, Refused
 from abbe.drivers.registry import open_controller
 from abbe.models.compensation.tables import NineTables
 from abbe.service.compensation.commission_levels import commission_levels
-from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.push.operations import Verdict
 from abbe.service.site import Site, machine_doc
@@ -93,13 +93,13 @@ def tables_of_nine(image: TableImage) -> NineTables:
     return NineTables((at[0], at[1], at[2]), (by[0], by[1], by[2]), (none[0], none[1], none[2]))
 
 
-async def bring(cnc: ModbusController, store: Store, site: Site, tables: NineTables, *, attended: bool = True) -> Pushed:
+async def bring(cnc: ModbusController, store: Store, site: Site, tables: NineTables, *, attended: bool = True) -> PushResult:
     """Push as a job does, with stand-ins for what would be measured."""
 
     async def yes() -> Verdict:
         return Verdict(True, "a stand-in")
 
-    wanted = Wanted(tables, await read_base(cnc), 100, None, {})
+    wanted = WantedTable(tables, await read_base(cnc), 100, None, {})
     return await Pushing(cnc, store, site, attended=attended).bring(wanted, Questions(list, "a test", yes, yes))
 
 

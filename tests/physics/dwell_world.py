@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abbe.models.alignment.dwell import Dwells, Planned, merged
+from abbe.models.alignment.dwell import Dwells, PlannedDwell, merged
 from abbe.models.paths.lines import cycles_of
 
 SETTLE_S = 0.3
@@ -19,7 +19,7 @@ class Case:
     """``planned`` and the stream. ``visits``: start, end and number of the planned standstill of each one made (-1: of none, it was
     approached from the other side). ``lost``: numbers of those that were passed without resting."""
 
-    planned: tuple[Planned, ...]
+    planned: tuple[PlannedDwell, ...]
     t_s: np.ndarray
     y_mm: np.ndarray
     visits: tuple[tuple[float, float, int], ...]
@@ -40,7 +40,7 @@ def case(seed: int) -> Case:
     um/m, noise 0.3 um; in turn nothing wrong, lost dwells, doubled dwells, both."""
     rng = np.random.default_rng([seed, 20])
     overrun = float(np.exp(rng.uniform(np.log(0.05), 0.0)))
-    planned = merged([Planned(x, 1.0) for x in line_targets(rng, overrun)])
+    planned = merged([PlannedDwell(x, 1.0) for x in line_targets(rng, overrun)])
     slow = float(rng.choice([1.0, 1.0, 4.0]))  # long dwells: the drift has time
     drift = rng.uniform(-20e-3, 20e-3) / 3600.0
     lost_motion, scale, wave = rng.uniform(-15e-3, 15e-3), rng.uniform(-150e-6, 150e-6), rng.uniform(0.0, 5e-3)
@@ -78,7 +78,7 @@ def case(seed: int) -> Case:
         before = one.target
     t = np.arange(0.0, now, SAMPLE_S) + rng.uniform(0.0, 0.9 * SAMPLE_S)
     y = np.interp(t, *zip(*knots, strict=True)) + drift * t + 0.3e-3 * rng.normal(size=t.size)
-    planned = tuple(Planned(p.target, p.seconds * slow, p.readings) for p in planned)
+    planned = tuple(PlannedDwell(p.target, p.seconds * slow, p.readings) for p in planned)
     words = f"seed {seed}: overrun {overrun:.3f} mm, drift {drift * 3.6e6:.0f} um/h, lost motion {lost_motion * 1e3:.0f} um"
     return Case(planned, t, y, tuple(visits), tuple(sorted(lost)), f"{words}, lost {sorted(lost)}, doubled {sorted(doubled)}")
 

@@ -19,7 +19,7 @@ from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.observability.rank import (
     Knowledge,
-    Seen,
+    SeenInformation,
     campaign_columns,
     compressed,
     perfect_setup,
@@ -55,7 +55,7 @@ class Experiment:
         stated = replace(stated_knowledge(terms, self.runs, setup.names), shared=self.shared, lost_motion=False)
         return perfect_setup(stated, terms, setup, self.perfect)
 
-    def seen(self, degree: int, extra: dict[str, np.ndarray] | None = None) -> Seen:
+    def seen(self, degree: int, extra: dict[str, np.ndarray] | None = None) -> SeenInformation:
         terms, setup = smooth_terms(degree), setup_unknowns(self.runs, Priors())
         known = self.knowledge(terms, setup)
         known = replace(known, held={**known.held, **(extra or {})})

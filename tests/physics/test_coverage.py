@@ -13,7 +13,7 @@ from abbe.models.compensation.summary import mean_linear
 from abbe.models.compensation.tables import nine_tables, predict_residual
 from abbe.models.geometry.chain import design
 from abbe.models.solvers.joint import JointSolution, solve_joint
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
 from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 from tests.physics.truth import MACHINE, SIGMA, Truth, linear_parameters
@@ -33,7 +33,7 @@ def test_the_stated_model_uncertainty_is_the_true_error(solved):
     ratios = []
     for truth, s in solved:
         gap = remove_rigid(grid, truth.deviation(grid) - s.deviation_mm(grid))
-        sources = error_sources(s, Inputs().as_measured())  # these truths are as warm in use as in the campaign
+        sources = error_sources(s, StatedInputs().as_measured())  # these truths are as warm in use as in the campaign
         ratios.append(
             np.sqrt(np.mean(np.sum(gap**2, axis=1)))
             / predict_residual(s, nine_tables(s, (3, 3, 3), sources=sources), sources=sources).u_model_mm

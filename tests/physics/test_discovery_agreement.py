@@ -17,8 +17,8 @@ from abbe.models.discovery.agreement import NO_NOISE, TOO_FEW, _Noise, _tested, 
 from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.discovery.prediction import Solved, predictions, solve
-from abbe.models.discovery.whitened_problem import Scene, scene_of
+from abbe.models.discovery.prediction import SolvedModel, predictions, solve
+from abbe.models.discovery.whitened_problem import WhitenedProblem, scene_of
 from abbe.service.discovery.never_fitted import ALARM
 from abbe.simulators.hidden.cases import make_case
 from abbe.simulators.hidden.suite import write_case
@@ -30,7 +30,7 @@ CASES = 12 if os.environ.get("ABBE_TEST_LONG") == "1" else 6
 
 
 @cache
-def solved(folder: Path, number: int) -> tuple[Scene, Solved, dict[str, np.ndarray]]:
+def solved(folder: Path, number: int) -> tuple[WhitenedProblem, SolvedModel, dict[str, np.ndarray]]:
     """A clean machine, measured, and the present simulation fitted to it."""
     name = f"null{number:04d}"
     write_case(make_case(name, FIRST_SEED + number, "null"), folder)

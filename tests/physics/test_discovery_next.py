@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from abbe.models.discovery.experiment.candidates import offers
-from abbe.models.discovery.experiment.design import Suspect, propose, prospects
+from abbe.models.discovery.experiment.design import SuspectEffect, propose, prospects
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path
 from tests.physics.discovery_paths import bar, campaign, case_of_paths, circle
@@ -16,9 +16,9 @@ EFFECTS = {e.name: e for e in CATALOGUE}
 INCLUDES = ("rigid6", "setup_centre_offset", "bar_length_error", "mirror_tilt")
 
 
-def suspect(name: str, key: str = "") -> Suspect:
+def suspect(name: str, key: str = "") -> SuspectEffect:
     effect = EFFECTS[name]
-    return Suspect(effect, key, {p.name: p.typical for p in effect.shape})
+    return SuspectEffect(effect, key, {p.name: p.typical for p in effect.shape})
 
 
 def one_way() -> tuple[Path, ...]:

@@ -15,7 +15,7 @@ from abbe.models.discovery.candidates import rows_for
 from abbe.models.discovery.case import Case, CaseRun, Role
 from abbe.models.discovery.discover import discover, fairly
 from abbe.models.discovery.noise import Colour, unscaled
-from abbe.models.discovery.projection import Space
+from abbe.models.discovery.projection import SignalSpace
 from abbe.models.discovery.selection import Contest, joined, weighed
 from abbe.models.discovery.whitened_problem import scene_of
 from abbe.models.effects.catalogue import CATALOGUE
@@ -237,7 +237,7 @@ def test_whitened_noise_has_unit_variance_and_no_memory() -> None:
 def test_what_is_left_of_readings_is_orthogonal_to_what_was_taken_out() -> None:
     rng = np.random.default_rng(5)
     columns, more, y = rng.normal(size=(80, 5)), rng.normal(size=(80, 2)), rng.normal(size=80)
-    space = Space.of(y, columns, columns.T @ columns, np.full(5, 1e6)).without(more, np.full(2, 1e6))
+    space = SignalSpace.of(y, columns, columns.T @ columns, np.full(5, 1e6)).without(more, np.full(2, 1e6))
     every = np.column_stack([columns, more])
     left = y - every @ np.linalg.lstsq(every, y, rcond=None)[0]
     assert space.residual == pytest.approx(left, abs=1e-8)

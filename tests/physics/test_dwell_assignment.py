@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from abbe.models.alignment.dwell import Planned, detect, named
+from abbe.models.alignment.dwell import PlannedDwell, detect, named
 from abbe.models.alignment.matching import match, places_reach
 from tests.physics.dwell_world import SETTLE_S, ZERO_MM, case, wrong_readings
 
@@ -54,7 +54,7 @@ def stream(stands, feed_mm_s=10.0, noise_mm=3e-4):
 
 
 WAY = (0.0, 20.0, 40.0, 60.0, 60.05, 60.0, 40.0, 20.0, 0.0)
-PLANNED = tuple(Planned(x, 1.0) for x in WAY)
+PLANNED = tuple(PlannedDwell(x, 1.0) for x in WAY)
 
 
 def test_an_error_as_large_as_the_overrun_does_not_make_the_turn_the_last_position():
@@ -95,7 +95,7 @@ def test_a_standstill_that_may_be_two_places_is_not_guessed():
     assert found.rival is not None
     stand, ours, other = found.rival
     assert (stand, {ours, other}) == (1, {1, 2})
-    planned = tuple(Planned(float(x), 1.0) for x in targets)
+    planned = tuple(PlannedDwell(float(x), 1.0) for x in targets)
     t, y = stream([(0.0, 1.0), (20.018, 1.0), (40.0, 1.0)])
     with pytest.raises(ValueError, match="may be planned standstill 2 or 3; nothing is guessed"):
         detect(t, y, planned, settle_s=SETTLE_S, zero=0.0)

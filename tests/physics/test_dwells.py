@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from abbe.models.alignment.dwell import Planned, detect, merged, named, noise_of
+from abbe.models.alignment.dwell import PlannedDwell, detect, merged, named, noise_of
 
 SETTLE_S = 0.3
 
@@ -14,7 +14,7 @@ def world(seed):
     n, step = int(rng.integers(5, 16)), float(rng.choice([2.0, 20.0, 80.0]))
     way = step * np.arange(n)
     targets = np.concatenate([way, way[::-1]])
-    planned = merged([Planned(float(x), 1.0) for x in targets])
+    planned = merged([PlannedDwell(float(x), 1.0) for x in targets])
     feed = min(float(rng.choice([5.0, 30.0, 100.0])), step / 0.4)  # what lasts less than two samples nobody can see
     wrong = {}
     if seed % 3 == 1:
@@ -79,7 +79,7 @@ def test_the_words_say_which_standstill_is_missing_or_too_much():
 
 
 def test_a_stand_of_the_wrong_length_is_said():
-    planned = merged([Planned(float(x), 1.0) for x in (0.0, 10.0, 20.0, 30.0)])
+    planned = merged([PlannedDwell(float(x), 1.0) for x in (0.0, 10.0, 20.0, 30.0)])
     t = np.arange(0.0, 9.0, 0.05)
     y = np.interp(t, [0.0, 1.0, 1.1, 2.1, 2.2, 5.2, 5.3, 6.3], [0.0, 0.0, 10.0, 10.0, 20.0, 20.0, 30.0, 30.0])[: np.searchsorted(t, 6.3)]
     found = detect(t[: y.size], y, planned, settle_s=SETTLE_S)
@@ -89,7 +89,7 @@ def test_a_stand_of_the_wrong_length_is_said():
 
 def test_where_the_turn_is_missing_nobody_guesses_which_way_the_plan_lies():
     """Out and back without the turning point: the same as a plan that is one step shorter, unless it is known where the zero is."""
-    planned = merged([Planned(float(x), 1.0) for x in (0.0, 10.0, 20.0, 30.0, 20.0, 10.0, 0.0)])
+    planned = merged([PlannedDwell(float(x), 1.0) for x in (0.0, 10.0, 20.0, 30.0, 20.0, 10.0, 0.0)])
     knots = [0.0, 1.0, 1.2, 2.2, 2.4, 4.4, 4.6, 5.6, 5.8, 6.8]
     t = np.arange(0.0, 6.8, 0.05)
     y = 5.0 + np.interp(t, knots, [0.0, 0.0, 10.0, 10.0, 20.0, 20.0, 10.0, 10.0, 0.0, 0.0])
@@ -103,13 +103,13 @@ def test_where_the_turn_is_missing_nobody_guesses_which_way_the_plan_lies():
 
 def test_a_stream_of_another_program_is_refused_and_noise_alone_is_no_program():
     planned, t, y, *_ = world(3)
-    other = merged([Planned(float(x), 1.0) for x in np.cumsum(np.random.default_rng(1).uniform(3.0, 50.0, 20))])
+    other = merged([PlannedDwell(float(x), 1.0) for x in np.cumsum(np.random.default_rng(1).uniform(3.0, 50.0, 20))])
     with pytest.raises(ValueError, match="another program"):
         detect(t, y, other, settle_s=SETTLE_S)
     with pytest.raises(ValueError, match="another program"):
         detect(t, np.random.default_rng(2).normal(size=t.size), planned, settle_s=SETTLE_S)
     with pytest.raises(ValueError, match="one place"):
-        detect(t, y, (Planned(0.0, 1.0), Planned(0.0, 1.0)), settle_s=SETTLE_S)
+        detect(t, y, (PlannedDwell(0.0, 1.0), PlannedDwell(0.0, 1.0)), settle_s=SETTLE_S)
 
 
 def test_noise_is_told_from_motion():
@@ -120,7 +120,7 @@ def test_noise_is_told_from_motion():
 
 def stream(seed=0):
     """A short line out and back and its stream, nothing wrong."""
-    planned = merged([Planned(float(x), 1.0) for x in (0, 50, 100, 150, 200, 200, 150, 100, 50, 0)])
+    planned = merged([PlannedDwell(float(x), 1.0) for x in (0, 50, 100, 150, 200, 200, 150, 100, 50, 0)])
     knots_s, knots_mm, now = [0.0], [0.0], 0.0
     for one in planned:
         for seconds in (abs(one.target - knots_mm[-1]) / 100.0, one.seconds):

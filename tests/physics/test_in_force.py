@@ -14,7 +14,7 @@ from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from abbe.models.solvers.in_force import LEAD_IN_MM, InForce
+from abbe.models.solvers.in_force import LEAD_IN_MM, AppliedTables
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.models.volumetric import remove_rigid, volume_grid
@@ -73,10 +73,10 @@ def test_an_axis_follows_its_drive_as_the_lost_motion_lets_it() -> None:
         play.run(lead + add(lead))
         return play.run(path + add(path))
 
-    found = InForce(table.correction_at, lost).moved_mm(path)
+    found = AppliedTables(table.correction_at, lost).moved_mm(path)
     assert np.abs(found - (axes(True) - axes(False))).max() < 1e-12
     # an axis that follows every move is another thing here: that is what the readings had been taken for
-    assert np.abs(InForce(table.correction_at).moved_mm(path) - found).max() > 2e-3
+    assert np.abs(AppliedTables(table.correction_at).moved_mm(path) - found).max() > 2e-3
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -84,7 +84,7 @@ def test_readings_less_the_table_are_those_of_the_machine_without_it(seed: int) 
     scenario = Scenario(seed=seed)
     table, plain, corrected = rough_table(seed), Rig(scenario, QUIET), CorrectedRig(scenario, QUIET)
     corrected.table = table
-    force = InForce(table.correction_at, plain.draws.backlash_mm)
+    force = AppliedTables(table.correction_at, plain.draws.backlash_mm)
     for name, order in (("ppp", "XYZ"), ("ppn", "ZYX")):
         path, beam = steps(name, order)
         gap = corrected.laser(path, beam) - force.laser_mm(path, beam) - plain.laser(path, beam)
@@ -128,10 +128,10 @@ def solved(runs: list[RunData]) -> JointSolution:
     return solve_joint(machine(), tuple(block_average(r, 400) if r.kind == "bar" else r for r in runs))
 
 
-def without(runs: list[RunData], force: InForce, stays: InForce) -> list[RunData]:
+def without(runs: list[RunData], force: AppliedTables, stays: AppliedTables) -> list[RunData]:
     """Readings less what a table did, but for what stays in them."""
 
-    def added(r: RunData, force: InForce) -> np.ndarray:
+    def added(r: RunData, force: AppliedTables) -> np.ndarray:
         return force.bar_mm(r.axes_mm, r.centre_mm) if r.kind == "bar" else force.laser_mm(r.axes_mm, r.beam)
 
     return [replace(r, deviation_mm=r.deviation_mm - added(r, force) + added(r, stays)) for r in runs]
@@ -157,12 +157,14 @@ def test_a_second_identification_is_as_certain_as_the_first(seed: int) -> None:
     first = solved(campaign(rig))
     rig.table = quantise(nine_tables(first, (25, 21, 19)), 1e-4)
     runs = campaign(rig)
-    told = [r for r in without(runs, InForce(rig.table.correction_at), InForce(np.zeros_like)) if not r.label.startswith("step")]
+    told = [
+        r for r in without(runs, AppliedTables(rig.table.correction_at), AppliedTables(np.zeros_like)) if not r.label.startswith("step")
+    ]
     lost, u_lost = np.array(list(solved(told).backlash_mm().values())).T
     assert np.abs(lost - rig.draws.backlash_mm).max() < 0.5e-3
     smooth = smooth_of(rig.table)
     assert smooth is not None
-    second = solved(without(runs, InForce(rig.table.correction_at, lost), InForce(smooth)))
+    second = solved(without(runs, AppliedTables(rig.table.correction_at, lost), AppliedTables(smooth)))
     assert model_uncertainty_mm(second) < 1.5 * model_uncertainty_mm(first)  # the order that is chosen differs; up to 1.4 was seen
     assert second.noise_mm["laser"] < 1.2 * first.noise_mm["laser"]
     # what is read is what the table has left: the new table is the old one plus this
@@ -171,7 +173,7 @@ def test_a_second_identification_is_as_certain_as_the_first(seed: int) -> None:
     found = np.sqrt(np.mean(np.sum(remove_rigid(grid, first.deviation_mm(grid)) ** 2, axis=1)))
     assert left < 0.3 * found
     # how well the lost motion is known adds nothing to speak of: 0.06 µm at most was seen, where the model is known to 1.1 µm
-    other = solved(without(runs, InForce(rig.table.correction_at, lost + u_lost), InForce(smooth)))
+    other = solved(without(runs, AppliedTables(rig.table.correction_at, lost + u_lost), AppliedTables(smooth)))
     moved = remove_rigid(grid, other.deviation_mm(grid) - second.deviation_mm(grid))
     assert np.sqrt(np.mean(np.sum(moved**2, axis=1))) < 0.1 * model_uncertainty_mm(second)
     as_commanded = solved(runs)

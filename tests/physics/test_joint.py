@@ -13,7 +13,7 @@ from abbe.models.compensation.tables import nine_tables, predict_residual, quant
 from abbe.models.paths.lines import diagonal_ends, straight_line
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import block_average, nominal_reading
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
 from abbe.models.verification import diagonal_figure, helix_figure
 from abbe.models.volumetric import field_figures, remove_rigid, rigid_design, volume_grid
@@ -31,7 +31,7 @@ def test_the_identified_field_is_the_true_one_within_its_own_uncertainty(solved)
     grid = volume_grid(MACHINE.stroke_mm, 7)
     gap = remove_rigid(grid, truth.deviation(grid) - s.deviation_mm(grid))
     rms = np.sqrt(np.mean(np.sum(gap**2, axis=1)))
-    sources = error_sources(s, Inputs().as_measured())  # this truth is as warm in use as in the campaign
+    sources = error_sources(s, StatedInputs().as_measured())  # this truth is as warm in use as in the campaign
     stated = predict_residual(s, nine_tables(s, (13, 11, 10)), sources=sources).u_model_mm
     assert 0.4 < rms / stated < 1.6  # one machine; ten of them in tests/physics/test_coverage.py
     assert rms < 1e-3

@@ -6,8 +6,8 @@ from numpy.polynomial import legendre
 from scipy import stats
 
 from abbe.models.geometry.bases import smooth_terms
-from abbe.models.solvers.components import Components, Found, cautious, estimate, posterior, slope
-from abbe.models.solvers.information import Sums
+from abbe.models.solvers.components import Components, FittedComponents, cautious, estimate, posterior, slope
+from abbe.models.solvers.information import InformationSums
 from abbe.models.solvers.priors import SMALLEST_BEND, Priors, SizeModel, size_model, smooth_shapes
 from tests.physics.truth import MACHINE
 
@@ -20,7 +20,7 @@ def problem(seed=0, n=(40, 25)):
     x = rng.normal(size=6) * np.repeat([2.0, 0.3], 3)
     y = [m @ x + s * rng.normal(size=len(m)) for m, s in zip(a, (0.5, 2.0), strict=True)]
     parts = [np.stack([m.T @ m for m in a]), np.stack([m.T @ v for m, v in zip(a, y, strict=True)])]
-    return a, y, Sums(*parts, np.array([v @ v for v in y]), np.array(n, dtype=float))
+    return a, y, InformationSums(*parts, np.array([v @ v for v in y]), np.array(n, dtype=float))
 
 
 def log_density(a, y, c):
@@ -63,7 +63,7 @@ def test_sizes_that_are_known_badly_widen_the_prior_and_no_shape_is_held_to_nano
     model = size_model(MACHINE, smooth_terms(6), (), np.ones(0), Priors())
     n, h = model.typical.size, model.sd.size
     small = Components(np.array([-12.0 * (name == "angle") for name in model.names]), np.zeros(2))
-    found = [cautious(model, Found(small, v * np.eye(h + 2), 0.0)) for v in (1e-12, 0.5)]
+    found = [cautious(model, FittedComponents(small, v * np.eye(h + 2), 0.0)) for v in (1e-12, 0.5)]
     before, known, unknown = (np.linalg.norm(m.root * c.half(m), axis=1) for m, c in ((model, small), *found))
     at = np.concatenate(model.blocks)
     rest = np.setdiff1d(np.arange(n), at)

@@ -10,8 +10,8 @@ from abbe.models.papers.kwon import calibration
 from abbe.models.papers.kwon.calibration import (
     FRAME_NAMES,
     PARAMETERS,
-    Calibration,
-    Readings,
+    KwonCalibration,
+    PlaneReadings,
     calibrate,
     default_prior,
     error_left,
@@ -38,14 +38,14 @@ def cube(half: float, middle: float = 0.0, n: int = 4) -> np.ndarray:
 
 def experiment(
     seed: int, lam: np.ndarray, *, known: bool = False, u_lambda: float = 0.0, size: float = 1.0
-) -> tuple[Calibration, np.ndarray, Geometry]:
+) -> tuple[KwonCalibration, np.ndarray, Geometry]:
     """``size``: truths in units of the prior that the calibration is told."""
     rng = np.random.default_rng(seed)
     theta = size * default_prior() * rng.standard_normal(18)
     true = machine(theta)
     reached = lam + u_lambda * rng.standard_normal(lam.shape)
     measured = from_frame(FRAME, forward(true, reached)) + U * rng.standard_normal(lam.shape)
-    return calibrate(NOMINAL, Readings(lam, measured, U, u_lambda), frame=FRAME if known else None), theta, true
+    return calibrate(NOMINAL, PlaneReadings(lam, measured, U, u_lambda), frame=FRAME if known else None), theta, true
 
 
 @pytest.mark.parametrize(("half", "known", "u_lambda"), [(1.0, False, 0.0), (20.0, False, 0.0), (20.0, True, 0.0), (20.0, False, 2e-3)])
@@ -107,11 +107,11 @@ def test_prior_test_is_the_chi_square_of_what_the_points_carry() -> None:
     assert chi2 == pytest.approx(11.0 - 2.0 * min(max(over, 0.0), 1.0) if over > 0.0 else c.prior_test.chi2, rel=1e-3)
 
 
-def with_outlier(size_mm: float) -> Calibration:
+def with_outlier(size_mm: float) -> KwonCalibration:
     lam, rng = cube(20.0), np.random.default_rng(5)
     measured = from_frame(FRAME, forward(machine(default_prior() * rng.standard_normal(18)), lam)) + U * rng.standard_normal(lam.shape)
     measured[20, 0] += size_mm
-    return calibrate(NOMINAL, Readings(lam, measured, U))
+    return calibrate(NOMINAL, PlaneReadings(lam, measured, U))
 
 
 @pytest.mark.parametrize("size_mm", [0.05, 5.0])
@@ -233,7 +233,7 @@ def test_points_worse_than_stated_widen_it_too() -> None:
     lam = cube(20.0)
     rng = np.random.default_rng(7)
     measured = from_frame(FRAME, forward(machine(np.zeros(18)), lam)) + 10 * U * rng.standard_normal(lam.shape)
-    c = calibrate(NOMINAL, Readings(lam, measured, U))
+    c = calibrate(NOMINAL, PlaneReadings(lam, measured, U))
     assert c.estimate.variance_factor == pytest.approx(100.0, rel=0.3)
     assert rms(c.residual_mm) == pytest.approx(10 * U * np.sqrt(3), rel=0.2)
 
@@ -245,7 +245,7 @@ def test_without_noise_the_truth_comes_back_where_points_tell_it() -> None:
     theta[9:12] = [3e-4, -2e-4, 1e-4]  # thb
     theta[15:18] = [0.02, -0.05, 0.03]  # dz
     lam = cube(20.0)
-    c = calibrate(NOMINAL, Readings(lam, from_frame(FRAME, forward(machine(theta), lam)), 1e-6), frame=FRAME)
+    c = calibrate(NOMINAL, PlaneReadings(lam, from_frame(FRAME, forward(machine(theta), lam)), 1e-6), frame=FRAME)
     np.testing.assert_allclose(c.estimate.theta[6:], theta[6:], atol=2e-6)
     assert rms(c.residual_mm) < 1e-7
 
@@ -254,13 +254,13 @@ def test_refusals() -> None:
     lam = cube(5.0, n=3)
     good = from_frame(FRAME, forward(NOMINAL, lam))
     with pytest.raises(ValueError, match="positive"):
-        Readings(lam, good, 0.0)
+        PlaneReadings(lam, good, 0.0)
     with pytest.raises(ValueError, match="do not fit"):
-        Readings(lam, good[:3], U)
+        PlaneReadings(lam, good[:3], U)
     with pytest.raises(ValueError, match="18 finite positive prior"):
-        calibrate(NOMINAL, Readings(lam, good, U), prior_sd=np.full(18, np.inf))
+        calibrate(NOMINAL, PlaneReadings(lam, good, U), prior_sd=np.full(18, np.inf))
     with pytest.raises(ValueError, match="18 finite positive prior"):
-        calibrate(NOMINAL, Readings(lam, good, U), prior_sd=np.ones(17))
+        calibrate(NOMINAL, PlaneReadings(lam, good, U), prior_sd=np.ones(17))
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_refusals() -> None:
 )
 def test_a_frame_that_is_no_placement_is_refused(frame: np.ndarray, text: str) -> None:
     lam = cube(5.0, n=3)
-    readings = Readings(lam, from_frame(FRAME, forward(NOMINAL, lam)), U)
+    readings = PlaneReadings(lam, from_frame(FRAME, forward(NOMINAL, lam)), U)
     with pytest.raises(ValueError, match=f"^calibration: frame: .*{text}"):
         calibrate(NOMINAL, readings, frame=frame)
 
@@ -285,10 +285,10 @@ def test_an_iteration_that_does_not_settle_is_refused(monkeypatch: pytest.Monkey
     measured = from_frame(FRAME, forward(machine(0.5 * default_prior()), lam))
     monkeypatch.setattr(calibration, "ITERATIONS", 1)
     with pytest.raises(NotSettled, match="not settled after 1 steps"):
-        calibrate(NOMINAL, Readings(lam, measured, U))
+        calibrate(NOMINAL, PlaneReadings(lam, measured, U))
 
 
 def test_commands_without_a_position_are_refused() -> None:
     lam = np.concatenate([cube(5.0, n=3), [[-200.0, 0.0, 0.0]]])
     with pytest.raises(NoForwardSolution, match="pose row 27"):
-        calibrate(NOMINAL, Readings(lam, lam, U))
+        calibrate(NOMINAL, PlaneReadings(lam, lam, U))

@@ -8,7 +8,7 @@ import pytest
 
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.solvers.assessment import observability
-from abbe.models.solvers.observability.cures import Campaign, count_seen, trials
+from abbe.models.solvers.observability.cures import CampaignLayout, count_seen, trials
 from abbe.models.solvers.observability.rank import Knowledge, campaign_columns, compressed
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import Priors
@@ -156,7 +156,7 @@ def test_virtual_additions_give_the_ranks_that_the_tables_have_for_real_ones(wan
 def gain(experiment, degree, key):
     terms, setup = smooth_terms(degree), setup_unknowns(experiment.runs, Priors())
     columns = compressed(campaign_columns(experiment.machine, terms, experiment.runs, setup))
-    campaign = Campaign(experiment.machine, terms, experiment.runs, columns, experiment.knowledge(terms, setup))
+    campaign = CampaignLayout(experiment.machine, terms, experiment.runs, columns, experiment.knowledge(terms, setup))
     found = trials(campaign, experiment.seen(degree))
     return next(count_seen(t.seen) for t in found if t.addition.key == key)
 

@@ -13,24 +13,26 @@ import pytest
 from abbe.models.geometry.bases import Term, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
-from abbe.models.papers.wang.experiments import Plan, distance_errors_mm, interpolated_mm, readings
+from abbe.models.papers.wang.experiments import WangPlan, distance_errors_mm, interpolated_mm, readings
 from abbe.models.papers.wang.mirror import diagonal_beam
 from abbe.models.papers.wang.model import exact_positions_mm
 from abbe.models.solvers.helix import LINEAR, fit_helix
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.solvers.least_squares import Estimate, solve_map
+from abbe.models.solvers.least_squares import ParameterEstimate, solve_map
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import Setup, linearise, setup_unknowns
+from abbe.models.solvers.observe import SetupUnknowns, linearise, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.solvers.step_diagonal import increments, wang_eq7
 from abbe.models.volumetric import volume_grid
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.wang_step_diagonal import DEMO_PLANS, IDEAL, NOISY, TILTED, errors_of, tilts_of
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 
 
-def solved(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: Setup, sigma_mm: float, priors: Priors) -> Estimate:
+def solved(
+    machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: SetupUnknowns, sigma_mm: float, priors: Priors
+) -> ParameterEstimate:
     """Most probable unknowns of the exact readings for priors as stated, nothing about them learned: Gauss and Newton, three steps."""
     names = (*(t.name for t in terms), "lost_X", "lost_Y", "lost_Z", *setup.names)
     prior = np.concatenate([term_prior_sd(machine, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
@@ -117,7 +119,7 @@ class Yang:
             )
         return tuple(out)
 
-    def six(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    def six(self, estimate: ParameterEstimate) -> tuple[np.ndarray, np.ndarray]:
         """Slopes and squareness of an estimate, with their standard uncertainties."""
         factor = np.array([*(2.0 / self.machine.length_mm), 1.0, 1.0, 1.0])
         names = ("EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z")
@@ -138,7 +140,7 @@ def test_yang_our_readings_of_his_machine_are_those_of_the_independent_script(ya
 
 
 def test_yang_six_parameters_come_back_without_set_up_error(yang):
-    perfect = Setup((), np.zeros(0))
+    perfect = SetupUnknowns((), np.zeros(0))
     for run in yang.runs(np.zeros(3)):
         found, _ = yang.six(solved(yang.machine, SIX, (run,), perfect, 1e-7, Priors()))
         assert np.abs(found - yang.truth_in_our_datum).max() < 1e-4 * 1e-6  # exact readings: nothing is neglected
@@ -215,7 +217,7 @@ class Wang:
         self.box = np.stack([np.zeros(3), self.travel], axis=1)
         self.grid = volume_grid(self.box, 5)
         self.machine = Machine("w-b-X-Y-Z-t", self.box)
-        self.case = Case(self.file, ("wang_step_diagonal",)).at("cases", TILTED)
+        self.case = VectorCase(self.file, ("wang_step_diagonal",)).at("cases", TILTED)
         self.demo = self.file["compensation_demo"]
 
     def deviation(self, p: np.ndarray) -> np.ndarray:
@@ -224,7 +226,7 @@ class Wang:
     def worst_um(self, model_mm: np.ndarray) -> float:
         return float(np.abs(distance_errors_mm(self.grid, model_mm, self.deviation(self.grid))).max()) * 1e3
 
-    def runs(self, plan: Plan, noise_mm: float = 0.0, seed: int = 0) -> tuple[RunData, ...]:
+    def runs(self, plan: WangPlan, noise_mm: float = 0.0, seed: int = 0) -> tuple[RunData, ...]:
         """One run per diagonal and line; the first record is zero and without noise, as the file's readings have it."""
         y = readings(plan, self.deviation, tilts_of(self.case))
         y = y + np.random.default_rng(seed).normal(0, noise_mm, y.size)
@@ -268,7 +270,7 @@ def wang(shared):
     return Wang(json.loads((shared / "vectors" / "wang_step_diagonal.json").read_text()))
 
 
-def plan_of(wang: Wang, name: str) -> Plan:
+def plan_of(wang: Wang, name: str) -> WangPlan:
     return DEMO_PLANS[name](wang.travel, wang.n)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from abbe.models.functions.line_fit import straight_line
 from abbe.models.notation.pahk import TYPES
-from abbe.models.papers.pahk.offset import Setup, as_measured, line_deviation_mm, offset_terms, refer_to_origin
+from abbe.models.papers.pahk.offset import OffsetSetup, as_measured, line_deviation_mm, offset_terms, refer_to_origin
 from abbe.models.papers.pahk.tables import ParameterTables
 
 # math.md 2.1, corrected value = measured + terms; <> only with the functional point at the probe tip.
@@ -91,7 +91,7 @@ def test_one_derivation_gives_the_rules_of_every_type(name):
     rng = np.random.default_rng(11)
     tables, offset = random_tables(rng), np.array([300.0, 200.0, 150.0])
     still = rng.normal(0.0, 3e-5, (3, 3))
-    terms = offset_terms(TYPES[name], tables, Setup(offset), still)
+    terms = offset_terms(TYPES[name], tables, OffsetSetup(offset), still)
     agree(terms, *by_the_rules(name, tables, offset, still, offset, own=True))
 
 
@@ -113,7 +113,7 @@ def test_a_probe_offset_lengthens_every_lever_listed_or_not(name):
             d[j][:, i] -= work * (f - f[0]) if i == j else residual(x, f)
     theta = np.array([slope[a, b] + slope[b, a] for a, b in ((0, 1), (0, 2), (1, 2))])
     square = square + theta * [kind.alpha_sign, 1, 1]
-    agree(offset_terms(kind, tables, Setup(offset, probe), still), d, square)
+    agree(offset_terms(kind, tables, OffsetSetup(offset, probe), still), d, square)
 
 
 @pytest.mark.parametrize("name", ["FB1", "FB2"])
@@ -121,7 +121,7 @@ def test_a_reflector_on_the_table_drops_the_terms_of_own_travel(name):
     rng = np.random.default_rng(12)
     tables, offset, still = random_tables(rng), np.array([300.0, 200.0, 150.0]), rng.normal(0.0, 3e-5, (3, 3))
     point = np.where(TYPES[name].work_side > 0, 0.0, offset)
-    terms = offset_terms(TYPES[name], tables, Setup(offset, table_point_mm=point), still)
+    terms = offset_terms(TYPES[name], tables, OffsetSetup(offset, table_point_mm=point), still)
     # The moving table's own coordinate of the reflector is zero, the others are those of the line: the rules without <>.
     agree(terms, *by_the_rules(name, tables, offset, still, offset, own=False))
 
@@ -130,7 +130,7 @@ def test_a_reflector_anywhere_on_a_table_sees_that_tables_rigid_motion():
     rng = np.random.default_rng(13)
     kind, tables, point = TYPES["FB2"], random_tables(rng), np.array([120.0, -35.0, 80.0])
     x, e = tables.positions_mm[0], tables.e_rad[0]
-    seen = as_measured(kind, tables, Setup(np.array([300.0, 200.0, 150.0]), table_point_mm=point))
+    seen = as_measured(kind, tables, OffsetSetup(np.array([300.0, 200.0, 150.0]), table_point_mm=point))
     own = tables.d_mm[0] + np.cross(e, point)  # the reflector's motion in the bed's frame beside the travel, Pahk's lateral signs
     along = tables.d_mm[0][:, 0] - np.cross(e, point)[:, 0]  # the table's travel is counted backwards
     assert seen.d_mm[0][:, 0] == pytest.approx(along - along[0], abs=1e-15)
@@ -142,7 +142,7 @@ def test_a_reflector_anywhere_on_a_table_sees_that_tables_rigid_motion():
 def test_there_and_back(name):
     rng = np.random.default_rng(14)
     tables = random_tables(rng)
-    setup = Setup(rng.uniform(100.0, 300.0, (3, 3)), rng.normal(0.0, 30.0, 3))  # every line at an offset of its own
+    setup = OffsetSetup(rng.uniform(100.0, 300.0, (3, 3)), rng.normal(0.0, 30.0, 3))  # every line at an offset of its own
     back = refer_to_origin(TYPES[name], as_measured(TYPES[name], tables, setup), setup)
     for j in range(3):
         assert back.d_mm[j] == pytest.approx(tables.d_mm[j], abs=1e-15)
@@ -153,10 +153,10 @@ def test_there_and_back(name):
 def test_lines_that_share_no_point_have_their_own_slopes(name):
     tables = random_tables(np.random.default_rng(15))
     kind, offsets = TYPES[name], np.array([[0.0, 200.0, 50.0], [400.0, 0.0, 300.0], [100.0, 90.0, 0.0]]) + 60.0
-    seen = as_measured(kind, tables, Setup(offsets))
+    seen = as_measured(kind, tables, OffsetSetup(offsets))
     slope = np.zeros((3, 3))
     for j in range(3):
-        off = line_deviation_mm(kind, tables, Setup(offsets[j]), j)  # each line measured alone
+        off = line_deviation_mm(kind, tables, OffsetSetup(offsets[j]), j)  # each line measured alone
         slope[j] = [straight_line(tables.positions_mm[j], off[:, i])[0] for i in range(3)]
     theta = -np.array([slope[a, b] + slope[b, a] for a, b in ((0, 1), (0, 2), (1, 2))])
     assert seen.squareness_rad * [kind.alpha_sign, 1, 1] == pytest.approx(theta, abs=1e-18)
@@ -166,7 +166,7 @@ def test_lines_that_share_no_point_have_their_own_slopes(name):
 @given(st.sampled_from(list(TYPES)), st.floats(-3.0, 3.0), st.integers(0, 2**31))
 def test_the_terms_are_linear_in_the_angles(name, factor, seed):
     rng = np.random.default_rng(seed)
-    tables, setup = random_tables(rng), Setup(rng.uniform(150.0, 250.0, 3))
+    tables, setup = random_tables(rng), OffsetSetup(rng.uniform(150.0, 250.0, 3))
     scaled = ParameterTables(tables.positions_mm, tables.d_mm, tuple(factor * e for e in tables.e_rad), tables.squareness_rad)
     one, many = offset_terms(TYPES[name], tables, setup), offset_terms(TYPES[name], scaled, setup)
     assert many.squareness_rad == pytest.approx(factor * one.squareness_rad, abs=1e-17)
@@ -177,13 +177,13 @@ def test_the_terms_are_linear_in_the_angles(name, factor, seed):
 def test_no_angular_errors_no_terms_and_no_offset_outside_the_tables():
     tables = random_tables(np.random.default_rng(16))
     straight = ParameterTables(tables.positions_mm, tables.d_mm, tuple(0 * e for e in tables.e_rad), tables.squareness_rad)
-    setup = Setup(np.array([300.0, 200.0, 150.0]))
+    setup = OffsetSetup(np.array([300.0, 200.0, 150.0]))
     seen = as_measured(TYPES["CX"], straight, setup)
     assert seen.squareness_rad == pytest.approx(tables.squareness_rad, abs=1e-18)
     assert seen.d_mm[1] == pytest.approx(tables.d_mm[1], abs=1e-15)
     with pytest.raises(ValueError, match="nothing is extrapolated"):
-        as_measured(TYPES["CX"], tables, Setup(np.array([300.0, 2000.0, 150.0])))
+        as_measured(TYPES["CX"], tables, OffsetSetup(np.array([300.0, 2000.0, 150.0])))
     with pytest.raises(ValueError, match="finite"):
-        Setup(np.array([np.nan, 0.0, 0.0]))
+        OffsetSetup(np.array([np.nan, 0.0, 0.0]))
     with pytest.raises(ValueError, match="shape"):
-        Setup(np.zeros(2))
+        OffsetSetup(np.zeros(2))

@@ -24,7 +24,7 @@ from abbe.models.planning.plan import plan_campaign, uncertainty_mm
 from abbe.models.planning.search import extra_minutes
 from abbe.models.solvers.observe import run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from tests.campaigns.planner_against_papers import compare, machines
 
 MACHINE = Machine(
@@ -128,7 +128,7 @@ def test_a_goal_is_reached_with_fewer_minutes_or_said_to_be_out_of_reach():
     assert hopeless.goal.minutes_needed is None
     assert hopeless.goal.limit_mm > 1e-5
     assert "temperature of the machine's scales" in hopeless.goal.limit_by
-    cold = replace(FEW, inputs=Inputs().of_the_data_alone())
+    cold = replace(FEW, inputs=StatedInputs().of_the_data_alone())
     perfect = plan_campaign(MACHINE, minutes=5.0, goal_mm=1e-5, tools=cold)
     assert "calibration" in perfect.goal.limit_by
     assert perfect.goal.limit_mm < hopeless.goal.limit_mm

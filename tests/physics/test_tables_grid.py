@@ -16,7 +16,7 @@ from abbe.models.geometry.chain import design
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observations import block_average
 from abbe.models.uncertainty.frame import RigidFree
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.mask import compensable_mask
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
@@ -112,7 +112,7 @@ def test_the_grid_takes_what_nine_tables_cannot(solved, sources):
 
 def test_the_predicted_distances_hold_on_the_true_machine(solved):
     truth, s = solved
-    sources = error_sources(s, Inputs().as_measured())  # this truth is as warm in use as in the campaign
+    sources = error_sources(s, StatedInputs().as_measured())  # this truth is as warm in use as in the campaign
     for nodes in (5, 9, 13) if os.environ.get("ABBE_TEST_LONG") == "1" else (5, 13):
         table = grid_table(s, (nodes,) * 3, sources=sources)
         stated, seen = predict_distances(s, table.correction_at, pairs=PAIRS, sources=sources), true_distances(truth, table.correction_at)
@@ -171,7 +171,7 @@ def test_table_and_mask_judge_by_the_same_uncertainty(too_simple):
 
 def test_stated_inputs_are_in_the_uncertainties_of_tables_and_can_be_given(solved):
     _, s = solved
-    warm, sure = (error_sources(s, Inputs(u_scale_temperature_k=u)) for u in (2.0, 0.0))
+    warm, sure = (error_sources(s, StatedInputs(u_scale_temperature_k=u)) for u in (2.0, 0.0))
     for of in (
         lambda x: grid_table(s, (3, 3, 3), sources=x).u_mm.max(),
         lambda x: nine_tables(s, (5, 5, 5), sources=x).u_mm[0][:, 0].max(),
@@ -183,7 +183,7 @@ def test_stated_inputs_are_in_the_uncertainties_of_tables_and_can_be_given(solve
 
 def test_uncertainties_of_the_nodes_are_those_of_the_field_without_rigid_motion(solved):
     _, s = solved
-    table = grid_table(s, (4, 4, 4), sources=error_sources(s, Inputs().of_the_data_alone()))
+    table = grid_table(s, (4, 4, 4), sources=error_sources(s, StatedInputs().of_the_data_alone()))
     p = nodes_mm(table.position_mm)
     root = np.linalg.cholesky(s.term_covariance + 1e-30 * np.eye(len(s.terms)))
     drawn = design(MACHINE, s.terms, p) @ root @ np.random.default_rng(1).standard_normal((len(s.terms), 2000))

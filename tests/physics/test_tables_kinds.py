@@ -15,7 +15,7 @@ from abbe.models.compensation.summary import SQUARENESS, mean_linear
 from abbe.models.compensation.tables import NineTables, nine_tables, quantise
 from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
 from tests.physics.truth import FLOOR, MACHINE, SIGMA, Truth
 
@@ -87,7 +87,7 @@ def test_parameters_and_their_tables_correct_the_same_distances_as_the_nine(solv
 def test_squareness_parameters_carry_the_uncertainty_of_the_very_slopes_they_are(solved):
     """Slopes of the tables, for draws of the machine from its covariance: their scatter is u, and they are not the mean over the volume."""
     _, s = solved
-    data = error_sources(s, Inputs().of_the_data_alone())
+    data = error_sources(s, StatedInputs().of_the_data_alone())
     counts = (9, 8, 7)
     found = squareness_tables(s, counts, sources=data).parameters
     root = np.linalg.cholesky(s.term_covariance + 1e-32 * np.eye(len(s.terms)))

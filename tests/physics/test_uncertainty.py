@@ -12,7 +12,7 @@ from abbe.models.solvers.observe import run_design
 from abbe.models.uncertainty import prediction as module
 from abbe.models.uncertainty.budget import budget_over
 from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
-from abbe.models.uncertainty.inputs import STEEL_PER_K, Inputs
+from abbe.models.uncertainty.inputs import STEEL_PER_K, StatedInputs
 from abbe.models.uncertainty.mask import compensable_mask
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.response import response
@@ -40,7 +40,7 @@ def solution(runs):
 
 def test_sources_of_the_data_add_up_to_the_covariance_of_the_solution(solution):
     """Noise and priors without remainder; with the widening for estimated sizes never below what the solver states, and hardly above."""
-    sources = error_sources(solution, Inputs().of_the_data_alone())
+    sources = error_sources(solution, StatedInputs().of_the_data_alone())
     r = response(solution)
     n = len(solution.terms)
     sd = np.sqrt(np.diag(r.covariance)[:n])
@@ -99,7 +99,7 @@ def test_rigid_free_frame_is_that_of_remove_rigid_and_holds_less(solution):
 
 def test_scale_temperature_is_expansion_times_travel(solution):
     """alpha u_T (x - start), each axis by itself, in the machine's own frame (positioning is zero at the start of the stroke)."""
-    p = predict_deviation(error_sources(solution, Inputs(u_scale_temperature_k=0.5)), GRID)
+    p = predict_deviation(error_sources(solution, StatedInputs(u_scale_temperature_k=0.5)), GRID)
     u = np.sqrt(p.variance_mm2[p.names.index("scale_temperature")])
     np.testing.assert_allclose(u, 0.5 * STEEL_PER_K * (GRID - MACHINE.stroke_mm[:, 0]), atol=1e-12)
 
@@ -129,7 +129,7 @@ def test_bar_length_counts_where_nothing_else_gives_a_scale(truth):
 def test_bar_temperature_acts_as_a_longer_bar(solution):
     """alpha u_T R of each bar: the change of the estimate when every bar reading is longer by that."""
     r = response(solution)
-    inputs = replace(Inputs().of_the_data_alone(), u_bar_temperature_k=2.0)
+    inputs = replace(StatedInputs().of_the_data_alone(), u_bar_temperature_k=2.0)
     source = error_sources(solution, inputs).source("bar_temperature")
     longer = np.concatenate([np.full(run.deviation_mm.size, 2.0 * STEEL_PER_K * (run.radius_mm or 0.0)) for run in solution.data])
     root, n = solution.prior_root, len(solution.terms)
@@ -141,7 +141,7 @@ def test_bar_temperature_acts_as_a_longer_bar(solution):
 
 
 def test_repeatability_takes_its_share_out_of_the_readings_and_adds_to_a_single_approach(solution):
-    data = Inputs().of_the_data_alone()
+    data = StatedInputs().of_the_data_alone()
     total = predict_deviation(error_sources(solution, data), GRID)
     small = predict_deviation(error_sources(solution, replace(data, repeatability_mm=5e-5)), GRID)
     np.testing.assert_allclose(small.u_mm, total.u_mm, rtol=1e-9)
@@ -151,7 +151,7 @@ def test_repeatability_takes_its_share_out_of_the_readings_and_adds_to_a_single_
 
 
 def test_every_source_has_words_and_degrees_of_freedom(solution):
-    inputs = Inputs(repeatability_mm=1e-4, repeatability_dof=9.0)
+    inputs = StatedInputs(repeatability_mm=1e-4, repeatability_dof=9.0)
     sources = error_sources(solution, inputs)
     assert {s.name for s in sources.sources} == set(WORDS)
     assert sources.source("repeatability").dof == 9.0
@@ -175,7 +175,7 @@ def test_order_that_was_left_out_is_allowed_for(truth, runs):
     missed = remove_rigid(GRID, truth.deviation(GRID)) - remove_rigid(GRID, s.deviation_mm(GRID))
     held = []
     for orders in (0, 6):
-        p = predict_deviation(error_sources(s, replace(Inputs().of_the_data_alone(), orders_above=orders)), GRID, frame=frame)
+        p = predict_deviation(error_sources(s, replace(StatedInputs().of_the_data_alone(), orders_above=orders)), GRID, frame=frame)
         held.append(float((np.abs(missed) < p.expanded_mm).mean()))
     assert held[1] > 0.93
     assert held[0] < held[1] - 0.1
@@ -184,7 +184,7 @@ def test_order_that_was_left_out_is_allowed_for(truth, runs):
 def test_omitted_orders_cost_what_a_solution_with_them_says(solution, runs):
     """Prior share of orders above: the joint solution of both, with the same sizes, has the same covariance of the prediction."""
     extra = 2
-    sources = error_sources(solution, replace(Inputs().of_the_data_alone(), orders_above=extra))
+    sources = error_sources(solution, replace(StatedInputs().of_the_data_alone(), orders_above=extra))
     r, n = response(solution), len(solution.terms)
     above = sources.terms[n:]
     b = np.concatenate([run_design(MACHINE, above, run, solution.setup)[:, : len(above)] for run in solution.data])

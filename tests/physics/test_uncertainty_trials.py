@@ -15,7 +15,7 @@ from abbe.models.uncertainty import campaign_trials as module
 from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
 from abbe.models.uncertainty.distributions import Distribution
 from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
@@ -36,7 +36,7 @@ def solution():
 
 @pytest.fixture(scope="module")
 def sources(solution):
-    return error_sources(solution, Inputs(repeatability_mm=1e-4))
+    return error_sources(solution, StatedInputs(repeatability_mm=1e-4))
 
 
 def test_trials_give_the_propagated_uncertainty_and_validate_its_intervals(sources):
@@ -63,7 +63,7 @@ def test_trials_through_the_exact_readings_are_those_through_the_gain(sources):
 
 def test_limits_make_shorter_intervals_than_the_law_of_propagation_says(solution):
     """Temperatures stated as limits and large: the interval of a rectangle ends at 1.65 u, and the propagated one is not valid."""
-    hot = error_sources(solution, Inputs(u_scale_temperature_k=2.0))
+    hot = error_sources(solution, StatedInputs(u_scale_temperature_k=2.0))
     point = np.array([[580.0, 20.0, 20.0]])
     p = predict_deviation(hot, point, frame=FRAME)
     draw = campaign_trials(hot, point, frame=FRAME, distributions=LIMITS).linear()
@@ -76,8 +76,8 @@ def test_limits_make_shorter_intervals_than_the_law_of_propagation_says(solution
 @pytest.mark.parametrize("repeatability_mm", [1e-4, 5e-4, 3e-3] if LONG else [1e-4, 3e-3])
 def test_repeatability_counts_once_however_large_it_is_stated(solution, repeatability_mm):
     """3 um stated for readings that scatter by less: the law of propagation and trials of the readings agree all the same."""
-    inputs = replace(Inputs().of_the_data_alone(), repeatability_mm=repeatability_mm)
-    stated, none = error_sources(solution, inputs), error_sources(solution, Inputs().of_the_data_alone())
+    inputs = replace(StatedInputs().of_the_data_alone(), repeatability_mm=repeatability_mm)
+    stated, none = error_sources(solution, inputs), error_sources(solution, StatedInputs().of_the_data_alone())
     u, without = (predict_deviation(s, POINTS, frame=FRAME).u_mm for s in (stated, none))
     np.testing.assert_allclose(u, without, rtol=1e-9)
     drawn = campaign_trials(stated, POINTS, frame=FRAME).linear()(np.random.default_rng(1), 20_000)
@@ -86,7 +86,7 @@ def test_repeatability_counts_once_however_large_it_is_stated(solution, repeatab
 
 def test_trials_of_a_point_do_not_depend_on_the_points_beside_it(solution):
     """What the estimated sizes add is cut at nothing point by point, as the law has it: 200 other points change nothing."""
-    sources = error_sources(solution, Inputs().of_the_data_alone())
+    sources = error_sources(solution, StatedInputs().of_the_data_alone())
     others = np.random.default_rng(3).uniform(MACHINE.stroke_mm[:, 0], MACHINE.stroke_mm[:, 1], (200, 3))
     alone, among = (
         campaign_trials(sources, p, frame=FRAME).linear()(np.random.default_rng(1), 300)[:, :18] for p in (POINTS, np.r_[POINTS, others])
@@ -112,7 +112,7 @@ def test_readings_are_drawn_in_parts_and_too_many_points_are_refused(sources, mo
 
 
 def test_one_approach_scatters_more_than_the_mean_of_many(solution):
-    many, once = (error_sources(solution, Inputs(repeatability_mm=5e-4, single_approach=s)) for s in (False, True))
+    many, once = (error_sources(solution, StatedInputs(repeatability_mm=5e-4, single_approach=s)) for s in (False, True))
     u = [adaptive(campaign_trials(s, POINTS[:1]).linear(), np.random.default_rng(4), largest=10_000).u for s in (many, once)]
     np.testing.assert_allclose(u[1] ** 2 - u[0] ** 2, 25e-8, atol=0.1 * (u[0] ** 2).max())
 
@@ -134,7 +134,7 @@ def test_intervals_hold_the_truth_of_machines_that_the_solver_does_not_know():
             frame = volume_frame(case.machine)
             inside = np.random.default_rng(seed).uniform(0.05, 0.95, (100, 3))
             points = case.machine.stroke_mm[:, 0] + case.machine.length_mm * inside
-            sources = error_sources(solve_joint(case.machine, case.runs), Inputs().of_the_data_alone())
+            sources = error_sources(solve_joint(case.machine, case.runs), StatedInputs().of_the_data_alone())
             p = predict_deviation(sources, points, frame=frame)
             truth = case.truth.deviation_mm(np.concatenate([frame.reference_mm, points]))
             at = len(frame.reference_mm)

@@ -5,19 +5,19 @@ import pytest
 
 from abbe.models.functions.monomials import error_arrays, monomials
 from abbe.models.notation.yang import workpiece_mm
-from abbe.models.papers.wang.experiments import Plan as LaserPlan
+from abbe.models.papers.wang.experiments import WangPlan as LaserPlan
 from abbe.models.papers.wang.experiments import distance_errors_mm, interpolated_mm, problem, readings
 from abbe.models.papers.wang.model import monomial_errors as wang_errors
 from abbe.models.papers.wang.model import monomial_field as wang_field
 from abbe.models.papers.wang.model import position_error_eq9
 from abbe.models.papers.yang.complete import delta_eq1, monomial_errors, monomial_field
-from abbe.models.papers.yang.experiments import Plan, all_helices, one_helix, step_diagonals, together, vector_map
+from abbe.models.papers.yang.experiments import YangPlan, all_helices, one_helix, step_diagonals, together, vector_map
 from abbe.models.papers.yang.origins import origin_plan
 from abbe.models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution, stacked
 
 TRAVEL, TOOL = np.array([812.8, 495.0, 508.0]), np.array([0.0, 0.0, 150.0])
 ORIGINS = origin_plan(np.stack([np.zeros(3), TRAVEL], axis=1))
-PLAN = Plan(TRAVEL, TOOL, ORIGINS, (175.0, 100.0), 5.0, 20, 1)
+PLAN = YangPlan(TRAVEL, TOOL, ORIGINS, (175.0, 100.0), 5.0, 20, 1)
 
 
 def test_counts_of_coefficients():

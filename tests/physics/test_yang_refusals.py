@@ -7,7 +7,7 @@ from abbe.models.notation.yang import YangErrors
 from abbe.models.papers.yang.ballbar import measured_mm, reading_eq6, reading_eq8, second_order_bound_mm
 from abbe.models.papers.yang.complete import delta_eq1, difference_eq3
 from abbe.models.papers.yang.conditioning import conditioning
-from abbe.models.papers.yang.experiments import Plan, all_helices, vector_map
+from abbe.models.papers.yang.experiments import YangPlan, all_helices, vector_map
 from abbe.models.papers.yang.origins import hemisphere_fits, origin_plan
 from abbe.models.papers.yang.simplified import fit_eq9
 from abbe.models.paths.helix import helix_points, helix_points_likely_code
@@ -101,12 +101,12 @@ def test_errors_at_one_position_are_not_those_of_thirty():
 
 def test_plans_without_origins_bars_or_known_words_are_refused():
     travel, tool = STROKE[:, 1], np.zeros(3)
-    plan = Plan(travel, tool, np.array([[400.0, 0.0, 250.0]]), (175.0,), 5.0, 4, 1)
+    plan = YangPlan(travel, tool, np.array([[400.0, 0.0, 250.0]]), (175.0,), 5.0, 4, 1)
     with pytest.raises(ValueError, match="'x'"):
         all_helices(plan, centres=True, lengths="x")
     with pytest.raises(ValueError, match="tool"):
         vector_map(plan, ())
     with pytest.raises(ValueError, match="origins"):
-        Plan(travel, tool, np.zeros((0, 3)), (175.0,), 5.0, 4, 1)
+        YangPlan(travel, tool, np.zeros((0, 3)), (175.0,), 5.0, 4, 1)
     with pytest.raises(ValueError, match="bar"):
-        Plan(travel, tool, np.zeros((1, 3)), (), 5.0, 4, 1)
+        YangPlan(travel, tool, np.zeros((1, 3)), (), 5.0, 4, 1)

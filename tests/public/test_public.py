@@ -144,7 +144,7 @@ def test_an_effect_that_cannot_be_simulated_is_refused_in_one_line(label: str, w
 
 def test_a_strength_that_is_a_root_is_simulated_as_stated():
     feeds = [abbe.Helix(f"h{v:g}", "A", "identify", (300.0, 250.0, 100.0), 100.0, turns=4.0, feed_mm_min=v) for v in (1000.0, 4000.0)]
-    quiet = abbe.Instruments(bar_noise_mm=1e-6, laser_noise_mm=1e-6)
+    quiet = abbe.SimulatedInstruments(bar_noise_mm=1e-6, laser_noise_mm=1e-6)
     slow, fast = (
         np.array(run["columns"]["deviation_mm"])
         for run in abbe.simulate(MACHINE, feeds, abbe.ErrorMotions(), effects={"contour_lag": 20.0}, instruments=quiet).runs

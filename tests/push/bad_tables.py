@@ -7,21 +7,21 @@ from collections.abc import Callable
 from dataclasses import replace
 from random import Random
 
-from abbe.service.push.candidate import Candidate, Column, Evidence, Scene, Seal
+from abbe.service.push.candidate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence
 from abbe.service.push.validate import content_digest
 
 LSB_MM = 1e-4
 NOW_S = 1.8e9
 N = 9
-Made = tuple[Candidate, Scene]
+Made = tuple[Candidate, CandidateContext]
 
 
 def good(rng: Random) -> Made:
     """A table that nothing speaks against, with the scene that it is for."""
     columns = tuple(_column(a, i, rng) for a in "XYZ" for i in "XYZ")
     active = {(c.moved, c.corrected): (0.0,) * N for c in columns} | {("X", "X"): (0.0, *(10 * LSB_MM,) * (N - 1))}
-    evidence = Evidence(4, NOW_S - 3600.0, (20.0, 20.6), 0.0005, 0.0004, 0.006, 0.0005, "mark 7", (NOW_S + 1e6, NOW_S + 2e6))
-    scene = Scene("mill", "mark 7", 1, 100, 4800, dict.fromkeys("XYZ", (0.0, 800.0)), {}, 0xABCD, active, {}, NOW_S)
+    evidence = TableEvidence(4, NOW_S - 3600.0, (20.0, 20.6), 0.0005, 0.0004, 0.006, 0.0005, "mark 7", (NOW_S + 1e6, NOW_S + 2e6))
+    scene = CandidateContext("mill", "mark 7", 1, 100, 4800, dict.fromkeys("XYZ", (0.0, 800.0)), {}, 0xABCD, active, {}, NOW_S)
     return signed(Candidate("mill", 1, 100, "mm", columns, 0xABCD, evidence, "")), scene
 
 
@@ -37,7 +37,7 @@ def _column(moved: str, corrected: str, rng: Random) -> Column:
 
 def signed(candidate: Candidate, role: str = "metrologist") -> Candidate:
     digest = content_digest(candidate)
-    return replace(candidate, digest=digest, seal=Seal(role, digest))
+    return replace(candidate, digest=digest, seal=EvidenceSeal(role, digest))
 
 
 def _with(candidate: Candidate, at: int, **change: object) -> Candidate:
@@ -152,7 +152,7 @@ def _changed_machine(rng: Random) -> Made:
 
 def _unsigned(rng: Random) -> Made:
     candidate, scene = good(rng)
-    return replace(candidate, seal=Seal()), scene
+    return replace(candidate, seal=EvidenceSeal()), scene
 
 
 def _wrong_role(rng: Random) -> Made:

@@ -16,16 +16,16 @@ MUTANTS: dict[str, Edits] = {
         (
             "staging",
             "step = bracket(known, image.bank, words, again=True)",
-            "step = Op(Kind.LOOK) if known.truth is None else Coherent(known.truth)",
+            "step = Operation(OperationKind.LOOK) if known.truth is None else Coherent(known.truth)",
         ),
         ("staging", "if known.image != image.data or known.meaning != image.meaning:", "if False:"),
     ),
     "journal after the action": (
         (
             "machine",
-            'return record(State.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"])',
-            'return record(State.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"]) if known.asked else '
-            'Op(Kind.ACTIVATE, bank=f["target"], crc=f["crc"], gen=f["staged_gen"], owner=f["owner"])',
+            'return record(PushState.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"])',
+            'return record(PushState.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"]) if known.asked else '
+            'Operation(OperationKind.ACTIVATE, bank=f["target"], crc=f["crc"], gen=f["staged_gen"], owner=f["owner"])',
         ),
     ),
     "activation sent again blindly": (("machine", "not known.asked and not known.stop:", "(not known.asked or known.doubts):"),),
@@ -49,7 +49,7 @@ MUTANTS: dict[str, Edits] = {
         ("back", 'if truth.states[other] == SEALED and truth.crc[other] == f["base_crc"]:', "if True:"),
         ("back", "if step is not None and known.image == base:", "if step is not None:"),
     ),
-    "late command not shut out": (("machine", "if not known.fenced:\n        return Op(Kind.RELEASE", "if False:\n        return Op(Kind.RELEASE"),),
+    "late command not shut out": (("machine", "if not known.fenced:\n        return Operation(OperationKind.RELEASE", "if False:\n        return Operation(OperationKind.RELEASE"),),
     "doubt taken for no": (("machine", "which = in_force(f, known.truth)", 'which = "base"'),),
     "axes exchanged in the encoder": (("codec", "np.round(tables.correction_mm[a][:, i] * 1e6", "np.round(tables.correction_mm[i][:, a] * 1e6"),),
     "sign exchanged in the encoder": (("codec", "np.round(tables.correction_mm[a][:, i] * 1e6", "np.round(-tables.correction_mm[a][:, i] * 1e6"),),
@@ -57,9 +57,9 @@ MUTANTS: dict[str, Edits] = {
         ("codec", "np.round(tables.correction_mm[a][:, i] * 1e6", "np.round(-tables.correction_mm[a][:, i] * 1e6"),
         ("second_decoder", "return value * _register(data, 6) / 1_000_000", "return -value * _register(data, 6) / 1_000_000"),
     ),
-    "verification always passes": (("machine", "known.verdict.value.passed:", "(known.verdict.value.passed or question is Kind.VERIFY):"),),
-    "probe always passes": (("machine", "known.verdict.value.passed:", "(known.verdict.value.passed or question is Kind.PROBE):"),),
-    "kept without a last look": (("machine", "    step = _confirm(f, known)\n    if step is None:\n        return record(State.ROLLBACK", "    step = record(State.PROBATION)\n    if step is None:\n        return record(State.ROLLBACK"),),
+    "verification always passes": (("machine", "known.verdict.value.passed:", "(known.verdict.value.passed or question is OperationKind.VERIFY):"),),
+    "probe always passes": (("machine", "known.verdict.value.passed:", "(known.verdict.value.passed or question is OperationKind.PROBE):"),),
+    "kept without a last look": (("machine", "    step = _confirm(f, known)\n    if step is None:\n        return record(PushState.ROLLBACK", "    step = record(PushState.PROBATION)\n    if step is None:\n        return record(PushState.ROLLBACK"),),
     "recovery goes on with the probation": (("machine", "if not known.mine:\n        return \"interrupted", "if False:\n        return \"interrupted"),),
     "way back against an e-stop": (("back", "if truth.unsafe:\n        return _pending(state, f\"not safe now: {truth.unsafe}\")\n    if truth.states", "if False:\n        return _pending(state, \"\")\n    if truth.states"), ("back", "    if truth.unsafe:\n        return _pending(state, f\"not safe now: {truth.unsafe}\")\n    return", "    return")),
     "armed against an e-stop": (LOOKS_SAFE,),
@@ -71,19 +71,19 @@ MUTANTS: dict[str, Edits] = {
     "way back without an entry": (
         (
             "back",
-            "return _armed(step.truth, other, State.ROLLBACK)",
-            'return Op(Kind.ACTIVATE, bank=other, crc=f["base_crc"], gen=step.truth.gen, owner=known.lease)',
+            "return _armed(step.truth, other, PushState.ROLLBACK)",
+            'return Operation(OperationKind.ACTIVATE, bank=other, crc=f["base_crc"], gen=step.truth.gen, owner=known.lease)',
         ),
     ),
     "another's lease not respected": (
-        ("machine", "if isinstance(known.verdict, Refused):\n        return _abandon(f, known, State.APPROVED", "if False:\n        return _abandon(f, known, State.APPROVED"),
-        ("machine", "if isinstance(known.verdict, Done):\n        return record(State.LEASED)", "if known.verdict is not None:\n        return record(State.LEASED)"),
+        ("machine", "if isinstance(known.verdict, Refused):\n        return _abandon(f, known, PushState.APPROVED", "if False:\n        return _abandon(f, known, PushState.APPROVED"),
+        ("machine", "if isinstance(known.verdict, Done):\n        return record(PushState.LEASED)", "if known.verdict is not None:\n        return record(PushState.LEASED)"),
         ("machine", 'if truth.owner != f["owner"]:', "if False:"),
     ),
     "activated on a lease that ends": (("machine", "truth.lease_ms < LEASE_LEFT_MS", "truth.lease_ms < 0"),),
     "pushed into axes that only just stand": (("machine", "STILL_S = 1.0", "STILL_S = 0.0"),),
     "approval an hour longer": (("machine", "truth.now_s >= known.approved_until_s", "truth.now_s >= known.approved_until_s + 3600.0"),),
-    "what is pending is forgotten": (("back", "    if known.rested:", "    if known.rested or state is State.ROLLBACK_PENDING:"),),
+    "what is pending is forgotten": (("back", "    if known.rested:", "    if known.rested or state is PushState.ROLLBACK_PENDING:"),),
 }  # fmt: skip
 BY_PROBE = "sign exchanged in encoder and decoder"
 """No read-back can see this one."""

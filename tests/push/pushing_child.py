@@ -24,12 +24,12 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError
 from abbe.service.push import operations as o
-from abbe.service.push.adapter import ControllerPort, People
+from abbe.service.push.adapter import ControllerPort, PushActors
 from abbe.service.push.approval import approval_digest
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import check_chain, facts
 from abbe.service.push.execute import push, recover
-from abbe.service.push.order import Order
+from abbe.service.push.order import OperationOrder
 from abbe.service.push.semantic_digest import meaning_of_tables
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image
@@ -87,7 +87,7 @@ class KillingBook:
         return await self._killer.around(f"journal {state}", self._real.append(journal, state, doc))
 
 
-def people(clock: SystemClock, *, better: bool) -> People:
+def people(clock: SystemClock, *, better: bool) -> PushActors:
     """Stand-ins that answer at once: the probe and the verification of a real machine take motion and instruments."""
 
     async def validate(journal: Any) -> list[str]:
@@ -102,7 +102,7 @@ def people(clock: SystemClock, *, better: bool) -> People:
     async def verify(journal: Any) -> o.Verdict:
         return o.Verdict(better, "stand-in")
 
-    return People(validate, approve, probe, verify)
+    return PushActors(validate, approve, probe, verify)
 
 
 async def work(words: dict[str, Any]) -> dict[str, Any]:
@@ -124,7 +124,7 @@ async def _work(words: dict[str, Any]) -> dict[str, Any]:
             if words["do"] == "push":
                 image = encode(table_image(tables(words["height"]), 100, words["height"]))
                 meaning = meaning_of_tables(tables(words["height"]))
-                order = Order(MACHINE, image, zlib.crc32(image), meaning, "limits", words["owner"] << 16)
+                order = OperationOrder(MACHINE, image, zlib.crc32(image), meaning, "limits", words["owner"] << 16)
                 ended = await push(port, KillingBook(await StoreBook.new(store, MACHINE, clock), killer), order)
             else:
                 book = await StoreBook.last(store, MACHINE, clock)

@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 
-from abbe.service.push.candidate import Candidate, Scene
+from abbe.service.push.candidate import Candidate, CandidateContext
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.validate import reasons_against
 from tests.push.bad_tables import CLASSES, EACH, LSB_MM, NOW_S, good, signed
@@ -65,7 +65,7 @@ def test_what_the_classes_do_not_hold_is_rejected_too(name: str) -> None:
     change, word = UNATTENDED[name]
     candidate, scene = good(Random(3))
     limits = replace(LIMITS, value_mm=0.012) if word == "VALUE" else LIMITS
-    made: tuple[Candidate, Scene] = change(candidate, scene)
+    made: tuple[Candidate, CandidateContext] = change(candidate, scene)
     assert [r for r in reasons_against(*made, limits) if r.startswith(word)]
 
 

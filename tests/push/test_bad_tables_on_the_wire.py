@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.tables import NineTables
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import read_entries
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.push.validate import reasons_against
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
@@ -59,14 +59,14 @@ async def test_every_class_of_bad_tables_is_rejected_and_writes_no_register(tmp_
         with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
             controller, log = b.session.controller, counted(b.sim.registers)
             base, gen = await read_base(controller), b.sim.world.controller.comp.generation
-            wanted = Wanted(tables(), base, 100, None, {})
+            wanted = WantedTable(tables(), base, 100, None, {})
             for n, (name, (make, word)) in enumerate(CLASSES.items()):
                 reasons = reasons_against(*make(Random(f"{name} {n % EACH}")), PushLimits())
                 questions = Questions(lambda reasons=reasons: reasons, "a test", never, never)
                 with pytest.raises(TableRefused, match=word):
                     await Pushing(controller, store, b.site).bring(wanted, questions)
                 last = read_entries(store, b.site.name)[-1]
-                assert (last.state, last.doc["reasons"]) == (State.REJECTED, reasons)
+                assert (last.state, last.doc["reasons"]) == (PushState.REJECTED, reasons)
             assert log == []
             assert b.sim.world.controller.comp.generation == gen
             # The same door opens for a good one: what was counted is what a push would have written.

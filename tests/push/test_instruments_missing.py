@@ -18,12 +18,12 @@ import pytest
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import SystemClock
 from abbe.service.compensation import pushing
-from abbe.service.compensation.push_approved import Order, push_approved
+from abbe.service.compensation.push_approved import PushOrder, push_approved
 from abbe.service.config import load_machine
 from abbe.service.events import ignore_progress
 from abbe.service.jobs.check import run_check
 from abbe.service.jobs.guided_campaign import led_campaign
-from abbe.service.jobs.investigate import Bench
+from abbe.service.jobs.investigate import InvestigationContext
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.site import Site, site_of
@@ -72,9 +72,9 @@ def machine_file(left: Left, folder: Path, laser: str | None) -> Path:
     return path
 
 
-def full(site: Site, left: Left) -> Bench:
+def full(site: Site, left: Left) -> InvestigationContext:
     """The full campaign, asked for."""
-    return Bench(site, left.store, identification(site.machine), SystemClock(), ignore_progress)
+    return InvestigationContext(site, left.store, identification(site.machine), SystemClock(), ignore_progress)
 
 
 async def nothing_to_note() -> None:
@@ -137,7 +137,7 @@ async def test_a_led_campaign_without_any_laser_does_so(tmp_path: Path) -> None:
 async def test_the_push_of_an_approved_proposal_does_so(tmp_path: Path, nothing: str) -> None:
     async with killed_push(tmp_path) as left:
         site = site_of(load_machine(machine_file(left, tmp_path, nothing)).machine)
-        ended = await push_approved(site, left.store, Order(1, nothing_to_note, ignore_progress, Control()), clock=SystemClock())
+        ended = await push_approved(site, left.store, PushOrder(1, nothing_to_note, ignore_progress, Control()), clock=SystemClock())
         assert ended.word == "failed"
         assert nothing in ended.text
         assert await left.active() == left.base

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.errors import Stopped
 from abbe.service.push.book import read_entries
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import State as Push
+from abbe.service.push.states import PushState as Push
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
@@ -50,9 +50,9 @@ async def machine(folder: Path) -> AsyncIterator[tuple[Bench, Store, list[int]]]
             yield b, store, counted(b.sim.registers)
 
 
-async def brought(b: Bench, store: Store, control: Control) -> tuple[Pushed, list[bool]]:
+async def brought(b: Bench, store: Store, control: Control) -> tuple[PushResult, list[bool]]:
     pushing = Told(b.session.controller, store, b.site, control=control)
-    wanted = Wanted(tables(), await read_base(b.session.controller), 100, None, {})
+    wanted = WantedTable(tables(), await read_base(b.session.controller), 100, None, {})
     return await pushing.bring(wanted, Questions(list, "a test", pushing.question, pushing.question)), pushing.paused
 
 

@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.pushing import AGAIN_S, Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import AGAIN_S, Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import PushNotBegun, StillActive, TableMismatch
 from abbe.service.push.adapter import BEAT_S, ControllerPort, nobody
 from abbe.service.push.book import read_entries
-from abbe.service.push.operations import Done, Kind, Op, Verdict
-from abbe.service.push.states import State
+from abbe.service.push.operations import Done, Operation, OperationKind, Verdict
+from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from abbe.simulators.cnc.compensation import CompResult
@@ -53,7 +53,7 @@ async def machine(tmp_path: Path):
 
 
 async def brought(b: Bench, store: Store, clock: Jumping, questions: Questions) -> Any:
-    wanted = Wanted(tables(), await read_base(b.session.controller), 100, None, {})
+    wanted = WantedTable(tables(), await read_base(b.session.controller), 100, None, {})
     return await Pushing(b.session.controller, store, b.site, clock).bring(wanted, questions)
 
 
@@ -72,7 +72,7 @@ async def test_who_orders_a_push_approves_it_for_an_hour_and_not_for_longer(mach
         return
     with pytest.raises(PushNotBegun, match="the approval has expired"):
         await brought(b, store, clock, Questions(list, "a test", never, never))
-    assert State.ACTIVATING not in {entry.state for entry in read_entries(store, b.site.name)}
+    assert PushState.ACTIVATING not in {entry.state for entry in read_entries(store, b.site.name)}
 
 
 async def test_a_measurement_ends_when_another_takes_the_lease_and_its_table_is_not_kept(machine) -> None:
@@ -92,8 +92,8 @@ async def test_a_measurement_ends_when_another_takes_the_lease_and_its_table_is_
         await brought(b, store, Jumping(), Questions(list, "a test", kept, taken))
     entries = read_entries(store, b.site.name)
     assert ended == ["in time"]
-    assert entries[-1].state is State.ROLLBACK_PENDING
-    assert next(e for e in entries if e.state is State.ROLLBACK).doc["why"] == "verify: another owner took the lease meanwhile"
+    assert entries[-1].state is PushState.ROLLBACK_PENDING
+    assert next(e for e in entries if e.state is PushState.ROLLBACK).doc["why"] == "verify: another owner took the lease meanwhile"
 
 
 @pytest.mark.parametrize("does_it", [True, False])
@@ -130,7 +130,7 @@ async def test_moving_axes_and_an_open_door_reach_the_push_as_not_safe(machine) 
     port = ControllerPort(b.session.controller, nobody(), SystemClock())
 
     async def unsafe() -> str:
-        looked = await port.execute(Op(Kind.LOOK), ())
+        looked = await port.execute(Operation(OperationKind.LOOK), ())
         assert isinstance(looked, Done), looked
         return str(looked.value.unsafe)
 

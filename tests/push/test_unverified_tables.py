@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from abbe.models.compensation.tables import NineTables
-from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.push.operations import Verdict
@@ -32,9 +32,9 @@ class Shop:
     b: Bench
     store: Store
 
-    async def push(self, wanted: NineTables, questions: Questions) -> Pushed:
+    async def push(self, wanted: NineTables, questions: Questions) -> PushResult:
         base = await read_base(self.b.session.controller)
-        return await Pushing(self.b.session.controller, self.store, self.b.site).bring(Wanted(wanted, base, 100, None, {}), questions)
+        return await Pushing(self.b.session.controller, self.store, self.b.site).bring(WantedTable(wanted, base, 100, None, {}), questions)
 
     async def somebody_activates_the_other_bank(self) -> None:
         control = self.b.session.controller

@@ -14,14 +14,14 @@ import pytest
 from abbe.drivers.cnc.tables import crc32
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.urls import DeviceUrls, address_of, control_of
 from abbe.service.errors import TableMismatch, UnsafeToMove
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import WORD, check_chain
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.report.report_table import table_said
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -75,7 +75,7 @@ def store(tmp_path: Path):
         yield opened
 
 
-async def pushed(store: Store, machine: str, images: tuple[bytes, bytes], states: tuple[State, ...], control: str = "") -> None:
+async def pushed(store: Store, machine: str, images: tuple[bytes, bytes], states: tuple[PushState, ...], control: str = "") -> None:
     await as_if_pushed(store, SystemClock(), machine, {}, images, states, control)
 
 
@@ -127,7 +127,7 @@ async def test_a_journal_that_was_begun_under_a_name_is_not_that_of_another_cont
 
 async def test_what_an_older_version_wrote_belongs_to_the_name(store: Store) -> None:
     await pushed(store, "mill", (OLD, NEW), UP_TO_ACTIVE)
-    assert read_entries(store, "mill", HERE)[-1].state == State.PROBATION
+    assert read_entries(store, "mill", HERE)[-1].state == PushState.PROBATION
     assert read_entries(store, "other", HERE) == []
 
 
@@ -220,7 +220,7 @@ async def left_in_probation(folder: Path, wanted: NineTables | None = None) -> A
         with Store.open(f"sqlite:///{whole}") as store:
             base = await read_base(controller)
             await Pushing(controller, store, b.site, level=3).bring(
-                Wanted(wanted or tables(), base, 100, None, {}), Questions(list, "a test", copies, kept)
+                WantedTable(wanted or tables(), base, 100, None, {}), Questions(list, "a test", copies, kept)
             )
         with Store.open(f"sqlite:///{killed}") as store:
             yield Left(b, store, base.crc)
@@ -240,7 +240,7 @@ async def test_at_another_address_it_is_refused_and_a_person_s_word_closes_it_un
         words = rf"is that of push 1 of machine 'sim' at {re.escape(here)}, which was never verified.*machine file of 'sim'"
         with pytest.raises(TableMismatch, match=words):
             await recover(controller, left.store, elsewhere)
-        assert read_entries(left.store, "sim")[-1].state == State.PROBATION  # only looked at
+        assert read_entries(left.store, "sim")[-1].state == PushState.PROBATION  # only looked at
         table = await left.active()
         assert "push 1 of machine 'sim', which no measurement has verified" in await accept(controller, left.store, elsewhere, "ann")
         assert read_entries(left.store, "sim")[-1].doc["by"] == "ann"
@@ -295,7 +295,7 @@ async def test_a_control_that_moved_and_fell_back_to_its_old_table_needs_a_perso
         controller = moved.session.controller
         assert "is accepted by ann" in await accept(controller, left.store, moved.site, "ann")
         check_chain(read_entries(left.store, "sim"))
-        assert [e.state for e in read_entries(left.store, "sim")][-2:] == [State.OPERATOR, State.ACCEPTED]
+        assert [e.state for e in read_entries(left.store, "sim")][-2:] == [PushState.OPERATOR, PushState.ACCEPTED]
         assert await recover(controller, left.store, moved.site) is None
         with pytest.raises(TableMismatch, match="never verified"):  # if it was another machine after all: its table is not accepted
             await recover(left.b.session.controller, left.store, left.b.site)
@@ -308,7 +308,7 @@ async def test_a_push_that_had_activated_nothing_is_closed_by_a_person_s_word_at
             with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(HERE))):
                 await recover(b.session.controller, store, b.site)
             await accept(b.session.controller, store, b.site, "ann")
-            assert [e.state for e in read_entries(store, "sim")][-2:] == [State.ABORTED, State.ACCEPTED]
+            assert [e.state for e in read_entries(store, "sim")][-2:] == [PushState.ABORTED, PushState.ACCEPTED]
             assert await recover(b.session.controller, store, b.site) is None
 
 
@@ -323,7 +323,7 @@ async def test_two_machines_of_two_names_do_not_meet_each_other_s_open_push(tmp_
     async with left_in_probation(tmp_path) as left, another_control(tmp_path) as other:
         site = replace(other.site, name="lathe")
         assert await recover(other.session.controller, left.store, site) is None
-        assert read_entries(left.store, "sim")[-1].state == State.PROBATION
+        assert read_entries(left.store, "sim")[-1].state == PushState.PROBATION
         assert read_entries(left.store, "lathe", site.control) == []
 
 
@@ -342,7 +342,7 @@ async def test_an_open_push_at_an_address_where_another_control_is_now_waits_for
                 with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(site.control))):
                     await recover(controller, store, site)
                 assert await controller.comp_status() == now
-                assert read_entries(store, "sim")[-1].state == State.PROBATION
+                assert read_entries(store, "sim")[-1].state == PushState.PROBATION
             await accept(controller, store, site)
             assert await recover(controller, store, site) is None
 
@@ -368,7 +368,7 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             for again in (site, left.site("mill-A")):
                 assert await recover(controller, store, again, accept_by="bob") is None  # there is nothing left to accept
             check_chain(read_entries(store, site.name))
-            assert [(e.push, e.state, e.doc["by"]) for e in read_entries(store, site.name)] == [(WORD, State.ACCEPTED, "ann")]
+            assert [(e.push, e.state, e.doc["by"]) for e in read_entries(store, site.name)] == [(WORD, PushState.ACCEPTED, "ann")]
             told = story(store, site.name)
             assert (told.now.how, told.pushes, f"{told.now.crc:08X}") == ("accepted", (), crc)
             await accept(controller, store, site, "eve")  # the same word by `abbe accept-table`
@@ -419,7 +419,7 @@ async def test_where_a_person_has_to_look_the_other_machine_s_file_is_no_remedy(
     async with left_in_probation(tmp_path) as left:
         image = (await read_base(left.b.session.controller)).image
         with Store.open(f"sqlite:///{tmp_path / 'fleet.sqlite3'}") as store:
-            await pushed(store, "A", (OLD, image), (*UP_TO_ACTIVE, State.OPERATOR), HERE)
+            await pushed(store, "A", (OLD, image), (*UP_TO_ACTIVE, PushState.OPERATOR), HERE)
             with pytest.raises(TableMismatch, match="is that of push 1 of machine 'A'") as refused:
                 await recover(left.b.session.controller, store, left.b.site)
             assert "which takes it back" not in str(refused.value)

@@ -333,7 +333,7 @@ class World:
     def order(self) -> Any:
         case = self.case
         meaning = self.p.semantic_digest.meaning_of_tables(tables(55))
-        return self.p.order.Order(
+        return self.p.order.OperationOrder(
             "M", self.candidate, c.zlib.crc32(self.candidate), meaning, "limits", OWNER, case.level, case.attended, CHUNK_WORDS
         )
 

@@ -29,7 +29,7 @@ from abbe.service.jobs.check import CheckResult, run_check
 from abbe.service.push.limits import PushLimits
 from abbe.service.scheduler.alarm_manager import AlarmManager, Telling
 from abbe.service.scheduler.job import CheckJob
-from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
@@ -38,7 +38,7 @@ from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
-from abbe.service.verification.alarm_states import Alarm, Kind
+from abbe.service.verification.alarm_states import Alarm, AlarmKind
 from abbe.service.verification.alarms import acknowledge, alarms_of
 from abbe.service.web.core_link.board import Board
 from abbe.service.web.view import View
@@ -86,7 +86,7 @@ class Shop:
             return await run_check(self.config, self.store, recipe, progress, control=control)
 
         job = CheckJob("sim", check, shelf, [board], clock, desk.checked)
-        terms = Terms(poll_s=0.5, recheck_s=0.5, errands=desk)
+        terms = LoopTerms(poll_s=0.5, recheck_s=0.5, errands=desk)
         scheduler = Scheduler([OFTEN], StoreLedger(self.store, clock, "sim"), job, shelf, clock, terms)
         running = asyncio.create_task(scheduler.run())
         self.view = View("sim", "0", board, self.store, scheduler.next_due, "", clock)
@@ -136,10 +136,10 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
         assert all(s["expanded"] > 0 for s in raised.signals)
 
         # nobody has asked for it: the full campaign, what is missing, the tables
-        await until(lambda: shop.alarms()[0].last(Kind.PROPOSED, Kind.ENDED, Kind.FAILED))
+        await until(lambda: shop.alarms()[0].last(AlarmKind.PROPOSED, AlarmKind.ENDED, AlarmKind.FAILED))
         found = shop.alarms()[0]
         kinds = [step.kind for step in found.work]
-        assert kinds == [Kind.BEGUN, Kind.MEASURED, Kind.DISCOVERED, Kind.PROPOSED], found.outcome
+        assert kinds == [AlarmKind.BEGUN, AlarmKind.MEASURED, AlarmKind.DISCOVERED, AlarmKind.PROPOSED], found.outcome
         proposed = found.work[-1].doc
         number, change = proposed["proposal"], re.search(r"largest change: ([+-][\d.]+) µm .* in the table of X over X", proposed["text"])
         assert change is not None, proposed["text"]  # what drifted: X, by its own scale
@@ -153,8 +153,8 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
 
         # a person says yes: the service pushes, verifies, keeps, checks again, and the alarm is over
         approve(shop.store, number, load(shop.store, number), "anna", 1.0, SystemClock())
-        await until(lambda: shop.alarms()[0].last(Kind.PUSHED))
-        pushed = shop.alarms()[0].last(Kind.PUSHED)
+        await until(lambda: shop.alarms()[0].last(AlarmKind.PUSHED))
+        pushed = shop.alarms()[0].last(AlarmKind.PUSHED)
         assert pushed is not None
         assert pushed.doc["word"] == "kept", pushed.doc["text"]
         over = await until(lambda: None if shop.alarms()[0].active else shop.alarms()[0])

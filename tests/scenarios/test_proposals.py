@@ -22,7 +22,7 @@ from abbe.service.compensation.proposal_checks import approve, hold
 from abbe.service.compensation.proposal_doc import digest_of_doc, load
 from abbe.service.compensation.proposal_states import standing, standing_of
 from abbe.service.compensation.proposals import load_runs, login
-from abbe.service.compensation.push_approved import Approved, Order, next_approved, push_approved
+from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved, push_approved
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import StoreError, TableRefused
@@ -172,7 +172,7 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
         async def tell_begun() -> None:
             begun.append(number)
 
-        order = Order(number, tell_begun, ignore_progress, Control())
+        order = PushOrder(number, tell_begun, ignore_progress, Control())
         ended = asyncio.run(push_approved(shop.site, store, order, clock=SystemClock()))
         assert begun == [number]
         assert (ended.word, "a person who approves has to be at the machine" in ended.text) == ("refused", True)

@@ -17,7 +17,7 @@ from abbe.drivers.errors import LinkDown
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.service.campaigns.measure import measure
 from abbe.service.compensation import pushing
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
@@ -25,7 +25,7 @@ from abbe.service.events import ignore_progress
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import check_chain
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
@@ -111,7 +111,7 @@ async def yes() -> Verdict:
 
 
 async def push(controller, store, site, tables, *, base=None, probe=yes, verify=yes, validate=list):
-    wanted = Wanted(tables, base or await read_base(controller), 100, None, {})
+    wanted = WantedTable(tables, base or await read_base(controller), 100, None, {})
     return await Pushing(controller, store, site).bring(wanted, Questions(validate, "a test", probe, verify))
 
 
@@ -129,7 +129,7 @@ async def test_a_bit_lost_on_the_way_is_found_by_the_read_back_and_never_activat
             await push(Noisy(session.controller), store, site, steep(site))
         assert await active(session) == before
         assert (await session.controller.comp_status()).lease_owner == 0
-        assert last(store) == State.ABORTED
+        assert last(store) == PushState.ABORTED
 
 
 async def test_an_encoder_that_lies_is_found_before_it_is_activated(start_sims, tmp_path, monkeypatch):
@@ -140,7 +140,7 @@ async def test_an_encoder_that_lies_is_found_before_it_is_activated(start_sims, 
         with pytest.raises(PushNotBegun, match="independent decoder"):
             await push(session.controller, store, site, steep(site))
         assert await active(session) == before
-        assert last(store) == State.ABORTED
+        assert last(store) == PushState.ABORTED
 
 
 async def test_a_table_with_a_reason_against_it_writes_no_register(start_sims, tmp_path):
@@ -150,7 +150,7 @@ async def test_a_table_with_a_reason_against_it_writes_no_register(start_sims, t
         with pytest.raises(TableRefused, match="VALUE: too large"):
             await push(session.controller, store, site, steep(site), validate=lambda: ["VALUE: too large"])
         assert (await session.controller.comp_status()).gen == before.gen  # no bank was touched
-        assert last(store) == State.REJECTED
+        assert last(store) == PushState.REJECTED
 
 
 async def test_a_table_changed_by_somebody_since_the_base_was_read_is_not_overwritten(start_sims, tmp_path):
@@ -164,21 +164,21 @@ async def test_a_table_changed_by_somebody_since_the_base_was_read_is_not_overwr
         assert await active(session) == (theirs.bank, theirs.crc)
 
 
-@pytest.mark.parametrize(("looks", "ends"), [(1, State.KEEP), (3, State.ROLLED_BACK), (30, State.ACTIVATING)])
+@pytest.mark.parametrize(("looks", "ends"), [(1, PushState.KEEP), (3, PushState.ROLLED_BACK), (30, PushState.ACTIVATING)])
 async def test_a_link_lost_right_after_activation_is_asked_again_or_taken_back_later(start_sims, tmp_path, looks, ends):
     sims = start_sims("--speed", "60")
     async with bench(sims, tmp_path) as (site, store, session):
         before = await active(session)
         cut = CutAfterActivate(session.controller, looks)
-        if ends is not State.ACTIVATING:
-            assert (await push(cut, store, site, steep(site))).kept == (ends is State.KEEP)
-            assert (last(store), await active(session) == before) == (ends, ends is State.ROLLED_BACK)
+        if ends is not PushState.ACTIVATING:
+            assert (await push(cut, store, site, steep(site))).kept == (ends is PushState.KEEP)
+            assert (last(store), await active(session) == before) == (ends, ends is PushState.ROLLED_BACK)
         else:
             with pytest.raises(StillActive, match="not known"):
                 await push(cut, store, site, steep(site))
             assert last(store) == ends
             assert "made active again" in await recover(session.controller, store, site)
-            assert (await active(session), last(store)) == (before, State.ROLLED_BACK)
+            assert (await active(session), last(store)) == (before, PushState.ROLLED_BACK)
         assert await recover(session.controller, store, site) is None
 
 
@@ -223,16 +223,16 @@ async def test_an_interlock_keeps_the_table_pending_and_the_next_start_takes_it_
 
         with pytest.raises(StillActive, match="STILL ACTIVE"):
             await push(session.controller, store, site, steep(site), verify=worse)
-        assert last(store) == State.ROLLBACK_PENDING
+        assert last(store) == PushState.ROLLBACK_PENDING
         with pytest.raises(StillActive):  # as long as the e-stop is pressed, nothing else starts
             await recover(session.controller, store, site)
         sims.ask("estop", on=False)
         await session.controller.reset_alarm()
         assert "made active again" in await recover(session.controller, store, site)
-        assert (await active(session), last(store)) == (before, State.ROLLED_BACK)
+        assert (await active(session), last(store)) == (before, PushState.ROLLED_BACK)
 
 
-@pytest.mark.parametrize("state", [State.PROBATION, State.ACTIVATING, State.PROBED, State.VERIFIED])
+@pytest.mark.parametrize("state", [PushState.PROBATION, PushState.ACTIVATING, PushState.PROBED, PushState.VERIFIED])
 async def test_a_push_cut_short_before_it_was_kept_is_taken_back_at_the_next_start(start_sims, tmp_path, monkeypatch, state):
     sims = start_sims("--speed", "60")
     async with bench(sims, tmp_path) as (site, store, session):
@@ -255,13 +255,13 @@ async def test_a_push_cut_short_before_it_was_kept_is_taken_back_at_the_next_sta
                 await push(session.controller, store, site, steep(site), probe=meanwhile)
             assert "takes it back before anything else" in raised.value.__notes__[0]
         assert last(store) == state
-        if state is State.PROBED:  # whoever looks now sees the new table; it is not that one which is vouched for
+        if state is PushState.PROBED:  # whoever looks now sees the new table; it is not that one which is vouched for
             said = await accept(session.controller, store, site)
             assert "was made active again" in said
             assert "nothing was accepted" in said
         else:
             assert "made active again" in await recover(session.controller, store, site)
-        assert (await active(session), last(store)) == (before, State.ROLLED_BACK)
+        assert (await active(session), last(store)) == (before, PushState.ROLLED_BACK)
         assert await recover(session.controller, store, site) is None
 
 
@@ -329,7 +329,7 @@ async def test_a_table_that_nobody_knows_stops_everything_until_a_person_accepts
         for _ in range(2):  # frozen, also at the next start
             with pytest.raises(TableMismatch, match="accept-table"):
                 await recover(controller, store, site)
-        assert last(store) == State.OPERATOR
+        assert last(store) == PushState.OPERATOR
         theirs = await active(session)
         assert "accepted" in await accept(controller, store, site)
         assert await recover(controller, store, site) is None

@@ -4,12 +4,12 @@ import asyncio
 
 import pytest
 
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import StoreError
 from abbe.service.push.book import StoreBook
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.tables.base_table import read_base
 from tests.scenarios.test_push import active, bench, last, push, steep
 
@@ -23,7 +23,7 @@ async def test_a_disk_that_is_full_for_a_moment_takes_the_table_back_at_once(sta
         honest = StoreBook.append
 
         async def fails_once(self, journal, wanted, doc):
-            if wanted is State.PROBED and not failed:
+            if wanted is PushState.PROBED and not failed:
                 failed.append(wanted)
                 raise StoreError("the disk is full")
             return await honest(self, journal, wanted, doc)
@@ -32,7 +32,7 @@ async def test_a_disk_that_is_full_for_a_moment_takes_the_table_back_at_once(sta
         with pytest.raises(StoreError) as raised:
             await push(session.controller, store, site, steep(site))
         assert raised.value.__notes__ == ["the old table is in force"]
-        assert (await active(session), last(store)) == (before, State.ROLLED_BACK)
+        assert (await active(session), last(store)) == (before, PushState.ROLLED_BACK)
 
 
 async def test_whoever_stops_it_hears_that_the_table_is_still_active(start_sims, tmp_path):
@@ -50,7 +50,7 @@ async def test_whoever_stops_it_hears_that_the_table_is_still_active(start_sims,
             await push(session.controller, store, site, steep(site), probe=stopped)
         task.uncancel()
         assert "STILL ACTIVE" in raised.value.__notes__[0]
-        assert last(store) == State.ROLLBACK_PENDING
+        assert last(store) == PushState.ROLLBACK_PENDING
         sims.ask("estop", on=False)
         await session.controller.reset_alarm()
         assert "made active again" in await recover(session.controller, store, site)
@@ -64,7 +64,7 @@ async def test_whoever_stops_it_hears_that_the_table_is_still_active(start_sims,
             await push(session.controller, store, site, steep(site), probe=just_stopped)
         task.uncancel()
         assert raised.value.__notes__ == ["the old table is in force"]
-        assert (await active(session), last(store)) == (before, State.ROLLED_BACK)
+        assert (await active(session), last(store)) == (before, PushState.ROLLED_BACK)
 
 
 async def test_a_stop_that_comes_before_a_question_moves_nothing(start_sims, tmp_path):
@@ -82,8 +82,8 @@ async def test_a_stop_that_comes_before_a_question_moves_nothing(start_sims, tmp
                 await asyncio.sleep(0)
                 return await super()._ask(question)
 
-        wanted = Wanted(steep(site), await read_base(session.controller), 100, None, {})
+        wanted = WantedTable(steep(site), await read_base(session.controller), 100, None, {})
         with pytest.raises(asyncio.CancelledError):
             await StopsBeforeTheProbe(session.controller, store, site).bring(wanted, Questions(list, "a test", never, never))
         task.uncancel()
-        assert (asked, last(store)) == ([], State.ROLLED_BACK)
+        assert (asked, last(store)) == ([], PushState.ROLLED_BACK)

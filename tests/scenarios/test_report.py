@@ -22,7 +22,7 @@ import pytest
 
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.service.cli import run
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
 from abbe.service.jobs.check import CheckResult
@@ -110,7 +110,7 @@ async def pushed(machine_file: Path) -> None:
 
     with Store.open(f"sqlite:///{machine_file.parent / 'abbe.sqlite3'}") as store:
         async with open_session(site.urls) as session:
-            wanted = Wanted(tables, await read_base(session.controller), 100, None, {})
+            wanted = WantedTable(tables, await read_base(session.controller), 100, None, {})
             done = await Pushing(session.controller, store, site).bring(wanted, Questions(list, "A. Metrologist", yes, yes))
         assert done.kept
 

@@ -22,7 +22,7 @@ from abbe.service.compensation.rollback import rollback
 from abbe.service.errors import PushNotBegun, StoreError, TableMismatch, TableRefused
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import check_chain
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.tables.base_table import read_base
 from abbe.service.tables.nine_tables import table_image
 from tests.scenarios.test_push import active, bench, last, linear_tables, push, steep
@@ -51,10 +51,10 @@ async def test_back_byte_for_byte_and_forward_again_and_to_the_beginning(start_s
         entries = read_entries(store, "sim")
         check_chain(entries)
         of_it = {e.state: e.doc for e in entries if e.push == 2}
-        assert of_it[State.APPROVED]["approved_by"].endswith("rollback")
-        for state, key in ((State.PROBED, "probe"), (State.VERIFIED, "verify")):
+        assert of_it[PushState.APPROVED]["approved_by"].endswith("rollback")
+        for state, key in ((PushState.PROBED, "probe"), (PushState.VERIFIED, "verify")):
             assert of_it[state][key] == "not measured: byte for byte the table that was in force before push 1; ordered back by a person"
-        assert State.STAGED in of_it  # read back, twice, like any other
+        assert PushState.STAGED in of_it  # read back, twice, like any other
         with pytest.raises(TableRefused, match="was a rollback itself"):
             await rollback(c, store, site)
         assert await rollback(c, store, site, 1) is not None
@@ -77,7 +77,7 @@ async def test_an_open_interlock_leaves_the_table_in_force(start_sims, tmp_path)
         sims.ask("estop", on=True)
         with pytest.raises(PushNotBegun, match="the old table is in force"):
             await rollback(session.controller, store, site)
-        assert (await active(session), await generation(session), last(store)) == (before, gen, State.ABORTED)
+        assert (await active(session), await generation(session), last(store)) == (before, gen, PushState.ABORTED)
 
 
 async def by_hand(session, image: bytes) -> None:
@@ -110,10 +110,10 @@ async def test_a_table_that_nobody_knows_is_refused_by_the_questions_too(start_s
         await push(session.controller, store, site, steep(site))
         gen = await generation(session)
         image = encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7))
-        monkeypatch.setattr(workflow, "table_before_last_kept", lambda *_: workflow.Known(image, "m", "a table from elsewhere"))
+        monkeypatch.setattr(workflow, "table_before_last_kept", lambda *_: workflow.KnownTables(image, "m", "a table from elsewhere"))
         with pytest.raises(TableRefused, match="UNKNOWN"):
             await rollback(session.controller, store, site)
-        assert (await generation(session), last(store)) == (gen, State.REJECTED)
+        assert (await generation(session), last(store)) == (gen, PushState.REJECTED)
 
 
 def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, monkeypatch, capsys):
@@ -121,7 +121,7 @@ def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, mo
     honest = StoreBook.append
 
     async def dies(self, journal, wanted, doc):
-        if journal and journal[-1].state is State.PROBED and journal[-1].push == 2:
+        if journal and journal[-1].state is PushState.PROBED and journal[-1].push == 2:
             raise StoreError("the disk is full")
         return await honest(self, journal, wanted, doc)
 
@@ -134,7 +134,7 @@ def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, mo
             assert await active(session) != kept
             return kept
 
-    async def now() -> tuple[tuple[int, int], list[tuple[int, State]]]:
+    async def now() -> tuple[tuple[int, int], list[tuple[int, PushState]]]:
         async with bench(sims, tmp_path) as (_, store, session):
             return await active(session), [(e.push, e.state) for e in read_entries(store, "sim")]
 
@@ -144,7 +144,7 @@ def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, mo
     assert run(["comp", "rollback", str(sims.machine_file), "--yes"]) == 0
     assert "push 2 was open and is finished" in capsys.readouterr().out
     table, entries = asyncio.run(now())
-    assert (table, entries[-1]) == (kept, (2, State.ROLLED_BACK))
+    assert (table, entries[-1]) == (kept, (2, PushState.ROLLED_BACK))
     assert run(["comp", "rollback", str(sims.machine_file), "--yes"]) == 0  # ordered once more: further back
     assert "in force again (push 3" in capsys.readouterr().out
     assert asyncio.run(now())[0][1] != kept[1]
@@ -157,7 +157,7 @@ async def test_a_rollback_cut_short_leaves_the_table_that_was_verified(start_sim
         before, honest = await active(session), StoreBook.append
 
         async def dies(self, journal, wanted, doc):
-            if journal and journal[-1].state is State.PROBED:
+            if journal and journal[-1].state is PushState.PROBED:
                 raise StoreError("the disk is full")
             return await honest(self, journal, wanted, doc)
 

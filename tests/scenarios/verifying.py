@@ -18,7 +18,7 @@ import pytest
 from abbe.models.compensation.tables import NineTables
 from abbe.service.campaigns.measure import measure
 from abbe.service.compensation.correct import load_runs
-from abbe.service.compensation.pushing import Pushed, Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import Session, open_session
 from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
@@ -29,7 +29,7 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
-from abbe.service.verification.verify import Figures, decide, figures
+from abbe.service.verification.verify import VerificationFigures, decide, figures
 from tests.scenarios.conftest import simulated
 from tests.scenarios.test_push import linear_tables, site_of
 
@@ -53,7 +53,7 @@ class Shop:
     sims: Any
     site: Site
     url: str
-    before: Figures = field(init=False)
+    before: VerificationFigures = field(init=False)
     said: list[str] = field(default_factory=list)
     number: int = 0
     here: tuple[Store, Session] = field(init=False)
@@ -87,7 +87,7 @@ async def _prepared(shop: Shop) -> None:
             async def yes() -> Verdict:
                 return Verdict(True, "the table that is there")
 
-            wanted = Wanted(shop.tables(**BASE), await read_base(session.controller), 100, None, {})
+            wanted = WantedTable(shop.tables(**BASE), await read_base(session.controller), 100, None, {})
             assert (await Pushing(session.controller, store, shop.site).bring(wanted, Questions(list, "a test", yes, yes))).kept
             ids = await measure(session, store, shop.site, plan_of(shop.site, "before"), progress=ignore_progress)
             shop.before = figures(await load_runs(store, ids))
@@ -107,7 +107,7 @@ class Push:
     told_s: float = 0.0
     took_s: float = 0.0
 
-    async def bring(self) -> Pushed:
+    async def bring(self) -> PushResult:
         self.pushing = Pushing(self.session.controller, self.store, self.shop.site)
 
         async def yes() -> Verdict:
@@ -119,7 +119,7 @@ class Push:
             finally:
                 self.told_s = time.monotonic()
 
-        wanted = Wanted(self.tables, await read_base(self.session.controller), 100, None, {})
+        wanted = WantedTable(self.tables, await read_base(self.session.controller), 100, None, {})
         try:
             return await self.pushing.bring(wanted, Questions(list, "a test", yes, verify))
         finally:

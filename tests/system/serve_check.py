@@ -14,7 +14,7 @@ from typing import Any
 
 import aiomqtt
 
-from abbe.service.core.setup import Setup
+from abbe.service.core.setup import ServiceSetup
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.broker import parse
@@ -77,7 +77,7 @@ def main() -> int:
     broker = parse(given["mqtt"]) if given.get("mqtt") else None
     topics = Topics("plant/abbe", "mill-7")
     return serve(
-        Setup(
+        ServiceSetup(
             "mill-7",
             {"name": "mill-7"},
             {"laser": "modbus+tcp://127.0.0.1:5021"},

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaigns.measure import Manner, measure
-from abbe.service.compensation.push_approved import Approved, Order
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.push_approved import Approved, PushOrder
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
-from abbe.service.core.setup import Setup
+from abbe.service.core.setup import ServiceSetup
 from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.events import Progress
@@ -33,7 +33,7 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.serve import serve
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.tables.base_table import read_base
-from abbe.service.tables.push_outcome import Outcome
+from abbe.service.tables.push_outcome import PushOutcome
 from tests.scenarios.test_push import linear_tables
 
 PROPOSAL = Approved(4, 9, 0)
@@ -44,7 +44,7 @@ def say(word: str) -> None:
     sys.stdout.flush()
 
 
-async def probing(session: Session, store: ServiceStore, site: Site, order: Order, last: str) -> Verdict:
+async def probing(session: Session, store: ServiceStore, site: Site, order: PushOrder, last: str) -> Verdict:
     """Axes on their way for as long as nobody stops them. ``last``: what the fixture is asked for when that happens."""
     told: list[Progress] = []
 
@@ -70,12 +70,12 @@ async def probing(session: Session, store: ServiceStore, site: Site, order: Orde
 
 def duties_on(site: Site, last: str) -> Any:
     def duties(store: ServiceStore) -> alarm_manager.Duties:
-        async def push(order: Order) -> Outcome:
+        async def push(order: PushOrder) -> PushOutcome:
             with alone(site.urls.cnc):
                 async with open_session(site.urls) as session:
                     await recover(session.controller, store, site)
                     await order.begun()
-                    wanted = Wanted(
+                    wanted = WantedTable(
                         linear_tables(site, np.full((3, 3), 1e-5)), await read_base(session.controller), 100, None, {"proposal": 4}
                     )
 
@@ -85,7 +85,7 @@ def duties_on(site: Site, last: str) -> Any:
                     done = await Pushing(session.controller, store, site, control=order.control).bring(
                         wanted, Questions(list, "a test", probe, probe)
                     )
-                    return Outcome("kept" if done.kept else "rolled back", done.why)
+                    return PushOutcome("kept" if done.kept else "rolled back", done.why)
 
         async def investigate(*_: object) -> None:
             raise AssertionError
@@ -105,7 +105,7 @@ def main() -> int:
     alarm_manager.next_approved = lambda store, name, entries, now_s: None if any(e.kind == "pushing" for e in entries) else PROPOSAL  # type: ignore[assignment]
     yearly = Schedule("yearly", "0 0 1 1 *", "UTC", "quick-check")
     return serve(
-        Setup(
+        ServiceSetup(
             "sim", site.doc, {"cnc": ready["cnc"]}, (yearly,), given["store"], None, Topics("plant/abbe", "sim"), "127.0.0.1", 0,
             lambda _: None, recover=lambda store: lambda: recover_at_start(store, site), duties=duties_on(site, given["last"]),
         )

@@ -19,10 +19,10 @@ import pytest
 from abbe.drivers.errors import Refused
 from abbe.drivers.links.modbus_line import Canary
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import Op
+from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 from abbe.models.compensation.tables import NineTables, grid_positions
-from abbe.service.compensation.pushing import Pushing, Questions, Wanted
+from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
@@ -248,7 +248,7 @@ async def test_our_link_reads_and_writes_a_libmodbus_server(server_url, canary):
     assert await link.read(0, 4) == (0x0102, 0x0304, 0x449A, 0x5000)
     for count in (1, 2, 100, 125):
         assert await link.read(500, count, lead=20) == tuple(range(500, 500 + count))
-    await link.write(700, range(3000, 3123), Op.LEVEL)
+    await link.write(700, range(3000, 3123), ModbusOperation.LEVEL)
     assert await link.read(700, 123) == tuple(range(3000, 3123))
     with pytest.raises(Refused, match="exception 2"):
         await link.read(990, 20)
@@ -276,7 +276,7 @@ async def test_mbpoll_reads_the_numbers_of_the_table_that_was_pushed(require, tm
         none = [np.zeros_like(c) for c in curves]
         tables = NineTables(grids, (curves[0], curves[1], curves[2]), (none[0], none[1], none[2]))
         with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-            wanted = Wanted(tables, await read_base(b.session.controller), 100, None, {})
+            wanted = WantedTable(tables, await read_base(b.session.controller), 100, None, {})
             pushed = await Pushing(b.session.controller, store, b.site).bring(wanted, Questions(list, "a test", yes, yes))
         assert pushed.kept
         found = await poll_table(int(re.search(r":(\d+)", b.site.urls.cnc.partition("//")[2]).group(1)))

@@ -15,7 +15,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.clock import SystemClock
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import check_chain
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
@@ -98,8 +98,8 @@ def test_an_approver_orders_the_table_back_and_an_operator_does_not(tmp_path: Pa
     with ServiceStore.open(url) as store:
         entries = read_entries(store, "sim")
         check_chain(entries)
-        assert (entries[-1].push, entries[-1].state) == (2, State.KEEP)
-        assert next(e for e in entries if e.push == 2 and e.state is State.APPROVED).doc["approved_by"] == "token:ann/test: rollback"
+        assert (entries[-1].push, entries[-1].state) == (2, PushState.KEEP)
+        assert next(e for e in entries if e.push == 2 and e.state is PushState.APPROVED).doc["approved_by"] == "token:ann/test: rollback"
         told = [(r.who, r.outcome, r.doc["reason"]) for r in store.audit() if r.action == "rollback"]
         assert told == [("token:ann/test", "begun", REASON), ("token:ann/test", "kept", REASON)]
         asked = [(r.who, r.outcome) for r in store.audit() if r.action == "POST /api/v1/tables/rollback"]

@@ -5,7 +5,7 @@ import json
 import random
 
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.run import READERS
 
@@ -39,7 +39,7 @@ def changed(doc, path, factor=FACTOR):
 
 def read(name, doc):
     """What the reader of a file says about such a document."""
-    case, checks = Case(doc, (name,)), Checks(name)
+    case, checks = VectorCase(doc, (name,)), Checks(name)
     READERS[f"{name}.json"](case, checks)
     checks.unread = case.unread()
     return checks

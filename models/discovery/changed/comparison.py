@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abbe.models.discovery.changed.search import Bench, Chosen
-from abbe.models.solvers.engine import Problem, build, expected_noise, settle
-from abbe.models.solvers.information import Sums, total
+from abbe.models.discovery.changed.search import ChangeContext, Chosen
+from abbe.models.solvers.engine import CampaignProblem, build, expected_noise, settle
+from abbe.models.solvers.information import InformationSums, total
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
 from abbe.models.uncertainty.known_field import KnownField
@@ -89,7 +89,7 @@ def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
         raise ValueError("changes: no runs")
     problem = build(known.machine, known.terms, runs, Priors(), expected_noise(runs, None, None))
     fit = settle(problem, _silent)
-    bench = Bench(known, problem, fit)
+    bench = ChangeContext(known, problem, fit)
     whole = bench.choose(total(fit.parts))
     by_half = [bench.choose(total(half)) for half in _halves(fit.parts, problem)]
     before, after, judged = bench.judged(by_half) if by_half else (None, None, None)
@@ -100,7 +100,7 @@ def _silent(_: str) -> None:
     return None
 
 
-def _halves(parts: tuple[Sums, ...], problem: Problem) -> list[tuple[Sums, ...]]:
+def _halves(parts: tuple[InformationSums, ...], problem: CampaignProblem) -> list[tuple[InformationSums, ...]]:
     """Folds (whole set-ups) with even and with odd numbers; none where one half would have too few set-ups."""
     folds = problem.readings.fold
     setups = [{problem.runs[k].setup for k in np.unique(problem.readings.run[folds % 2 == odd])} for odd in (0, 1)]
@@ -109,7 +109,7 @@ def _halves(parts: tuple[Sums, ...], problem: Problem) -> list[tuple[Sums, ...]]
     return [parts[odd::2] for odd in (0, 1)]
 
 
-def _changes(bench: Bench, whole: Chosen, by_half: list[Chosen]) -> tuple[Change, ...]:
+def _changes(bench: ChangeContext, whole: Chosen, by_half: list[Chosen]) -> tuple[Change, ...]:
     """All that were chosen by all runs, the largest evidence first."""
     out = []
     for taken in whole.taken:

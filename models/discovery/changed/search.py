@@ -13,15 +13,15 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term, term_values
 from abbe.models.machine import AXES
-from abbe.models.solvers.engine import Fit, Problem
-from abbe.models.solvers.information import Sums
+from abbe.models.solvers.engine import CampaignFit, CampaignProblem
+from abbe.models.solvers.information import InformationSums
 from abbe.models.uncertainty.known_field import KnownField
 
 # How much more likely readings are if something has changed by an unknown amount: each candidate alone, all else integrated out.
 
 
 @dataclass(frozen=True)
-class Asked:
+class AskedChange:
     """A candidate: numbers of mean 0 and a standard deviation of ``sizes`` (which one is not known) along ``directions``, shape (p, q).
 
     ``several``: a motion's shape, however many numbers that takes here; else one number with a meaning of its own.
@@ -34,7 +34,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ChangeEvidence:
     """Gain in log evidence at the best size, and that size."""
 
     name: str
@@ -42,7 +42,7 @@ class Evidence:
     size: float
 
 
-def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[Asked]) -> list[Evidence]:
+def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[AskedChange]) -> list[ChangeEvidence]:
     """Ask every candidate alone.
 
     Parameters
@@ -51,7 +51,7 @@ def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[Asked]) -> list[
         Normal equations of the whitened readings, less what is expected without any change.
     base : array, shape (p, k)
         Factor of the covariance of everything that is open without a change; it is integrated out.
-    asked : sequence of Asked
+    asked : sequence of AskedChange
 
     Returns
     -------
@@ -76,7 +76,7 @@ def log_evidence(gram: F2, moment: F1, base: F2) -> float:
     return 0.5 * float(z @ z) - float(np.log(low.diagonal()).sum())
 
 
-def _one(asked: Asked, gram: F2, moment: F1) -> Evidence:
+def _one(asked: AskedChange, gram: F2, moment: F1) -> ChangeEvidence:
     d = asked.directions
     values, vectors = linalg.eigh(d.T @ gram @ d)
     values, along = np.maximum(values, 0.0), vectors.T @ (d.T @ moment)
@@ -85,7 +85,7 @@ def _one(asked: Asked, gram: F2, moment: F1) -> Evidence:
         inside = 1.0 + size**2 * values
         found.append(0.5 * float(np.sum(size**2 * along**2 / inside) - np.sum(np.log(inside))))
     best = int(np.argmax(found))
-    return Evidence(asked.name, found[best], asked.sizes[best])
+    return ChangeEvidence(asked.name, found[best], asked.sizes[best])
 
 
 LINEAR = ("EXX", "EYY", "EZZ", "C0Y", "B0Z", "A0Z")
@@ -102,10 +102,10 @@ POINTS = 41
 
 
 @dataclass(frozen=True)
-class Taken:
+class TakenChange:
     """A candidate that was chosen: with which size it stands beside the others, its gain after its price, and its near rivals."""
 
-    asked: Asked
+    asked: AskedChange
     size: float
     gain: float
     rivals: tuple[tuple[str, float], ...]
@@ -115,18 +115,18 @@ class Taken:
 class Chosen:
     """What some runs have chosen, and their normal equations less what the solution from before expects: (p, p) and (p,)."""
 
-    taken: tuple[Taken, ...]
+    taken: tuple[TakenChange, ...]
     gram: F2
     moment: F1
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class ChangeContext:
     """The new runs, linearised about what they themselves say, and the machine from before. Unknowns in units of their typical size."""
 
     known: KnownField
-    problem: Problem
-    fit: Fit
+    problem: CampaignProblem
+    fit: CampaignFit
 
     @property
     def _n(self) -> int:
@@ -142,13 +142,13 @@ class Bench:
         return out
 
     @cached_property
-    def candidates(self) -> tuple[Asked, ...]:
+    def candidates(self) -> tuple[AskedChange, ...]:
         """All that may have changed, as far as the solution from before has terms for it."""
         names = {t.motion if t.order == 0 else t.name for t in self.known.terms}
         linear = [m for m in LINEAR if (m if m[1] == "0" else f"{m}.1") in names]
-        out = [Asked(m, self._scaled(self.known.linear({m: 1.0})), LINEAR_SIZES) for m in linear]
+        out = [AskedChange(m, self._scaled(self.known.linear({m: 1.0})), LINEAR_SIZES) for m in linear]
         bent = dict.fromkeys(t.motion for t in self.known.terms if _is_shape(t))
-        return (*out, *(Asked(f"{m} shape", self._shape(m), SHAPE_SIZES, several=True) for m in bent))
+        return (*out, *(AskedChange(f"{m} shape", self._shape(m), SHAPE_SIZES, several=True) for m in bent))
 
     def _scaled(self, coefficients: F1) -> F2:
         """One direction (P,) in mm and rad as a direction of all unknowns, shape (p, 1)."""
@@ -160,7 +160,7 @@ class Bench:
         """Factor of the documented size of a motion but for its linear part, shape (p, q)."""
         return self.problem.sizes.root[:, [k for k, t in enumerate(self.known.terms) if t.motion == motion and _is_shape(t)]]
 
-    def choose(self, sums: Sums) -> Chosen:
+    def choose(self, sums: InformationSums) -> Chosen:
         """Take in what gains most, one after another, until nothing gains enough; what has become needless goes.
 
         That alone would go wrong twice. A shape is so pliant that it may gain more at first than either of two linear changes which explain
@@ -174,12 +174,12 @@ class Bench:
         start[: self._n] = self.known.coefficients / self.problem.sizes.typical[: self._n]
         none = Chosen((), gram, moment - gram @ start)
         linear = tuple(a for a in self.candidates if not a.several)
-        every = self._needed(replace(none, taken=tuple(Taken(a, max(LINEAR_SIZES), 0.0, ()) for a in linear)))
+        every = self._needed(replace(none, taken=tuple(TakenChange(a, max(LINEAR_SIZES), 0.0, ()) for a in linear)))
         grown = [self._grown(start, self.candidates) for start in (none, self._grown(none, linear), every)]
         best = max([none, *grown], key=lambda c: log_evidence(gram, c.moment, self._beside(c.taken)) - self._price * len(c.taken))
         return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
 
-    def _rivals(self, chosen: Chosen, taken: Taken) -> tuple[tuple[str, float], ...]:
+    def _rivals(self, chosen: Chosen, taken: TakenChange) -> tuple[tuple[str, float], ...]:
         """Candidates that explain nearly as much in place of one that was chosen, beside all the others."""
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in self.candidates if a.name not in names]
@@ -188,7 +188,7 @@ class Bench:
         near = [(e.name, own.gain - e.gain) for e in found if own.gain - e.gain < NEAR]
         return tuple(sorted(near, key=lambda item: item[1]))
 
-    def _grown(self, chosen: Chosen, candidates: Sequence[Asked]) -> Chosen:
+    def _grown(self, chosen: Chosen, candidates: Sequence[AskedChange]) -> Chosen:
         while len(chosen.taken) < MOST and (best := self._best(chosen, candidates)) is not None:
             grown = self._needed(replace(chosen, taken=(*chosen.taken, best)))
             if best.asked.name not in {t.asked.name for t in grown.taken}:
@@ -196,7 +196,7 @@ class Bench:
             chosen = grown
         return chosen
 
-    def _best(self, chosen: Chosen, candidates: Sequence[Asked]) -> Taken | None:
+    def _best(self, chosen: Chosen, candidates: Sequence[AskedChange]) -> TakenChange | None:
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in candidates if a.name not in names]
         if not left:
@@ -206,7 +206,7 @@ class Bench:
         gain = found[k].gain - self._price
         if gain < ENOUGH:
             return None
-        return Taken(left[k], found[k].size, gain, ())
+        return TakenChange(left[k], found[k].size, gain, ())
 
     def _needed(self, chosen: Chosen) -> Chosen:
         """Every one with its gain and size beside all the others; the least needed goes first, until all are needed."""
@@ -225,7 +225,7 @@ class Bench:
     def _price(self) -> float:
         return float(np.log(len(self.candidates)))
 
-    def _beside(self, taken: Sequence[Taken]) -> F2:
+    def _beside(self, taken: Sequence[TakenChange]) -> F2:
         """Factor of all that is open when these have changed, shape (p, k)."""
         return np.column_stack([self._open, *(t.asked.directions * t.size for t in taken)])
 
@@ -233,10 +233,10 @@ class Bench:
         """The same with all scales and squareness free, too, without one candidate."""
         others = [t for t in chosen.taken if t.asked.name != but]
         names = {but, *(t.asked.name for t in others)}
-        linear = [Taken(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
+        linear = [TakenChange(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
         return self._beside([t if t.asked.several else replace(t, size=max(LINEAR_SIZES)) for t in (*others, *linear)])
 
-    def size(self, chosen: Chosen, asked: Asked) -> tuple[float, float]:
+    def size(self, chosen: Chosen, asked: AskedChange) -> tuple[float, float]:
         """Value of a change and its standard uncertainty (as `Change` of the comparison), all that is linear free beside it."""
         coefficients, covariance = self._coefficients(chosen, asked)
         if not asked.several:
@@ -248,7 +248,7 @@ class Bench:
         slope = rows.T @ (rows @ coefficients) / (len(rows) * max(value, 1e-300))
         return value, float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
 
-    def _coefficients(self, chosen: Chosen, asked: Asked) -> tuple[F1, F2]:
+    def _coefficients(self, chosen: Chosen, asked: AskedChange) -> tuple[F1, F2]:
         """Coefficients (P,) of one change, mm or rad, and their covariance."""
         size = next(t.size for t in chosen.taken if t.asked.name == asked.name)
         factor = asked.directions * (size if asked.several else max(LINEAR_SIZES))
@@ -281,7 +281,7 @@ class Bench:
         out = {}
         for asked in self.candidates:
             if not asked.several and asked.name not in names:
-                one = Taken(asked, max(LINEAR_SIZES), 0.0, ())
+                one = TakenChange(asked, max(LINEAR_SIZES), 0.0, ())
                 value, u = self.size(replace(chosen, taken=(*chosen.taken, one)), asked)
                 if 2.0 * u < max(LINEAR_SIZES):
                     out[asked.name] = abs(value) + 2.0 * u

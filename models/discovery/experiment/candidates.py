@@ -34,7 +34,7 @@ OTHER_FEED = 1.3
 
 
 @dataclass(frozen=True)
-class Offer:
+class ExperimentOffer:
     """One addition: its runs; ``less``: runs whose readings are taken off (angular); minutes; why, for people."""
 
     adds: str
@@ -50,14 +50,14 @@ class Offer:
         return self.adds in ("angular_interferometer", "second_tool_length", "reference_length")
 
 
-def offers(case: Case) -> tuple[Offer, ...]:
+def offers(case: Case) -> tuple[ExperimentOffer, ...]:
     """Every addition that the identify runs do not hold already."""
     runs = [r.path for r in case.of("identify")]
     bars, lasers = [p for p in runs if p.kind == "bar"], [p for p in runs if p.kind == "laser"]
     if not runs:
         return ()
     start = max(float(r.path.at.t_s[-1]) for r in case.runs) + GAP_S
-    out: list[Offer] = []
+    out: list[ExperimentOffer] = []
     if bars:
         out += _bar_variants(bars, start)
     else:
@@ -66,12 +66,12 @@ def offers(case: Case) -> tuple[Offer, ...]:
         out.append(_diagonals(runs[0], start))
     if not any(p.test == "laser_linear" for p in lasers):
         found = tuple(_line(runs[0], a, start + a * 3000.0, f"next_line_{AXES[a]}") for a in range(3))
-        out.append(Offer("single_axis_laser", found, 3 * LINE_MIN + _minutes(found), "a laser along each axis alone"))
+        out.append(ExperimentOffer("single_axis_laser", found, 3 * LINE_MIN + _minutes(found), "a laser along each axis alone"))
     out += [_angles(runs[0], start), _late(bars or lasers, start)]
     if len({tuple(np.round(p.machine.tool_mm)) for p in runs}) < 2:
         out.append(_second_tool(bars or lasers, start))
     if bars and not any(r.length_calibrated for r in case.of("identify")):
-        out.append(Offer("reference_length", (), LENGTH_MIN, "the bar's length against a standard", knows_length=True))
+        out.append(ExperimentOffer("reference_length", (), LENGTH_MIN, "the bar's length against a standard", knows_length=True))
     return tuple(out)
 
 
@@ -95,26 +95,26 @@ def _minutes(runs: tuple[CaseRun, ...]) -> float:
     return sum(float(np.ptp(r.path.at.t_s)) / 60.0 + RUN_MIN for r in runs)
 
 
-def _bar_variants(bars: list[Path], start: float) -> list[Offer]:
+def _bar_variants(bars: list[Path], start: float) -> list[ExperimentOffer]:
     out, first = [], bars[0]
     feeds = {float(np.round(np.median(p.feed_mm_min))) for p in bars}
     if one_feed(bars):
         other = max(feeds) * (0.4 if max(feeds) > 1500.0 else 2.5)
         both = _with_back(first, bars, lambda q, t, label: _bar(first, q, other, t, label), start, "next_feed")
-        out.append(Offer("second_feed", both, BAR_MIN + _minutes(both), f"the same path at {other:.0f} mm/min"))
+        out.append(ExperimentOffer("second_feed", both, BAR_MIN + _minutes(both), f"the same path at {other:.0f} mm/min"))
     if one_way(bars):
         again = (_bar(first, first.at.q_mm[::-1], min(feeds), start, "next_back"),)
-        out.append(Offer("opposite_direction", again, BAR_MIN + _minutes(again), "the same path the other way round"))
+        out.append(ExperimentOffer("opposite_direction", again, BAR_MIN + _minutes(again), "the same path the other way round"))
     if one_radius(bars):
         radius = first.radius_mm * (2.0 / 3.0 if first.radius_mm > 100.0 else 1.5)
         if _fits(first.machine, first.centre_mm, radius):
             shape = (first.at.q_mm - first.centre_mm) * (radius / first.radius_mm) + first.centre_mm
             both = _with_back(first, bars, lambda q, t, label: _bar(first, q, max(feeds), t, label), start, "next_radius", shape)
-            out.append(Offer("second_radius", both, BAR_MIN + _minutes(both), f"the same path with a bar of {radius:.0f} mm"))
+            out.append(ExperimentOffer("second_radius", both, BAR_MIN + _minutes(both), f"the same path with a bar of {radius:.0f} mm"))
     if not any(p.test == "ballbar_circle" for p in bars):
         found = _circles(first, start, max(feeds))
         if found:
-            out.append(Offer("planar_circles", found, BAR_MIN + _minutes(found), "circles in planes of two axes, both ways"))
+            out.append(ExperimentOffer("planar_circles", found, BAR_MIN + _minutes(found), "circles in planes of two axes, both ways"))
     return out
 
 
@@ -184,13 +184,15 @@ def _circles(like: Path, start: float, feed: float) -> tuple[CaseRun, ...]:
     return tuple(out)
 
 
-def _ballbar(like: Path, start: float) -> list[Offer]:
+def _ballbar(like: Path, start: float) -> list[ExperimentOffer]:
     """None where the strokes have no room for a bar."""
     runs = _circles(like, start, 2.0 * FEED_MM_MIN) + tuple(
         replace(r, path=replace(r.path, label=f"{r.path.label}_slow", setup=f"{r.path.setup}_slow"))
         for r in _circles(like, start + 1500.0, FEED_MM_MIN)
     )
-    return [Offer("ballbar", runs, BAR_MIN + _minutes(runs), "a ball-bar in three planes at two feeds, both ways")] if runs else []
+    return (
+        [ExperimentOffer("ballbar", runs, BAR_MIN + _minutes(runs), "a ball-bar in three planes at two feeds, both ways")] if runs else []
+    )
 
 
 def _laser(like: Path, q_mm: F2, beam: F1, start: float, label: str, test: str) -> CaseRun:
@@ -212,14 +214,14 @@ def _box(machine: Machine) -> F2:
     return np.column_stack([machine.stroke_mm[:, 0] + inside, machine.stroke_mm[:, 1] - inside])
 
 
-def _diagonals(like: Path, start: float) -> Offer:
+def _diagonals(like: Path, start: float) -> ExperimentOffer:
     found = []
     for k, name in enumerate(DIAGONALS):
         a, b = diagonal_ends(_box(like.machine), name)
         beam = (b - a) / np.linalg.norm(b - a)
         found.append(_laser(like, step_diagonal(a, b, 12), beam, start + 2000.0 * k, f"next_{name}", "laser_diagonal"))
     runs = tuple(found)
-    return Offer("laser_diagonals", runs, 4 * LASER_MIN + _minutes(runs), "the four body diagonals in steps, out and back")
+    return ExperimentOffer("laser_diagonals", runs, 4 * LASER_MIN + _minutes(runs), "the four body diagonals in steps, out and back")
 
 
 def _line(like: Path, axis: int, start: float, label: str, tool_mm: F1 | None = None) -> CaseRun:
@@ -232,7 +234,7 @@ def _line(like: Path, axis: int, start: float, label: str, tool_mm: F1 | None = 
     return replace(run, path=replace(run.path, machine=replace(like.machine, tool_mm=like.machine.tool_mm + tool_mm)))
 
 
-def _angles(like: Path, start: float) -> Offer:
+def _angles(like: Path, start: float) -> ExperimentOffer:
     """An angular interferometer reads the difference of two beams; about both directions across each axis."""
     one, two, t = [], [], start
     for a in range(3):
@@ -243,25 +245,29 @@ def _angles(like: Path, start: float) -> Offer:
             two.append(_line(like, a, t, label, -arm))
             t += 1500.0
     runs = tuple(one)
-    return Offer("angular_interferometer", runs, 3 * LINE_MIN + _minutes(runs), "pitch and yaw of each axis by themselves", less=tuple(two))
+    return ExperimentOffer(
+        "angular_interferometer", runs, 3 * LINE_MIN + _minutes(runs), "pitch and yaw of each axis by themselves", less=tuple(two)
+    )
 
 
-def _late(known: list[Path], start: float) -> Offer:
+def _late(known: list[Path], start: float) -> ExperimentOffer:
     """The first paths again hours later, each in a set-up of its own."""
     runs = []
     for k, p in enumerate(_different(known)[:4]):
         runs.append(_again(p, start + LATE_S + 1500.0 * k, f"next_late_{k}", p.machine))
     setup = BAR_MIN if known[0].kind == "bar" else LASER_MIN
     found = tuple(runs)
-    return Offer("longer_session", found, WAIT_MIN + len(found) * setup + _minutes(found), "the first runs again hours later")
+    return ExperimentOffer("longer_session", found, WAIT_MIN + len(found) * setup + _minutes(found), "the first runs again hours later")
 
 
-def _second_tool(known: list[Path], start: float) -> Offer:
+def _second_tool(known: list[Path], start: float) -> ExperimentOffer:
     tool = known[0].machine.tool_mm
     along = tool / np.linalg.norm(tool) if np.linalg.norm(tool) > 1.0 else -np.eye(3)[2]
     longer = replace(known[0].machine, tool_mm=tool + LONGER_TOOL_MM * along)
     runs = tuple(_again(p, start + 1500.0 * k, f"next_tool_{k}", longer) for k, p in enumerate(_different(known)[:4]))
-    return Offer("second_tool_length", runs, TOOL_MIN + len(runs) * BAR_MIN + _minutes(runs), "the same runs with a tool 100 mm longer")
+    return ExperimentOffer(
+        "second_tool_length", runs, TOOL_MIN + len(runs) * BAR_MIN + _minutes(runs), "the same runs with a tool 100 mm longer"
+    )
 
 
 def _different(known: list[Path]) -> list[Path]:

@@ -17,7 +17,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import NextTest
 from abbe.models.discovery.baseline import Baseline, baseline_of
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.discovery.experiment.candidates import Offer, offers
+from abbe.models.discovery.experiment.candidates import ExperimentOffer, offers
 from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path, Places
 
@@ -37,7 +37,7 @@ RIDGE = 1e-10
 
 
 @dataclass(frozen=True)
-class Suspect:
+class SuspectEffect:
     """An effect that may be the missing one.
 
     Attributes
@@ -61,7 +61,7 @@ class Suspect:
 class Prospect:
     """What an addition would tell: separation of the leader from each rival, sigmas, in the order of the rivals; what is known already."""
 
-    offer: Offer
+    offer: ExperimentOffer
     sigmas: F1
     already: F1
 
@@ -83,7 +83,9 @@ class Prospect:
         return float(np.maximum(gain, 0.0).sum() / max(self.offer.minutes, 1.0))
 
 
-def propose(case: Case, leader: Suspect, rivals: tuple[Suspect, ...], noise_mm: Mapping[str, float] | None = None) -> NextTest | None:
+def propose(
+    case: Case, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], noise_mm: Mapping[str, float] | None = None
+) -> NextTest | None:
     """The addition that tells the leading suspect from its rivals best, per minute.
 
     Parameters
@@ -108,7 +110,7 @@ def propose(case: Case, leader: Suspect, rivals: tuple[Suspect, ...], noise_mm: 
 
 
 def prospects(
-    case: Case, leader: Suspect, rivals: tuple[Suspect, ...], noise_mm: Mapping[str, float] | None = None
+    case: Case, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], noise_mm: Mapping[str, float] | None = None
 ) -> tuple[Prospect, ...]:
     """All additions with what they would tell, best per minute first; parameters as `propose`."""
     found = offers(case)
@@ -164,7 +166,7 @@ class _Columns:
     rivals: tuple[tuple[F2, ...], ...]
 
     @classmethod
-    def of(cls, base: Baseline, leader: Suspect, rivals: tuple[Suspect, ...], paths: tuple[Path, ...]) -> _Columns:
+    def of(cls, base: Baseline, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], paths: tuple[Path, ...]) -> _Columns:
         own = leader.effect.signal(paths, leader.key, leader.values)
         given = usual(leader, own[0].shape[1]) if leader.coefficients is None else leader.coefficients
         # columns of set-ups that are new: as large as those of the old ones
@@ -203,7 +205,7 @@ class _Columns:
         return np.array(out)
 
 
-def usual(suspect: Suspect, columns: int) -> F1:
+def usual(suspect: SuspectEffect, columns: int) -> F1:
     """Coefficients of the middle of what is usual, in the first column, for any power law of the strength."""
     effect = suspect.effect
     sizes = [abs(effect.strength(c * effect.per_unit * np.eye(columns)[0], suspect.values)) / effect.per_unit for c in (1.0, 4.0)]

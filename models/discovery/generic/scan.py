@@ -28,16 +28,16 @@ PLACES = 64
 
 
 @dataclass(frozen=True)
-class Seen:
+class ScanResult:
     """What is left of the readings of some runs: ``rest`` whitened, ``sigma_mm`` of one reading of each run."""
 
     paths: tuple[Path, ...]
     rest: tuple[F1, ...]
     sigma_mm: tuple[float, ...]
 
-    def only(self, which: list[int]) -> Seen:
+    def only(self, which: list[int]) -> ScanResult:
         """Some of the runs, in this order."""
-        return Seen(tuple(self.paths[k] for k in which), tuple(self.rest[k] for k in which), tuple(self.sigma_mm[k] for k in which))
+        return ScanResult(tuple(self.paths[k] for k in which), tuple(self.rest[k] for k in which), tuple(self.sigma_mm[k] for k in which))
 
     def stacked(self) -> tuple[F1, F2, F1]:
         """Clock, look per sigma (n, 3) and rest of all runs."""
@@ -56,7 +56,7 @@ def best(score: F1, count: int, apart: int) -> list[int]:
     return out
 
 
-def step_moments(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
+def step_moments(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
     """Moments of a step per axis and, ``""``, in all directions at once: by set-up of a bar, by run of a laser, whose zero is new."""
     groups: dict[str, list[int]] = {}
     for k, p in enumerate(seen.paths):
@@ -77,7 +77,7 @@ def step_moments(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
     return {key: tuple(float(t0[i]) for i in best(score, count, 15)) for key, score in columns.items()}
 
 
-def periods(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
+def periods(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
     """Periods on the clock, by axis and by instrument ("bar", "laser")."""
     t, look, rest = seen.stacked()
     per_mm = np.concatenate([np.full(p.n, 1.0 / s) for p, s in zip(seen.paths, seen.sigma_mm, strict=True)])
@@ -88,7 +88,7 @@ def periods(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
     return {k: tuple(float(1.0 / f[i]) for i in best(power[j], count, 2)) for j, k in enumerate(("X", "Y", "Z", "bar", "laser"))}
 
 
-def pitches(seen: Seen, count: int) -> dict[str, tuple[float, ...]]:
+def pitches(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
     """Pitches of a wave along one axis in the direction of another, by component."""
     q = np.concatenate([p.at.q_mm for p in seen.paths])
     _, look, rest = seen.stacked()
@@ -117,7 +117,7 @@ def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F
     return f[inside], power
 
 
-def bursts(seen: Seen, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+def bursts(seen: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Moments, widths and frequencies of short swings in single bar runs: each the values of the best few combinations."""
     found: list[tuple[float, float, float, float]] = []
     for p, rest in zip(seen.paths, seen.rest, strict=True):
@@ -141,7 +141,7 @@ def bursts(seen: Seen, count: int) -> tuple[tuple[float, ...], tuple[float, ...]
     return tuple(tuple(dict.fromkeys(round(v[j], 6) for v in top)) for j in (1, 2, 3))  # type: ignore[return-value]
 
 
-def bumps(seen: Seen, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
+def bumps(seen: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
     """Moments at which the path passes the places where a bump would take out most."""
     q = np.concatenate([p.at.q_mm for p in seen.paths])
     t, look, rest = seen.stacked()

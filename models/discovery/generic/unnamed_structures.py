@@ -12,7 +12,7 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Where
 from abbe.models.discovery.case import Case
-from abbe.models.discovery.generic.scan import PERIODS_S, PITCHES_MM, Seen, bumps, bursts, periods, pitches, step_moments
+from abbe.models.discovery.generic.scan import PERIODS_S, PITCHES_MM, ScanResult, bumps, bursts, periods, pitches, step_moments
 from abbe.models.discovery.generic.shapes import SIGNALS, lobe_latitude, place_at
 from abbe.models.discovery.signal_localization import where_of_signal
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
@@ -61,7 +61,7 @@ def generic_rivals(
         starts = _coarse(paths)
     else:
         kept = tuple(p for p in paths if p.label in residuals)
-        starts = _scanned(Seen(kept, tuple(residuals[p.label] for p in kept), tuple(sigma_mm[p.kind] for p in kept)))
+        starts = _scanned(ScanResult(kept, tuple(residuals[p.label] for p in kept), tuple(sigma_mm[p.kind] for p in kept)))
     bar = any(p.kind == "bar" for p in paths)
     return tuple(e for e in _all(starts, paths) if bar or e.name not in ("unnamed_lobes", "unnamed_burst"))
 
@@ -105,7 +105,7 @@ Starts = dict[str, dict[str, tuple[float, ...]]]
 """Starts by parameter, ``"period_s"``, by key; ``"*"`` for all keys."""
 
 
-def _scanned(seen: Seen) -> Starts:
+def _scanned(seen: ScanResult) -> Starts:
     moments = step_moments(seen, TOP)
     t0, width, hertz = bursts(seen, TOP)
     return {

@@ -44,7 +44,7 @@ def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tup
     look = np.concatenate([p.look**2 / s**2 for p, s in zip(paths, sigma_mm, strict=True)])
     values = np.concatenate(rest)
     read = values != 0.0
-    fits = tuple(_Fit.of(square[read], look[read]) for square in (np.concatenate([_rough(r) for r in rest]), values**2))
+    fits = tuple(_RoughnessFit.of(square[read], look[read]) for square in (np.concatenate([_rough(r) for r in rest]), values**2))
     out: dict[int, Roughness] = {}
     for axis in range(3):
         speed = np.concatenate([np.where(np.ptp(p.at.q_mm[:, axis]) > 0, np.abs(p.at.v_mm_s[:, axis]), np.inf) for p in paths])
@@ -75,7 +75,7 @@ def _rough(rest: F1) -> F1:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _RoughnessFit:
     """Squared residuals with scatter along the axes fitted: what more scatter within a gate gains."""
 
     square: F1
@@ -83,7 +83,7 @@ class _Fit:
     start: F1
 
     @classmethod
-    def of(cls, square: F1, look: F2) -> _Fit:
+    def of(cls, square: F1, look: F2) -> _RoughnessFit:
         plain = look / np.maximum(look.max(axis=0), 1e-300)
         return cls(square, plain, _likelihood(square, plain, np.full(3, 0.02)))
 

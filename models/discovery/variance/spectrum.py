@@ -24,7 +24,7 @@ TOP = 24
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """Gain in log likelihood (of the runs that prove it), how many frequencies were tried, frequency, amplitude with its uncertainty.
 
     ``p_harmonics``: how often noise gives as much at twice to four times the frequency; a saw-tooth has them, a vibration has not.
@@ -57,7 +57,7 @@ class _Spectrum:
 
 def line_of_axis(
     axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...], colour: Colour | None
-) -> Line | None:
+) -> SpectralLine | None:
     """The most likely line of an axis' vibration; None where no run could show one.
 
     Parameters
@@ -73,11 +73,11 @@ def line_of_axis(
     total = np.zeros(len(f))
     for s in spectra:
         total += (s.size**2)[s.at(f)]
-    best: Line | None = None
+    best: SpectralLine | None = None
     for i in np.argsort(-total)[:TOP]:
         gain, amplitude, u = _amplitude(spectra, f[i])
         if best is None or gain > best.gain:
-            best = Line(gain, float((HERTZ[1] - HERTZ[0]) * longest), float(f[i]), amplitude, u)
+            best = SpectralLine(gain, float((HERTZ[1] - HERTZ[0]) * longest), float(f[i]), amplitude, u)
     if best is None:
         return None
     proof = [s for s in spectra if s.proves[s.at(np.array([best.frequency_hz]))[0]]]

@@ -21,7 +21,7 @@ from abbe.models.papers.kwon.kinematics import forward, inverse, jacobian
 from abbe.models.papers.kwon.sensitivity import parameter_design, parameter_names
 from abbe.models.papers.kwon.weighing import PriorTest, Weights, outlying_points, weigh
 from abbe.models.solvers.identifiability import Combination, Identifiability, analyse, project_out
-from abbe.models.solvers.least_squares import Estimate, solve_map
+from abbe.models.solvers.least_squares import ParameterEstimate, solve_map
 
 # Commands with their CMM points, and how such points depend on parameters and placement, in units of their uncertainty.
 
@@ -30,7 +30,7 @@ FRAME_NAMES = ("shift x", "shift y", "shift z", "turn a", "turn b", "turn c")
 
 
 @dataclass(frozen=True)
-class Readings:
+class PlaneReadings:
     """Commands and measured points; repeated visits are repeated rows.
 
     Parameters
@@ -87,7 +87,7 @@ def point_design(geometry: Geometry, lambda_mm: F2, pivot_mm: F1 | None) -> F3:
     return np.concatenate([design, rigid], axis=2)
 
 
-def whitened(geometry: Geometry, readings: Readings, frame: F2, pivot_mm: F1 | None) -> tuple[F2, F1]:
+def whitened(geometry: Geometry, readings: PlaneReadings, frame: F2, pivot_mm: F1 | None) -> tuple[F2, F1]:
     """Design (3n, 18 or 24) and misfit (3n,) of the readings in units of their standard uncertainty.
 
     Each point has the covariance u_point^2 I + u_lambda^2 J J', J = dP/dlambda.
@@ -119,7 +119,7 @@ SETTLED = 1e-6
 
 
 @dataclass(frozen=True)
-class Calibration:
+class KwonCalibration:
     """Identified machine.
 
     Attributes
@@ -130,7 +130,7 @@ class Calibration:
         From the base frame to the CMM: estimated, or the one that was given.
     pivot_mm : array (3,) or None
         Point of the base frame about which the turns of ``frame`` are uncertain; None when the frame was given.
-    estimate : Estimate
+    estimate : ParameterEstimate
         Deviations from nominal (mm, rad) with covariance, names PARAMETERS, then FRAME_NAMES when the frame was unknown (increments about
         ``frame``, so zero). Residuals and chi2 are in units of the stated uncertainty; the covariance is that of the fit with
         ``variance_factor`` on the points and ``prior_factor`` on the prior, and EVERY uncertainty is conditional on that prior.
@@ -152,7 +152,7 @@ class Calibration:
     geometry: Geometry
     frame: F2
     pivot_mm: F1 | None
-    estimate: Estimate
+    estimate: ParameterEstimate
     identifiability: Identifiability
     carried: int
     residual_mm: F2
@@ -226,7 +226,7 @@ def default_prior() -> F1:
     return np.array([TOLERANCE_RAD if name.startswith("th") else TOLERANCE_MM for name in PARAMETERS])
 
 
-def calibrate(nominal: Geometry, readings: Readings, prior_sd: F1 | None = None, frame: F2 | None = None) -> Calibration:
+def calibrate(nominal: Geometry, readings: PlaneReadings, prior_sd: F1 | None = None, frame: F2 | None = None) -> KwonCalibration:
     """Most probable parameters, given normal priors about nominal; Gauss-Newton on the exact forward solution.
 
     Noise and prior are widened where the points demand it (`abbe.models.papers.kwon.weighing.weigh`): the noise by what no parameter can
@@ -236,7 +236,7 @@ def calibrate(nominal: Geometry, readings: Readings, prior_sd: F1 | None = None,
     Parameters
     ----------
     nominal : Geometry
-    readings : Readings
+    readings : PlaneReadings
     prior_sd : array, shape (18,), optional
         Positive standard deviations of the deviations from nominal, order of PARAMETERS; default `default_prior`. Some combinations leave
         no trace in positions at all (R with r for theta_p = theta_b; dz with the height of the frame), so a prior is always needed.
@@ -289,7 +289,9 @@ def _with(nominal: Geometry, theta: F1) -> Geometry:
     return nominal.with_errors(dict(zip(PER_LEG, theta.reshape(len(PER_LEG), LEGS), strict=True)))
 
 
-def _step(geometry: Geometry, readings: Readings, frame: F2, pivot: F1 | None, known: tuple[F1, F1]) -> tuple[Estimate, Weights]:
+def _step(
+    geometry: Geometry, readings: PlaneReadings, frame: F2, pivot: F1 | None, known: tuple[F1, F1]
+) -> tuple[ParameterEstimate, Weights]:
     """One linearised fit about the present geometry and frame, points and prior weighed as they themselves demand."""
     theta, prior = known
     design, misfit = whitened(geometry, readings, frame, pivot)
@@ -304,7 +306,9 @@ def _step(geometry: Geometry, readings: Readings, frame: F2, pivot: F1 | None, k
     return replace(fit, covariance=covariance, chi2=chi2, variance_factor=weights.variance_factor), weights
 
 
-def _result(geometry: Geometry, readings: Readings, frame: F2, pivot: F1 | None, fit: tuple[Estimate, F1, Weights]) -> Calibration:
+def _result(
+    geometry: Geometry, readings: PlaneReadings, frame: F2, pivot: F1 | None, fit: tuple[ParameterEstimate, F1, Weights]
+) -> KwonCalibration:
     estimate, prior, weights = fit
     design, misfit = whitened(geometry, readings, frame, pivot)
     # The triangle of a QR decomposition has the same singular values and the same null space as all the rows.
@@ -312,7 +316,7 @@ def _result(geometry: Geometry, readings: Readings, frame: F2, pivot: F1 | None,
     residual = readings.measured_mm - from_frame(frame, forward(geometry, readings.lambda_mm))
     rank, stray = analyse(PARAMETERS, seen, typical=prior), outlying_points(misfit.reshape(-1, 3))
     found = (weights.carried, residual, weights.test, weights.prior_factor, stray)
-    return Calibration(geometry, frame, pivot, estimate, rank, *found)
+    return KwonCalibration(geometry, frame, pivot, estimate, rank, *found)
 
 
 def _combination(hidden: Combination) -> str:

@@ -20,7 +20,7 @@ MARGIN = 0.1
 
 
 @dataclass(frozen=True)
-class Prediction:
+class SurfacePrediction:
     """Surface at some points.
 
     Attributes
@@ -35,7 +35,7 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Surface:
+class SphereSurface:
     """A fitted surface.
 
     Attributes
@@ -78,7 +78,7 @@ class Surface:
         m = term_matrix(self.terms, self.shift_mm, self.scale_mm)
         return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", m, self.unscaled_cov, m) * self.anova.ms_res))
 
-    def predict(self, points_mm: F2, margin: float = MARGIN) -> Prediction:
+    def predict(self, points_mm: F2, margin: float = MARGIN) -> SurfacePrediction:
         """Value and uncertainty at points.
 
         Parameters
@@ -101,7 +101,7 @@ class Surface:
         x = regressors((p - self.shift_mm) / self.scale_mm, self.terms)
         share = np.einsum("ni,ij,nj->n", x, self.unscaled_cov, x)
         variance = self.anova.ms_res
-        return Prediction(x @ self.scaled, np.sqrt(share * variance), np.sqrt((1.0 + share) * variance))
+        return SurfacePrediction(x @ self.scaled, np.sqrt(share * variance), np.sqrt((1.0 + share) * variance))
 
     def _refuse_beyond(self, p: F2, margin: float) -> None:
         if not 0.0 <= margin < np.inf:
@@ -127,7 +127,7 @@ class Surface:
             )
 
 
-def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) -> Surface:
+def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) -> SphereSurface:
     """Least-squares cubic surface with the terms that the points can carry.
 
     Points on one plane Z = a + bX + cY give the ten monomials of X and Y and the plane is reported; 20 coefficients of (27) have only
@@ -161,7 +161,7 @@ def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) ->
         raise SurfaceNotDetermined(_why(x, where))
     scaled = vt.T @ ((u.T @ y) / s)
     fitted = x @ scaled
-    return Surface(where, shift, scale, scaled, (vt.T / s**2) @ vt, y - fitted, anova(y, fitted, len(where.terms)))
+    return SphereSurface(where, shift, scale, scaled, (vt.T / s**2) @ vt, y - fitted, anova(y, fitted, len(where.terms)))
 
 
 def _more(bad: NDArray[np.intp]) -> str:

@@ -24,7 +24,7 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
-class Setup:
+class OffsetSetup:
     """Where the instrument measured.
 
     Parameters
@@ -63,7 +63,7 @@ class Setup:
             object.__setattr__(self, "table_point_mm", points[1])
 
 
-def line_positions_mm(tables: ParameterTables, setup: Setup, axis: int) -> F2:
+def line_positions_mm(tables: ParameterTables, setup: OffsetSetup, axis: int) -> F2:
     """Commanded positions of the measuring line of an axis, shape (n_axis, 3): that axis over its table, the others at the offset."""
     x = tables.positions_mm[axis]
     axes: F2 = np.repeat(setup.offset_mm[axis][None], x.size, axis=0)
@@ -71,7 +71,7 @@ def line_positions_mm(tables: ParameterTables, setup: Setup, axis: int) -> F2:
     return axes
 
 
-def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: Setup, axis: int, still_rad: F2 | None = None) -> F2:
+def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, axis: int, still_rad: F2 | None = None) -> F2:
     """Deviation (actual minus nominal, rule G) that an instrument meets along the measuring line of an axis.
 
     Parameters
@@ -106,7 +106,7 @@ def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: Setup, axi
     return off
 
 
-def as_measured(kind: PahkType, tables: ParameterTables, setup: Setup, still_rad: F2 | None = None) -> ParameterTables:
+def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
     """What instruments on the lines of a setup would report for parameters that refer to the origin.
 
     Definition (math.md 2.1): positioning is the deviation along the line less its value at the start; straightness the deviation across
@@ -140,7 +140,7 @@ def as_measured(kind: PahkType, tables: ParameterTables, setup: Setup, still_rad
     return replace(tables, d_mm=(seen[0], seen[1], seen[2]), squareness_rad=squareness)
 
 
-def offset_terms(kind: PahkType, tables: ParameterTables, setup: Setup, still_rad: F2 | None = None) -> ParameterTables:
+def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
     """What to add to values measured off the origin: the Abbe terms of P (9), (10), (A3), (A6), (A9), from the angular errors alone.
 
     Derived from rule G in place of the printed sets, which lack the slope terms of squareness and have wrong signs in (A6), (A9) (math.md
@@ -167,7 +167,7 @@ def offset_terms(kind: PahkType, tables: ParameterTables, setup: Setup, still_ra
     return replace(seen, d_mm=(-seen.d_mm[0], -seen.d_mm[1], -seen.d_mm[2]), squareness_rad=-seen.squareness_rad)
 
 
-def refer_to_origin(kind: PahkType, measured: ParameterTables, setup: Setup, still_rad: F2 | None = None) -> ParameterTables:
+def refer_to_origin(kind: PahkType, measured: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
     """Parameters referred to the origin from what was measured on offset lines: measured + `offset_terms` (P (9), (10), (A3), (A6), (A9)).
 
     Inverse of `as_measured` for functions in its normal form (positioning zero at the start, straightness without least-squares line).

@@ -19,7 +19,7 @@ Deviation = Callable[[F2], F2]
 
 
 @dataclass(frozen=True)
-class Plan:
+class WangPlan:
     """What is measured.
 
     Attributes
@@ -68,7 +68,7 @@ class Plan:
         return out
 
 
-def problem(plan: Plan, degree: int) -> tuple[F2, F2]:
+def problem(plan: WangPlan, degree: int) -> tuple[F2, F2]:
     """Design of the error functions (18 degree - 3 columns) and of the mirror tilts, all readings but the zero first ones."""
     terms = monomials(degree)
 
@@ -78,7 +78,7 @@ def problem(plan: Plan, degree: int) -> tuple[F2, F2]:
     return _design(plan, field)
 
 
-def _design(plan: Plan, field: Field) -> tuple[F2, F2]:
+def _design(plan: WangPlan, field: Field) -> tuple[F2, F2]:
     parts, setups, per = [], [], 2 if plan.tilts else 0
     for k, (name, path) in enumerate(plan.diagonals):
         beam = diagonal_beam(plan.travel_mm, name)
@@ -92,7 +92,7 @@ def _design(plan: Plan, field: Field) -> tuple[F2, F2]:
     return stacked(parts, setups)
 
 
-def readings(plan: Plan, deviation: Deviation, tilt_rad: dict[str, F1]) -> F1:
+def readings(plan: WangPlan, deviation: Deviation, tilt_rad: dict[str, F1]) -> F1:
     """What the laser shows on a machine, in the order of the rows of `problem`, mm.
 
     Parameters

@@ -24,7 +24,7 @@ PRINTED_NORMAL = 1.96
 
 
 @dataclass(frozen=True)
-class Difference:
+class RadiusDifference:
     """Mean and standard deviation of the difference per axis, shape (3,), mm, and the interval of the mean, shape (3, 2), mm."""
 
     mean_mm: F1
@@ -78,7 +78,7 @@ def confidence_interval(
 
 def model_difference(
     complete: Model, simplified: Model, stroke_mm: F2, *, seed: int, points: int = 100, repeats: int = 100, law: Law = "student"
-) -> Difference:
+) -> RadiusDifference:
     """Mean difference of two models over random points of the volume, by the paper's procedure 1) to 4).
 
     Parameters
@@ -111,4 +111,4 @@ def model_difference(
     variance = off.var(axis=1, ddof=1)
     sd: F1 = np.sqrt(variance).mean(axis=0) if law == "normal" else np.sqrt(variance.mean(axis=0))
     interval = confidence_interval(mean, sd, points * repeats, law=law, degrees_of_freedom=repeats * (points - 1))
-    return Difference(mean, sd, interval, points * repeats)
+    return RadiusDifference(mean, sd, interval, points * repeats)

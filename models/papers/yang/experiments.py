@@ -18,7 +18,7 @@ from abbe.models.notation.yang import workpiece_mm
 from abbe.models.papers.yang.complete import monomial_field
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from abbe.models.solvers.designs import Field, Rows, bar_rows, laser_rows, stacked, vector_rows
+from abbe.models.solvers.designs import DesignRows, Field, bar_rows, laser_rows, stacked, vector_rows
 from abbe.models.volumetric import volume_grid
 
 Problem = tuple[F2, F2]
@@ -32,7 +32,7 @@ LATERAL_TOOL_MM = np.array([100.0, 50.0, 150.0])
 
 
 @dataclass(frozen=True)
-class Plan:
+class YangPlan:
     """What was measured where.
 
     Attributes
@@ -76,12 +76,12 @@ class Plan:
         return at
 
 
-def helix_rows(plan: Plan, origin_mm: F1, radius_mm: float) -> Rows:
+def helix_rows(plan: YangPlan, origin_mm: F1, radius_mm: float) -> DesignRows:
     """Ball-bar rows of one helix with pole in +Y, eq (8) of Yang (math.md 4.2, 4.3).
 
     Parameters
     ----------
-    plan : Plan
+    plan : YangPlan
     origin_mm : array, shape (3,)
         Cup, scales x, y, z (z of the cross slide); so lies the path.
     radius_mm : float
@@ -101,7 +101,7 @@ def helix_rows(plan: Plan, origin_mm: F1, radius_mm: float) -> Rows:
     return bar_rows(plan.field(), workpiece_mm(points), workpiece_mm(origin_mm))
 
 
-def diagonal_rows(plan: Plan, *, sequential: bool = True) -> list[Rows]:
+def diagonal_rows(plan: YangPlan, *, sequential: bool = True) -> list[DesignRows]:
     """Laser rows of the four diagonals ppp, npp, pnp, ppn OF THE SCALES (not of the workpiece: z runs the other way), order X, Y, Z."""
     box = np.stack([np.zeros(3), plan.travel_mm], axis=1)
     out = []
@@ -122,13 +122,13 @@ def across(beam: F1) -> F2:
     return np.stack([first, np.cross(beam, first)])
 
 
-def one_helix(plan: Plan, *, setup: bool) -> Problem:
+def one_helix(plan: YangPlan, *, setup: bool) -> Problem:
     """(a) one helix with the first bar about the first origin, set-up perfect or cup offset and bar length unknown."""
     rows = helix_rows(plan, plan.origins_mm[0], plan.radii_mm[0])
     return rows.machine, rows.setup if setup else rows.setup[:, :0]
 
 
-def all_helices(plan: Plan, *, centres: bool, lengths: Literal["none", "common", "each"] = "none") -> Problem:
+def all_helices(plan: YangPlan, *, centres: bool, lengths: Literal["none", "common", "each"] = "none") -> Problem:
     """(b) every origin with every bar; a cup offset per origin; bar lengths ``"none"`` known, ``"common"`` or ``"each"`` unknown.
 
     Raises
@@ -151,7 +151,7 @@ def all_helices(plan: Plan, *, centres: bool, lengths: Literal["none", "common",
     return stacked(parts, setups)
 
 
-def step_diagonals(plan: Plan, *, tilts: bool, sequential: bool = True) -> Problem:
+def step_diagonals(plan: YangPlan, *, tilts: bool, sequential: bool = True) -> Problem:
     """(d) four diagonals, mirrors ideal or two tilts unknown per diagonal."""
     rows = diagonal_rows(plan, sequential=sequential)
     per = 2 if tilts else 0
@@ -164,12 +164,12 @@ def together(first: Problem, second: Problem) -> Problem:
     return stacked([first[0], second[0]], [(first[1], tuple(range(k))), (second[1], tuple(range(k, k + m)))])
 
 
-def vector_map(plan: Plan, tools_mm: tuple[F1, ...]) -> Problem:
+def vector_map(plan: YangPlan, tools_mm: tuple[F1, ...]) -> Problem:
     """Upper bound: the whole deviation vector on a grid over the volume, with each of the tools (math.md 4.6).
 
     Parameters
     ----------
-    plan : Plan
+    plan : YangPlan
     tools_mm : tuple of arrays (3,)
         (Tx, Ty, Tz + L) of each tool; the plan's own tool is not added.
 
@@ -190,7 +190,7 @@ def vector_map(plan: Plan, tools_mm: tuple[F1, ...]) -> Problem:
     return a, np.zeros((len(a), 0))
 
 
-Experiment = Callable[[Plan], Problem]
+Experiment = Callable[[YangPlan], Problem]
 EXPERIMENTS: dict[str, Experiment] = {
     "e1": lambda p: vector_map(p, (p.tool_mm,)),
     "e2": lambda p: vector_map(p, (p.tool_mm, LONG_TOOL_MM)),

@@ -16,7 +16,7 @@ DEFAULT_OFFSETS_MM = ((-200.0, -75.0), (-200.0, 75.0), (200.0, -75.0), (200.0, 7
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class OriginFit:
     """Whether a hemisphere fits: how far it leaves the travel at each end of each axis (0 inside), mm, shape (3, 2)."""
 
     over_mm: F2
@@ -61,7 +61,7 @@ def origin_plan(stroke_mm: F2, offsets_mm: tuple[tuple[float, float], ...] = DEF
     return out
 
 
-def hemisphere_fits(origin_mm: F1, radius_mm: float, stroke_mm: F2, *, axis: int = 1) -> Fit:
+def hemisphere_fits(origin_mm: F1, radius_mm: float, stroke_mm: F2, *, axis: int = 1) -> OriginFit:
     """Whether a hemisphere about ``origin_mm`` with its pole in +``axis`` stays in the travel.
 
     Parameters
@@ -83,7 +83,7 @@ def hemisphere_fits(origin_mm: F1, radius_mm: float, stroke_mm: F2, *, axis: int
         raise ValueError(f"hemisphere: the origin must be three finite numbers, got {origin_mm!r}")
     low, high = o - radius_mm, o + radius_mm
     low[axis] = o[axis]
-    return Fit(np.maximum(np.stack([stroke[:, 0] - low, high - stroke[:, 1]], axis=1), 0.0))
+    return OriginFit(np.maximum(np.stack([stroke[:, 0] - low, high - stroke[:, 1]], axis=1), 0.0))
 
 
 def _stroke(stroke_mm: F2, axis: int) -> F2:

@@ -18,9 +18,16 @@ from abbe.models.solvers.decomposition import singular_values
 from abbe.models.solvers.identifiability import project_out
 from abbe.models.solvers.observability.additions import Addition, additions
 from abbe.models.solvers.observability.free import Play, play
-from abbe.models.solvers.observability.rank import Columns, Knowledge, Seen, campaign_columns, stated_knowledge, with_knowledge
+from abbe.models.solvers.observability.rank import (
+    CampaignColumns,
+    Knowledge,
+    SeenInformation,
+    campaign_columns,
+    stated_knowledge,
+    with_knowledge,
+)
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import Setup, setup_unknowns
+from abbe.models.solvers.observe import SetupUnknowns, setup_unknowns
 from abbe.models.solvers.priors import Priors
 
 SHOWN = 1e-7
@@ -28,18 +35,18 @@ SHOWN = 1e-7
 
 
 @dataclass(frozen=True)
-class Campaign:
+class CampaignLayout:
     """What was, or is to be, measured: nominal machine, model terms, runs, their compressed columns, and what is known of the set-up."""
 
     machine: Machine
     terms: tuple[Term, ...]
     runs: tuple[RunData, ...]
-    columns: Columns
+    columns: CampaignColumns
     known: Knowledge
 
 
 @dataclass(frozen=True)
-class Trial:
+class CureTrial:
     """An addition and what it would show: ``seen``, shape (rows, k), per unit of each hidden combination, set-up unknowns out."""
 
     addition: Addition
@@ -56,17 +63,17 @@ def count_seen(seen: F2) -> int:
     return int((s > SHOWN).sum())
 
 
-def trials(campaign: Campaign, seen: Seen) -> list[Trial]:
+def trials(campaign: CampaignLayout, seen: SeenInformation) -> list[CureTrial]:
     """Try every usual addition on what is hidden; none if nothing is hidden."""
     if not seen.null_space.shape[1]:
         return []
     order = max(t.order for t in campaign.terms)
     tried = additions(campaign.machine, campaign.runs, campaign.known, campaign.columns.setup_names, order)
     hidden = play(campaign.columns, campaign.known, seen)
-    return [Trial(a, _shown(campaign, a, hidden)) for a in tried]
+    return [CureTrial(a, _shown(campaign, a, hidden)) for a in tried]
 
 
-def best_sequence(found: list[Trial], hidden: int) -> list[tuple[Addition, int]]:
+def best_sequence(found: list[CureTrial], hidden: int) -> list[tuple[Addition, int]]:
     """Additions in the order in which each shows most of what is still hidden, and how many combinations are visible after each."""
     out: list[tuple[Addition, int]] = []
     stack, left, shown = np.zeros((0, hidden)), list(found), 0
@@ -81,7 +88,7 @@ def best_sequence(found: list[Trial], hidden: int) -> list[tuple[Addition, int]]
     return out
 
 
-def _shown(campaign: Campaign, addition: Addition, hidden: Play) -> F2:
+def _shown(campaign: CampaignLayout, addition: Addition, hidden: Play) -> F2:
     """What an addition shows per unit of each hidden combination (unit columns), shape (at most k, k); its own set-up unknowns out."""
     if not addition.runs:
         at = [i for i, group in enumerate(hidden.groups) if set(group) & set(addition.knows)]
@@ -102,7 +109,7 @@ def _shown(campaign: Campaign, addition: Addition, hidden: Play) -> F2:
     return _upper(project_out(response, np.concatenate([loose, free[:, fresh]], axis=1)))
 
 
-def _known_with(campaign: Campaign, runs: tuple[RunData, ...], setup: Setup, new: Columns) -> Knowledge:
+def _known_with(campaign: CampaignLayout, runs: tuple[RunData, ...], setup: SetupUnknowns, new: CampaignColumns) -> Knowledge:
     """Unknowns that the addition brings are known or free by the same rules as the old ones, which stay what they were."""
     known, before = campaign.known, set(campaign.columns.setup_names)
     stated = stated_knowledge(campaign.terms, runs, setup.names).held

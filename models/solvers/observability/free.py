@@ -14,7 +14,7 @@ from abbe.models.arrays import F2
 from abbe.models.solvers.decomposition import svd
 from abbe.models.solvers.designs import unit_columns
 from abbe.models.solvers.identifiability import HIDDEN, RANK_TOLERANCE
-from abbe.models.solvers.observability.rank import Columns, Knowledge, Seen, with_knowledge
+from abbe.models.solvers.observability.rank import CampaignColumns, Knowledge, SeenInformation, with_knowledge
 
 NOTHING = 1e-7
 """Entries of unit vectors below this are rounding."""
@@ -43,7 +43,7 @@ class Play:
     size: F2
 
 
-def play(columns: Columns, known: Knowledge, seen: Seen) -> Play:
+def play(columns: CampaignColumns, known: Knowledge, seen: SeenInformation) -> Play:
     """Null space of machine and free unknowns together, from that of the machine alone (`what_is_seen`)."""
     machine, free, groups = with_knowledge(columns, known)
     unit, factor = unit_columns(free)
@@ -55,7 +55,7 @@ def play(columns: Columns, known: Knowledge, seen: Seen) -> Play:
     return Play(groups, hidden, -answer * factor[:, None], loose * factor[:, None], factor[:, None])
 
 
-def hidden_free(columns: Columns, known: Knowledge, seen: Seen) -> frozenset[str]:
+def hidden_free(columns: CampaignColumns, known: Knowledge, seen: SeenInformation) -> frozenset[str]:
     """Free unknowns that take part in what is hidden, by name.
 
     Among them lost motion of axes that never reverse, like the pole axis of one helix. What is known (`Knowledge.held`) is not free.

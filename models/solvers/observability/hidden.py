@@ -13,8 +13,8 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.decomposition import singular_values, svd
 from abbe.models.solvers.identifiability import RANK_TOLERANCE
 from abbe.models.solvers.observability.additions import Addition
-from abbe.models.solvers.observability.cures import Campaign, Trial, best_sequence, trials
-from abbe.models.solvers.observability.rank import Seen
+from abbe.models.solvers.observability.cures import CampaignLayout, CureTrial, best_sequence, trials
+from abbe.models.solvers.observability.rank import SeenInformation
 from abbe.models.solvers.observability.volume import frame_free_design, inner_box
 from abbe.models.solvers.observability.words import Family, families, sentence
 from abbe.models.solvers.observe import with_tool
@@ -72,7 +72,7 @@ class Advice:
 
 
 @dataclass(frozen=True)
-class Picture:
+class HiddenDirection:
     """Hidden groups, advice, and the rank no run with the same tools could exceed."""
 
     groups: tuple[HiddenGroup, ...]
@@ -80,7 +80,7 @@ class Picture:
     reachable: int
 
 
-def picture(campaign: Campaign, seen: Seen, prior_sd: F1) -> Picture:
+def picture(campaign: CampaignLayout, seen: SeenInformation, prior_sd: F1) -> HiddenDirection:
     """Everything about the null space; ``prior_sd``: typical size of every coefficient, shape (p,)."""
     terms = campaign.terms
     field = _fields(campaign, seen.factor)
@@ -92,10 +92,10 @@ def picture(campaign: Campaign, seen: Seen, prior_sd: F1) -> Picture:
     groups += [_group(terms, f, seen, other_tools, 0.0, prior_sd) for f in families(terms, silent, seen.factor)]
     steps = best_sequence(tried, seen.null_space.shape[1])
     advice = tuple(Advice(a.cure, seen.rank + shown, len(terms)) for a, shown in steps)
-    return Picture(tuple(groups), advice, _reachable(field))
+    return HiddenDirection(tuple(groups), advice, _reachable(field))
 
 
-def _fields(campaign: Campaign, factor: F1) -> F2:
+def _fields(campaign: CampaignLayout, factor: F1) -> F2:
     """Deviation over the inner volume with every tool in use, rigid motion removed, unit columns, shape (rows, p)."""
     points = _lines(campaign.machine, max(t.order for t in campaign.terms) + 3)
     tools = {tuple(with_tool(campaign.machine, r.tool_mm).tool_mm): r.tool_mm for r in campaign.runs}
@@ -147,7 +147,9 @@ def _typical(family: Family, prior_sd: F1) -> F2:
     return np.asarray(q * prior_sd[:, None])
 
 
-def _group(terms: tuple[Term, ...], family: Family, seen: Seen, tried: list[Trial], effect_mm: float, prior_sd: F1) -> HiddenGroup:
+def _group(
+    terms: tuple[Term, ...], family: Family, seen: SeenInformation, tried: list[CureTrial], effect_mm: float, prior_sd: F1
+) -> HiddenGroup:
     count = family.vectors.shape[1]
     coordinates = linalg.qr(seen.null_space.T @ (family.vectors / seen.factor[:, None]), mode="economic", check_finite=False)[0]
     shown = [(t.addition, t.shows(coordinates)) for t in tried]

@@ -24,7 +24,7 @@ NODES = 41
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class ParameterStatus:
     """One unknown: estimate (None before solving), standard uncertainty, prior standard deviation, in mm, rad or mm/s.
 
     ``share``: 1 - (u / prior)^2, how much of the information comes from the readings; ``status``: by `OBSERVED` and `SEEN`, and never
@@ -49,7 +49,7 @@ class Correlation:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MotionStatus:
     """One error motion as a function over its stroke, or one squareness.
 
     ``share``: as of a parameter, for the function's mean variance over the stroke; ``hidden``: its coefficients that take part in hidden
@@ -71,12 +71,14 @@ def status_of(share: float, *, hidden: bool) -> Status:
     return "observed" if share >= OBSERVED else "weak"
 
 
-def parameters(names: tuple[str, ...], theta: F1 | None, covariance: F2, prior_sd: F1, hidden: frozenset[str]) -> tuple[Parameter, ...]:
+def parameters(
+    names: tuple[str, ...], theta: F1 | None, covariance: F2, prior_sd: F1, hidden: frozenset[str]
+) -> tuple[ParameterStatus, ...]:
     """Every unknown in the order of ``names``; ``hidden``: names of those that take part in hidden combinations."""
     u = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     share = np.clip(1.0 - (u / prior_sd) ** 2, 0.0, 1.0)
     return tuple(
-        Parameter(
+        ParameterStatus(
             name, None if theta is None else float(theta[i]), float(u[i]), float(prior_sd[i]), float(share[i]),
             status_of(float(share[i]), hidden=name in hidden),
         )
@@ -98,7 +100,7 @@ def hidden_terms(terms: tuple[Term, ...], null_space: F2) -> frozenset[str]:
     return taking_part(tuple(t.name for t in terms), null_space)
 
 
-def motions(machine: Machine, terms: tuple[Term, ...], covariance: F2, prior: F2, hidden: frozenset[str]) -> tuple[Motion, ...]:
+def motions(machine: Machine, terms: tuple[Term, ...], covariance: F2, prior: F2, hidden: frozenset[str]) -> tuple[MotionStatus, ...]:
     """Every error motion and squareness of the model, judged as a function over its stroke.
 
     Parameters
@@ -117,7 +119,7 @@ def motions(machine: Machine, terms: tuple[Term, ...], covariance: F2, prior: F2
         mine = tuple(terms[i].name for i in at if terms[i].name in hidden)
         share = float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0 else 0.0
         status = status_of(share, hidden=bool(mine))
-        out.append(Motion(name, share, float(np.sqrt(max(after, 0.0))), mine, status, _reason(mine, share, status)))
+        out.append(MotionStatus(name, share, float(np.sqrt(max(after, 0.0))), mine, status, _reason(mine, share, status)))
     return tuple(out)
 
 
@@ -129,7 +131,7 @@ def _reason(hidden: tuple[str, ...], share: float, status: Status) -> str:
     return f"only {100.0 * share:.0f} % of what is known of it comes from the readings, the rest is an assumption"
 
 
-def observable_motions(found: tuple[Motion, ...], *, weak: bool = False) -> tuple[str, ...]:
+def observable_motions(found: tuple[MotionStatus, ...], *, weak: bool = False) -> tuple[str, ...]:
     """Error motions that may be written into tables of their own: numbers that rest on readings.
 
     Rule: none of its coefficients takes part in a hidden combination, and the readings carry at least 90 % of what is known of it (with

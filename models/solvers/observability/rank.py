@@ -24,7 +24,7 @@ from abbe.models.solvers.decomposition import svd
 from abbe.models.solvers.designs import unit_columns
 from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import Setup, run_design
+from abbe.models.solvers.observe import SetupUnknowns, run_design
 from abbe.models.solvers.observe_setup import bar_length_name
 from abbe.models.solvers.rounding import as_meant
 
@@ -62,7 +62,7 @@ class Knowledge:
 
 
 @dataclass(frozen=True)
-class Columns:
+class CampaignColumns:
     """Readings of a campaign per unit of everything: ``machine`` (n, p), ``lost`` (n, 3) lost motion, ``setup`` (n, k), with its names."""
 
     machine: F2
@@ -72,7 +72,7 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenInformation:
     """What the readings show of the machine.
 
     Attributes
@@ -98,14 +98,14 @@ class Seen:
     null_space: F2
 
 
-def campaign_columns(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: Setup) -> Columns:
+def campaign_columns(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: SetupUnknowns) -> CampaignColumns:
     """Linearised readings of all runs as they were meant (`as_meant`), unweighted: what a reading shows does not depend on its noise."""
     a = np.concatenate([run_design(machine, terms, as_meant(run), setup) for run in runs])
     p = len(terms)
-    return Columns(a[:, :p], a[:, p : p + len(DIRECTIONS)], a[:, p + len(DIRECTIONS) :], setup.names)
+    return CampaignColumns(a[:, :p], a[:, p : p + len(DIRECTIONS)], a[:, p + len(DIRECTIONS) :], setup.names)
 
 
-def compressed(columns: Columns) -> Columns:
+def compressed(columns: CampaignColumns) -> CampaignColumns:
     """The same information in as few rows as there are columns (QR): everything after it is cheap, whatever the number of readings."""
     whole = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1)
     unit, factor = unit_columns(whole)
@@ -113,7 +113,7 @@ def compressed(columns: Columns) -> Columns:
         unit = linalg.qr(unit, mode="r", check_finite=False)[0][: whole.shape[1]]
     r = unit / factor
     p = columns.machine.shape[1]
-    return Columns(r[:, :p], r[:, p : p + 3], r[:, p + 3 :], columns.setup_names)
+    return CampaignColumns(r[:, :p], r[:, p : p + 3], r[:, p + 3 :], columns.setup_names)
 
 
 def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup_names: tuple[str, ...]) -> Knowledge:
@@ -131,13 +131,13 @@ def _calibrated(run: RunData) -> bool:
     return run.length_calibrated is True or (run.length_calibrated is None and run.u_length_mm is not None)
 
 
-def perfect_setup(known: Knowledge, terms: tuple[Term, ...], setup: Setup, kinds: tuple[str, ...] = HAND_SET) -> Knowledge:
+def perfect_setup(known: Knowledge, terms: tuple[Term, ...], setup: SetupUnknowns, kinds: tuple[str, ...] = HAND_SET) -> Knowledge:
     """Known besides: all set-up unknowns of these kinds (``"cup"``, ``"tilt"``, ``"bar_length"``), as the papers assume."""
     more = {n: np.zeros(len(terms)) for n in setup.names if n.startswith(tuple(f"{k}_" for k in kinds))}
     return replace(known, held={**known.held, **more}, shared=tuple(g for g in known.shared if not set(g) & set(more)))
 
 
-def with_knowledge(columns: Columns, known: Knowledge) -> tuple[F2, F2, tuple[tuple[str, ...], ...]]:
+def with_knowledge(columns: CampaignColumns, known: Knowledge) -> tuple[F2, F2, tuple[tuple[str, ...], ...]]:
     """Machine columns, columns of what stays free (set-up unknowns and lost motion), and the names behind each of these."""
     machine, at = columns.machine, {n: i for i, n in enumerate(columns.setup_names)}
     for name, combination in known.held.items():
@@ -153,7 +153,7 @@ def with_knowledge(columns: Columns, known: Knowledge) -> tuple[F2, F2, tuple[tu
     return machine, np.concatenate([columns.setup[:, :0], *free], axis=1), tuple(groups)
 
 
-def what_is_seen(columns: Columns, known: Knowledge) -> Seen:
+def what_is_seen(columns: CampaignColumns, known: Knowledge) -> SeenInformation:
     """Rank and null space of the machine's coefficients, whatever the free set-up unknowns and the lost motion are.
 
     Raises
@@ -172,7 +172,7 @@ def what_is_seen(columns: Columns, known: Knowledge) -> Seen:
     rank = int((s > RANK_TOLERANCE * top).sum())
     condition = top / float(s[rank - 1]) if rank else float("inf")
     effective = int((s > EFFECTIVE_TOLERANCE * top).sum())
-    return Seen(rank, effective, condition, factor, np.asarray(s), vt[:rank].T, vt[rank:].T)
+    return SeenInformation(rank, effective, condition, factor, np.asarray(s), vt[:rank].T, vt[rank:].T)
 
 
 def _without_rounding(a: F2) -> F2:

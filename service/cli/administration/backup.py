@@ -10,7 +10,7 @@ import typer
 from abbe.service.cli.common import JsonOption, print_json
 
 if TYPE_CHECKING:
-    from abbe.service.backup.backup import Source
+    from abbe.service.backup.backup import BackupSource
 
 StoreOption = Annotated[
     str | None, typer.Option("--store", "--db", metavar="URL", help="Database, instead of a machine file's.", show_default=False)
@@ -75,9 +75,9 @@ def restore(
         typer.echo(f"put aside: {path}")
 
 
-def _places(places: list[Path], store: str | None, last: str) -> tuple[Source, Path]:
+def _places(places: list[Path], store: str | None, last: str) -> tuple[BackupSource, Path]:
     """Database and folder that the words name."""
-    from abbe.service.backup.backup import Source
+    from abbe.service.backup.backup import BackupSource
     from abbe.service.capture.settings import CaptureSettings
     from abbe.service.config import load_machine
     from abbe.service.errors import ConfigError
@@ -86,6 +86,6 @@ def _places(places: list[Path], store: str | None, last: str) -> tuple[Source, P
     if len(places) != (2 if store is None else 1):
         raise ConfigError("a database and one folder are needed", f"write MACHINE.toml {last}, or --store URL {last}")
     if store is not None:
-        return Source(store, CaptureSettings()), places[0]
+        return BackupSource(store, CaptureSettings()), places[0]
     loaded = load_machine(places[0])
-    return Source(loaded.database_url, site_of(loaded.machine).capture, places[0]), places[1]
+    return BackupSource(loaded.database_url, site_of(loaded.machine).capture, places[0]), places[1]

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from abbe.service.capture.live import LiveFeed
     from abbe.service.channel.messages import MachineTold
     from abbe.service.compensation.ordered_rollback import BackOrder
-    from abbe.service.compensation.push_approved import Order
-    from abbe.service.config import Loaded
+    from abbe.service.compensation.push_approved import PushOrder
+    from abbe.service.config import LoadedMachine
     from abbe.service.config_timetable import AlarmSection
     from abbe.service.core.campaigns import CampaignOrder, MeasureCampaign
     from abbe.service.core.orders import Hands
-    from abbe.service.core.setup import Setup
+    from abbe.service.core.setup import ServiceSetup
     from abbe.service.events import ProgressSink
-    from abbe.service.jobs.guided_campaign import Led
+    from abbe.service.jobs.guided_campaign import CampaignOutcome
     from abbe.service.jobs.investigate import Note
     from abbe.service.mqtt.broker import Broker
     from abbe.service.plant.opcua.setup import OpcUaSetup
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site
-    from abbe.service.tables.push_outcome import Outcome
+    from abbe.service.tables.push_outcome import PushOutcome
     from abbe.service.verification.alarm_states import Alarm
 
 
@@ -57,12 +57,12 @@ def serve(
     raise typer.Exit(run(setup, once=once))
 
 
-def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
+def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     """Return what the service is to do.
 
     Parameters
     ----------
-    loaded : Loaded
+    loaded : LoadedMachine
         The machine file.
     port : int, optional
         Instead of the file's.
@@ -77,7 +77,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     from abbe.service.campaigns.plausibility import check_unattended, doubts
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
-    from abbe.service.core.setup import Setup
+    from abbe.service.core.setup import ServiceSetup
     from abbe.service.jobs.at_start import recover_at_start
     from abbe.service.jobs.check import run_check
     from abbe.service.mqtt.topics import Topics
@@ -103,7 +103,7 @@ def setup_of(loaded: Loaded, port: int | None = None) -> Setup:
     if any(entry.on_alarm == "propose" for entry in config.schedule):
         plan = paced(campaign_plan(config.alarm.campaign, site.machine, folder), site.max_feed_mm_min)
         dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
-    return Setup(
+    return ServiceSetup(
         machine=config.name,
         doc=site.doc,
         devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
@@ -146,7 +146,7 @@ def _told(site: Site) -> MachineTold:
     return MachineTold(doc["chain"], axes, pivots, (float(x), float(y), float(z)), site.max_feed_mm_min)
 
 
-def _broker(loaded: Loaded) -> Broker | None:
+def _broker(loaded: LoadedMachine) -> Broker | None:
     from dataclasses import replace
 
     from abbe.service.mqtt.broker import parse
@@ -160,7 +160,7 @@ def _broker(loaded: Loaded) -> Broker | None:
     return broker
 
 
-def _opcua(loaded: Loaded) -> OpcUaSetup | None:
+def _opcua(loaded: LoadedMachine) -> OpcUaSetup | None:
     from abbe.service.plant.opcua.setup import OpcUaSetup
 
     given = loaded.machine.opcua
@@ -181,16 +181,16 @@ def duties_on(
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.push_approved import push_approved
-    from abbe.service.jobs.investigate import Bench, investigate
+    from abbe.service.jobs.investigate import InvestigationContext, investigate
     from abbe.service.scheduler.alarm_manager import Duties
 
     def duties(store: ServiceStore) -> Duties:
         clock = SystemClock()
 
         async def look_into(one: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
-            await investigate(Bench(site, store, plan, clock, progress, control, live), one, note)
+            await investigate(InvestigationContext(site, store, plan, clock, progress, control, live), one, note)
 
-        async def push(order: Order) -> Outcome:
+        async def push(order: PushOrder) -> PushOutcome:
             return await push_approved(site, store, order, clock=clock, rate_hz=rate_hz)
 
         return Duties(alarm.warn_days, alarm.campaign, look_into, push if alarm.push == "approved" else None)
@@ -206,10 +206,10 @@ def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]
     from abbe.service.core.orders import Hands
 
     def on(store: ServiceStore) -> Hands:
-        async def back(order: BackOrder) -> Outcome:
+        async def back(order: BackOrder) -> PushOutcome:
             return await bring_back(site, store, order, clock=SystemClock())
 
-        async def push(order: Order) -> Outcome:
+        async def push(order: PushOrder) -> PushOutcome:
             return await push_approved(site, store, order, clock=SystemClock())
 
         return Hands(back, push if alarm.push == "never" else None)
@@ -221,12 +221,12 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
     """Return how a full campaign is measured that a person starts, given the service's store."""
     from abbe.service.clock import SystemClock
     from abbe.service.jobs.guided_campaign import full_campaign, led_campaign, named_now
-    from abbe.service.jobs.investigate import Bench
+    from abbe.service.jobs.investigate import InvestigationContext
 
     def on(store: ServiceStore) -> MeasureCampaign:
-        async def measure(order: CampaignOrder) -> Led:
+        async def measure(order: CampaignOrder) -> CampaignOutcome:
             plan, source = full_campaign(order.recipe, site.machine, folder)
-            bench = named_now(Bench(site, store, plan, SystemClock(), order.progress, order.control, live), order.recipe)
+            bench = named_now(InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live), order.recipe)
             return await led_campaign(bench, source, order.by)
 
         return measure

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from abbe.service.campaign_data.campaign_folder import Campaign
-    from abbe.service.discovery.discover import Job, Journal
+    from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
     from abbe.service.discovery.discover_live import Added
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
@@ -72,10 +72,10 @@ def opened(campaign: str, db: str | None, machine: Path | None, without: list[st
             yield found.without(without), store
 
 
-def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
+def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, DiscoveryJournal]:
     """The job and where it stands."""
     from abbe.service.discovery.changed_since import since_of
-    from abbe.service.discovery.discover import Journal, prepare
+    from abbe.service.discovery.discover import DiscoveryJournal, prepare
     from abbe.service.discovery.discovery_store import journal_of
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
@@ -85,7 +85,7 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[Job, Journal]:
     table = NO_TABLE if store is None else table_then(store, campaign)
     since = None if store is None else since_of(store, campaign)
     job = prepare(campaign, catalogue(), base, table=table, since=since)
-    return job, Journal() if store is None else journal_of(store, job)
+    return job, DiscoveryJournal() if store is None else journal_of(store, job)
 
 
 def _live_needs(campaign: str, machine: Path | None) -> None:
@@ -100,8 +100,8 @@ def _live_needs(campaign: str, machine: Path | None) -> None:
 
 
 def _gone_on(
-    store: Store, machine: Path, at: tuple[Job, Journal, dict[str, Any]], *, accept_table: bool = False
-) -> tuple[Job, Journal, dict[str, Any]]:
+    store: Store, machine: Path, at: tuple[DiscoveryJob, DiscoveryJournal, dict[str, Any]], *, accept_table: bool = False
+) -> tuple[DiscoveryJob, DiscoveryJournal, dict[str, Any]]:
     """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is done twice."""
     from datetime import timedelta
 
@@ -164,7 +164,7 @@ def _measured(store: Store, site: Site, campaign: Campaign, what: Added, *, acce
         raise
 
 
-def _searched(job: Job, journal: Journal) -> dict[str, Any]:
+def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> dict[str, Any]:
     """The finding, with progress on stderr; Ctrl-C says what is kept."""
     from abbe.service.cli.progress import display
     from abbe.service.discovery.discover import discover as work
@@ -184,7 +184,7 @@ def _searched(job: Job, journal: Journal) -> dict[str, Any]:
             raise
 
 
-def _written(job: Job, journal: Journal, finding: dict[str, Any], json_file: Path | None, report: Path | None) -> None:
+def _written(job: DiscoveryJob, journal: DiscoveryJournal, finding: dict[str, Any], json_file: Path | None, report: Path | None) -> None:
     """Files that were asked for, each whole or not at all."""
     from abbe.service.clock import SystemClock
     from abbe.service.rendering.discovery_page import render_discovery
@@ -199,7 +199,7 @@ def _written(job: Job, journal: Journal, finding: dict[str, Any], json_file: Pat
         write_page(render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, made))), report)
 
 
-def _print(job: Job, journal: Journal, finding: dict[str, Any]) -> None:
+def _print(job: DiscoveryJob, journal: DiscoveryJournal, finding: dict[str, Any]) -> None:
     from abbe.service.discovery.discovery_words import lines_of
 
     typer.echo(f"campaign {job.campaign.name}: {len(finding['runs'])} runs, {len(job.effects)} effects in the catalogue")

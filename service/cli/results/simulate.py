@@ -11,7 +11,7 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, print_j
 from abbe.service.cli.results.discover import opened
 
 if TYPE_CHECKING:
-    from abbe.service.discovery.discover import Job
+    from abbe.service.discovery.discover import DiscoveryJob
     from abbe.service.discovery.simulate import Simulation
 
 
@@ -54,15 +54,15 @@ def simulate(
         typer.echo(f"report: {report}")
 
 
-def _write_report(job: Job, told: Simulation, target: Path) -> None:
+def _write_report(job: DiscoveryJob, told: Simulation, target: Path) -> None:
     from abbe.service.clock import SystemClock
-    from abbe.service.discovery.discover import Journal
+    from abbe.service.discovery.discover import DiscoveryJournal
     from abbe.service.discovery.simulate import simulated_finding, verdict_line
     from abbe.service.rendering.discovery_page import render_discovery
     from abbe.service.rendering.page_file import write_page
     from abbe.service.report.discovery_pages import discovery_page, page_facts
 
-    facts, said = page_facts(job, Journal(), SystemClock().utc().isoformat(timespec="seconds"))
+    facts, said = page_facts(job, DiscoveryJournal(), SystemClock().utc().isoformat(timespec="seconds"))
     finding = simulated_finding(job, told)
     said |= {"title": f"Campaign {job.campaign.name} - measured against simulated", "verdict": verdict_line(finding)}
     write_page(render_discovery(discovery_page(finding, job.runs, facts, said)), target)

@@ -71,7 +71,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     from abbe.service.identification.effect_removal import taken_out
     from abbe.service.identification.table_removal import table_then
 
-    wanted = _Wanted(model, tables, grid, nodes, unit_um * 1e-3, trials)
+    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
         told, doc = _solved(found.without(without or []), wanted)
@@ -97,7 +97,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _SolveRequest:
     """What was asked for beside the solution itself."""
 
     model: ModelName | None
@@ -125,7 +125,7 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
         yield store, found
 
 
-def _solved(campaign: Campaign, wanted: _Wanted) -> tuple[Account, dict[str, Any]]:
+def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[str, Any]]:
     """The solution and its document, with progress on stderr."""
     from abbe.service.cli.progress import display
     from abbe.service.events import Progress
@@ -146,7 +146,7 @@ def _solved(campaign: Campaign, wanted: _Wanted) -> tuple[Account, dict[str, Any
     return told, doc
 
 
-def _more(told: Account, wanted: _Wanted, say: Callable[[str], None]) -> dict[str, Any]:
+def _more(told: Account, wanted: _SolveRequest, say: Callable[[str], None]) -> dict[str, Any]:
     """What takes longer and is only done on request. The grid is written here: what it refuses, stores nothing."""
     out: dict[str, Any] = {}
     if not (wanted.tables or wanted.grid or wanted.trials):

@@ -11,7 +11,7 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, databas
 
 if TYPE_CHECKING:
     from abbe.service.config_schema import MachineFile
-    from abbe.service.formats.choice import Choice
+    from abbe.service.formats.choice import FormatChoice
     from abbe.service.formats.model import Compensation
 
 comp = typer.Typer(help="Compensation tables: as the files that controls read, and back.", no_args_is_help=True)
@@ -65,11 +65,11 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     """Write the best tables that a control can hold, with what each kind of table would leave."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import control_for, export, formats_in, identified, reference_of, write_files
-    from abbe.service.compensation.comp_signed import Seal, check_signing, sign_files
+    from abbe.service.compensation.comp_signed import TableSeal, check_signing, sign_files
 
     doc = _solution(solution, db, machine)
     known = identified(doc)
-    seal = None if sign is None else Seal(sign, days, base)
+    seal = None if sign is None else TableSeal(sign, days, base)
     config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
     fresh = _fresh(solution, db, machine, said_so=without_table)
     made = export(known, form, reference_of(reference), fresh=fresh)
@@ -109,7 +109,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
-    from abbe.service.compensation.comp_signed import Asked, standing
+    from abbe.service.compensation.comp_signed import SigningRequest, standing
     from abbe.service.formats.compare import check_same
 
     control, known, at = control_for(form), None, reference_of(reference)
@@ -118,7 +118,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     nominal = known.machine if known is not None else _machine(machine)
     start = at if at is not None else nominal.stroke_mm[:, 0]
     files = read_files(file)
-    worth = standing(file, files, _machine_file(machine), Asked(form, tuple(trust or ()), base), SystemClock().utc())
+    worth = standing(file, files, _machine_file(machine), SigningRequest(form, tuple(trust or ()), base), SystemClock().utc())
     found = read_key(form, files, settings_for(control, nominal, start))
     doc: dict[str, Any] = {"tables": _tables(found), "standing": "signed" if worth.signed else "candidate", "why": worth.why}
     if known is not None:
@@ -177,7 +177,7 @@ def _machine(file: Path | None) -> Any:
     return Machine("w-X-Y-b-Z-t", np.array([[0.0, 1.0]] * 3))
 
 
-def _choice(c: Choice) -> dict[str, Any]:
+def _choice(c: FormatChoice) -> dict[str, Any]:
     return {"kind": c.kind, "rms_um": c.rms_mm * 1e3, "max_um": c.max_mm * 1e3, "numbers": c.numbers, "best": c.best}
 
 

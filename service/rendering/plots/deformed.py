@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from abbe.service.rendering.axes import nice_step
 from abbe.service.rendering.numbers import plain, tidy
-from abbe.service.rendering.plots.isometric import Paper, Window, label_edges, round_down
+from abbe.service.rendering.plots.isometric import Paper, ViewWindow, label_edges, round_down
 from abbe.service.rendering.svg import Svg
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ def deformed_grid(grid_mm: Array, deviation_um: Array, *, key: str, heading: str
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
     svg.text((WIDTH / 2.0, 36.0), words, "t-soft", anchor="middle")
     actual = grid_mm + deviation_um * 1e-3 * magnified
-    paper = Paper.around(low, high, Window((WIDTH / 2.0, 232.0), WIDTH - 170.0, HEIGHT - 200.0))
+    paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, 232.0), WIDTH - 170.0, HEIGHT - 200.0))
     for nodes, style in ((grid_mm, "hidden-edge"), (actual, "s-c2")):
         for line in _face_lines(nodes):
             svg.polyline([paper(p) for p in line], style)

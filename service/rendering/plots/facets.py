@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from abbe.service.rendering.axes import nice_step, tick_text, ticks
 from abbe.service.rendering.numbers import plain, tidy
-from abbe.service.rendering.plots.isometric import Paper, Window, depth, draw_box
+from abbe.service.rendering.plots.isometric import Paper, ViewWindow, depth, draw_box
 from abbe.service.rendering.plots.signed import SignedScale, extremes
 from abbe.service.rendering.svg import XY, Svg
 
@@ -73,7 +73,7 @@ def surface_plot(surface: Surface, scale: SignedScale, *, key: str, heading: str
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
     svg.text((WIDTH / 2.0, 36.0), words, "t-soft", anchor="middle")
     low, high = np.array([0.0, 0.0, FLOOR]), np.array([1.0, 1.0, ROOF])
-    paper = Paper.around(low, high, Window((WIDTH / 2.0, 206.0), WIDTH - 120.0, HEIGHT - 150.0))
+    paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, 206.0), WIDTH - 120.0, HEIGHT - 150.0))
     top = 4.0 * scale.step
     draw_box(svg, paper, low, high)
     x, y = np.meshgrid(_share(surface.x), _share(surface.y))
@@ -103,7 +103,7 @@ def lobing_plot(colatitude_rad: Array, longitude_rad: Array, values: Array, scal
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
     svg.text((WIDTH / 2.0, 36.0), words, "t-soft", anchor="middle")
     paper = Paper.around(
-        np.array([-0.95, -0.95, 0.0]), np.array([0.95, 0.95, 1.0]), Window((WIDTH / 2.0, 208.0), WIDTH - 130.0, HEIGHT - 110.0)
+        np.array([-0.95, -0.95, 0.0]), np.array([0.95, 0.95, 1.0]), ViewWindow((WIDTH / 2.0, 208.0), WIDTH - 130.0, HEIGHT - 110.0)
     )
     phi, theta = np.meshgrid(colatitude_rad, longitude_rad, indexing="ij")
     normal = np.stack([np.sin(phi) * np.cos(theta), np.sin(phi) * np.sin(theta), np.cos(phi)], axis=2)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from abbe.service.rendering.axes import Panel, data_range
-from abbe.service.rendering.discovery_model import Array, Place, RunGap, Trace
+from abbe.service.rendering.discovery_model import Array, PlaceMap, RunGap, Trace
 from abbe.service.rendering.numbers import COVERAGE, plain
 from abbe.service.rendering.svg import Svg
 
@@ -66,7 +66,7 @@ def trace_plot(trace: Trace, *, key: str) -> str:
     return svg.render()
 
 
-def place_plot(place: Place, *, key: str) -> str:
+def place_plot(place: PlaceMap, *, key: str) -> str:
     """Cells of one plane, darker where the gap is larger against its noise; a ring where something was located."""
     heading = f"Where the gap lives, {place.x_axis} and {place.y_axis}"
     worst = float(place.times_noise.max()) if place.times_noise.size else math.nan

@@ -24,7 +24,7 @@ VIEW: F2 = np.array([[1 / _ROOT2, 1 / _ROOT2, 0.0], [-1 / _ROOT6, 1 / _ROOT6, 2 
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ViewWindow:
     """Part of a picture for a spatial view: its centre, and the largest width and height of the box drawn there, in pixels."""
 
     at: XY
@@ -41,7 +41,7 @@ class Paper:
     at: XY
 
     @classmethod
-    def around(cls, low: F2, high: F2, window: Window) -> Paper:
+    def around(cls, low: F2, high: F2, window: ViewWindow) -> Paper:
         """Largest scale at which the box from ``low`` to ``high`` fits the window."""
         corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
         flat = (corners - (low + high) / 2.0) @ VIEW[:2].T

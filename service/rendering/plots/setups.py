@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from abbe.service.rendering.plots.isometric import Paper, Window, depth, draw_box, label_edges
+from abbe.service.rendering.plots.isometric import Paper, ViewWindow, depth, draw_box, label_edges
 from abbe.service.rendering.svg import Svg
 
 F2 = NDArray[np.float64]
@@ -58,7 +58,7 @@ def setups_picture(stroke_mm: F2, paths: Sequence[SetupPath], *, key: str = "set
     words = "; ".join(f"{p.number}: {p.words}" for p in paths)
     svg = Svg(WIDTH, HEIGHT, key, f"{count} set-ups in the machine's volume", words)
     low, high = stroke_mm[:, 0], stroke_mm[:, 1]
-    paper = Paper.around(low, high, Window((WIDTH / 2.0, HEIGHT / 2.0 - 14.0), WIDTH - 150.0, HEIGHT - 130.0))
+    paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, HEIGHT / 2.0 - 14.0), WIDTH - 150.0, HEIGHT - 130.0))
     draw_box(svg, paper, low, high)
     middles = np.array([p.path_mm.mean(axis=0) for p in paths]).reshape(-1, 3)
     for i in np.argsort(depth(middles), kind="stable"):  # far ones first, near ones over them

@@ -25,7 +25,7 @@ PLANES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Slice:
+class SlicePlane:
     """Nodes of one plane, shape (a, b, 3), mm; deviation, µm; U (k = 2) of its length, µm, and whether that is exceeded, shape (a, b)."""
 
     plane: str
@@ -62,7 +62,7 @@ def magnification(span_mm: float, longest_um: float) -> float:
     return round_down(0.1 * span_mm / (longest_um * 1e-3)) if longest_um > 0.0 and span_mm > 0.0 else 1.0
 
 
-def slice_plot(data: Slice, top: float, magnified: float, words: Words, *, key: str = "slice") -> str:
+def slice_plot(data: SlicePlane, top: float, magnified: float, words: Words, *, key: str = "slice") -> str:
     """One plane. ``top``: upper end of the colours in the reader's unit; ``magnified``: mm drawn per mm of error."""
     across, up, _ = PLANES[data.plane]
     grid = data.grid_mm / words.place.size
@@ -91,7 +91,7 @@ def slice_plot(data: Slice, top: float, magnified: float, words: Words, *, key: 
     return svg.render()
 
 
-def _arrows(svg: Svg, panel: Panel, data: Slice, ends: tuple[Array, Array], top: float, words: Words) -> None:
+def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array], top: float, words: Words) -> None:
     """From the first ends to the second."""
     across, up, _ = PLANES[data.plane]
     (grid, actual), unit = ends, words.error

@@ -16,7 +16,7 @@ from abbe.service.rendering.axes import nice_step, round_up
 from abbe.service.rendering.model import ArrowField
 from abbe.service.rendering.numbers import plain, tidy
 from abbe.service.rendering.palette import SEQUENCE
-from abbe.service.rendering.plots.isometric import Paper, Window, depth, draw_box, label_edges, round_down
+from abbe.service.rendering.plots.isometric import Paper, ViewWindow, depth, draw_box, label_edges, round_down
 from abbe.service.rendering.svg import Svg
 
 F2 = NDArray[np.float64]
@@ -73,7 +73,7 @@ def volume_arrows(field: ArrowField, scale: ArrowScale, *, key: str, heading: st
     if finite_grid.size:
         low, high = finite_grid.min(axis=0), finite_grid.max(axis=0)
         # Arrows at the faces leave the box: the margin leaves them room.
-        window = Window((WIDTH / 2.0, 58.0 + (HEIGHT - 110.0) / 2.0), WIDTH - 120.0, HEIGHT - 178.0)
+        window = ViewWindow((WIDTH / 2.0, 58.0 + (HEIGHT - 110.0) / 2.0), WIDTH - 120.0, HEIGHT - 178.0)
         paper = Paper.around(low, high, window)
         draw_box(svg, paper, low, high)
         _draw_arrows(svg, paper, field, scale)

@@ -20,7 +20,7 @@ from abbe.service.sequences.recipes import bar_tables, laser_tables
 from abbe.service.sequences.recipes.bar_tables import CircleTable, HelixPointsTable, HelixTable, bar_table
 from abbe.service.sequences.recipes.laser_tables import DiagonalTable, FaceTable, LineTable, laser_table
 from abbe.service.sequences.recipes.recipe import BarRecipe, Recipe
-from abbe.service.sequences.recipes.recipe_tables import Table, TestTable
+from abbe.service.sequences.recipes.recipe_tables import RecipeTable, TestTable
 from abbe.service.sequences.recipes.setups import shared_setups
 
 FORMAT = "abbe-recipe/1"
@@ -31,7 +31,7 @@ AnyTest = Annotated[
 KINDS: dict[str, type[TestTable]] = bar_tables.KINDS | laser_tables.KINDS
 
 
-class RecipeFile(Table):
+class RecipeFile(RecipeTable):
     """A whole recipe file."""
 
     format: Literal["abbe-recipe/1"]

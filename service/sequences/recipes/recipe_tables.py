@@ -15,13 +15,13 @@ Letter = Literal["X", "Y", "Z"]
 Role = Literal["identify", "holdout"]
 
 
-class Table(BaseModel):
+class RecipeTable(BaseModel):
     """Frozen, and without keys that nobody knows."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-class TestTable(Table):
+class TestTable(RecipeTable):
     """Keys of every test."""
 
     __test__ = False  # not a pytest class

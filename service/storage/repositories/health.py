@@ -13,7 +13,7 @@ from abbe.service.storage.tables import machines, outbox
 
 
 @dataclass(frozen=True, slots=True)
-class Health:
+class StoreHealth:
     """State of a database. ``file``: of SQLite, else empty; ``size_b``: with the write-ahead log; ``since_utc``: of the first machine."""
 
     revision: str
@@ -28,12 +28,12 @@ class Health:
 class HealthStore(StoreBase):
     """How the database itself is."""
 
-    def health(self) -> Health:
+    def health(self) -> StoreHealth:
         """Look at the database; nothing is written."""
         database = self._engine.url.database
         file = str(database) if self._engine.dialect.name == "sqlite" and not self._in_memory and database else ""
 
-        def look(connection: Connection) -> Health:
+        def look(connection: Connection) -> StoreHealth:
             waiting = select(func.count(), func.min(outbox.c.created_utc)).where(outbox.c.sent_utc.is_(None))
             count, oldest = connection.execute(waiting).one()
             since = connection.execute(select(func.min(machines.c.created_utc))).scalar()
@@ -44,6 +44,6 @@ class HealthStore(StoreBase):
             else:
                 size = int(connection.execute(text("select page_count * page_size from pragma_page_count, pragma_page_size")).scalar_one())
             revision = revision_of(connection) or ""
-            return Health(revision, head_revision(), file, size, since, int(count), oldest)
+            return StoreHealth(revision, head_revision(), file, size, since, int(count), oldest)
 
         return self._read(look)

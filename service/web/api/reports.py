@@ -19,7 +19,7 @@ from abbe.service.web.login.access import needs
 AT_A_TIME = 2
 
 
-class Kind(StrEnum):
+class ReportKind(StrEnum):
     """What a report is about."""
 
     RUN = "run"
@@ -29,7 +29,7 @@ class Kind(StrEnum):
     PUSH = "push"
 
 
-class Form(StrEnum):
+class ReportForm(StrEnum):
     """How it is written."""
 
     PDF = "pdf"
@@ -38,7 +38,7 @@ class Form(StrEnum):
     JSON = "json"
 
 
-MEDIA = {Form.PDF: "application/pdf", Form.HTML: "text/html", Form.CSV: "text/csv", Form.JSON: "application/json"}
+MEDIA = {ReportForm.PDF: "application/pdf", ReportForm.HTML: "text/html", ReportForm.CSV: "text/csv", ReportForm.JSON: "application/json"}
 WRITTEN: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The report, as a file to be saved; the same data give the same bytes",
@@ -59,9 +59,9 @@ def add_reports(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/reports/{kind}/{number}", response_class=Response, responses=WRITTEN)
     @needs(Permission.READ)
     async def report(
-        kind: Kind,
+        kind: ReportKind,
         number: Number,
-        form: Annotated[Form, Query(description="How it is written.")] = Form.PDF,
+        form: Annotated[ReportForm, Query(description="How it is written.")] = ReportForm.PDF,
         machine: Annotated[str | None, Query(description="Whose push, where several machines are stored.")] = None,
     ) -> Response:
         """A report to sign: figures with U by ISO 230, conditions, decision, what was not observable."""
@@ -70,7 +70,7 @@ def add_reports(app: FastAPI, sources: Sources) -> None:
         return Response(data, media_type=MEDIA[form], headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
-def _written(sources: Sources, kind: Kind, number: int, form: Form, machine: str | None) -> tuple[str, bytes]:
+def _written(sources: Sources, kind: ReportKind, number: int, form: ReportForm, machine: str | None) -> tuple[str, bytes]:
     with as_stored():
         document = _document(sources, kind, number, machine)
         found = FORMS[f".{form}"](document)
@@ -78,9 +78,9 @@ def _written(sources: Sources, kind: Kind, number: int, form: Form, machine: str
     return name, found.encode() if isinstance(found, str) else found
 
 
-def _document(sources: Sources, kind: Kind, number: int, machine: str | None) -> Document:
+def _document(sources: Sources, kind: ReportKind, number: int, machine: str | None) -> Document:
     store = sources.store
-    if kind is Kind.PUSH:
+    if kind is ReportKind.PUSH:
         if machine is not None and (not storable(machine) or not store.push_entries(machine, sources.control_of(machine))):
             raise NotStored("this machine has no push")
         found = store.page(
@@ -89,10 +89,15 @@ def _document(sources: Sources, kind: Kind, number: int, machine: str | None) ->
         if not found:
             raise NotStored(f"there is no push {number}")
         return numbered_report(store, kind, number, sources.rules, machine)
-    listing = {Kind.RUN: "runs", Kind.CAMPAIGN: "campaigns", Kind.VERIFICATION: "verifications", Kind.DISCOVERY: "discoveries"}[kind]
+    listing = {
+        ReportKind.RUN: "runs",
+        ReportKind.CAMPAIGN: "campaigns",
+        ReportKind.VERIFICATION: "verifications",
+        ReportKind.DISCOVERY: "discoveries",
+    }[kind]
     row = sources.row(listing, number, kind)
-    if kind is Kind.RUN:
+    if kind is ReportKind.RUN:
         return stored_report(store, store.run(f"{row['campaign']}/{row['label']}"), sources.rules)
-    if kind is Kind.CAMPAIGN:
+    if kind is ReportKind.CAMPAIGN:
         return stored_report(store, store.campaign(row["name"]), sources.rules)
     return numbered_report(store, kind, number, sources.rules)

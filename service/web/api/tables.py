@@ -12,10 +12,10 @@ from abbe.service.compensation.proposal_checks import approve as work_approve
 from abbe.service.compensation.proposal_checks import reject as work_reject
 from abbe.service.compensation.proposal_diff import ACTIVE, compare, diff_json
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposal_states import Standing, check_waiting, standing, standing_of
+from abbe.service.compensation.proposal_states import ProposalStatus, check_waiting, standing, standing_of
 from abbe.service.errors import NotStored, Unusable
 from abbe.service.push.book import read_entries
-from abbe.service.push.entries import Entry
+from abbe.service.push.entries import JournalEntry
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission
@@ -114,7 +114,7 @@ def _standings(sources: Sources, rows: list[Doc]) -> list[s.Proposal]:
     """Where proposals stand; journals and tables are read once for all of them."""
     store, now_s = sources.store, sources.clock.utc().timestamp()
     tables = {t.id: t.doc for t in store.tables()} if rows else {}
-    journals: dict[str, list[Entry]] = {}
+    journals: dict[str, list[JournalEntry]] = {}
     found = []
     for row in rows:
         number, machine = row["id"], row["machine"]
@@ -126,16 +126,16 @@ def _standings(sources: Sources, rows: list[Doc]) -> list[s.Proposal]:
                 decided = (store.approvals(number), journals[machine], tables, now_s, store.rejections(number))
                 now = standing_of(number, proposed, *decided)
         except (Unusable, NotStored) as error:  # one bad row must not hide the others
-            now = Standing("changed", error.detail)
+            now = ProposalStatus("changed", error.detail)
         found.append(_proposal(row, now))
     return found
 
 
-def _proposal(row: Doc, now: Standing) -> s.Proposal:
+def _proposal(row: Doc, now: ProposalStatus) -> s.Proposal:
     return s.Proposal.model_validate(_head(row, now))
 
 
-def _head(row: Doc, now: Standing) -> Doc:
+def _head(row: Doc, now: ProposalStatus) -> Doc:
     known = {"number": row["id"], "machine": row["machine"], "solution": row["solution_id"], "created_utc": row["created_utc"]}
     return known | {"state": now.word, "why": now.text}
 

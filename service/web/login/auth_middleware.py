@@ -19,7 +19,7 @@ from abbe.service.errors import AbbeError
 from abbe.service.users.people import NOBODY, ONLOOKER, Principal
 from abbe.service.web.bodies import Body
 from abbe.service.web.login.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
-from abbe.service.web.login.authentication import Door, csrf_token
+from abbe.service.web.login.authentication import Authenticator, csrf_token
 from abbe.service.web.login.origin import address_of, is_ours, is_tls
 from abbe.service.web.problems import problem
 
@@ -48,11 +48,11 @@ class Guard:
         Behind it.
     routes : sequence of routes
         Of the application, as they are at the time of a request.
-    door : Door, optional
+    door : Authenticator, optional
         Without one there are no users: everybody is an onlooker, and nothing can be changed.
     """
 
-    def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute], door: Door | None) -> None:
+    def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute], door: Authenticator | None) -> None:
         self._app, self._routes, self._door = app, routes, door
         self._behind_tls = door is not None and door.behind_tls
 
@@ -120,7 +120,7 @@ class Guard:
         return None
 
     async def _recorded(
-        self, door: Door, route: BaseRoute, visit: Visit, refused: Response | None, call: tuple[Scope, Receive, Send]
+        self, door: Authenticator, route: BaseRoute, visit: Visit, refused: Response | None, call: tuple[Scope, Receive, Send]
     ) -> None:
         """Answer, with a record of it on disk before the answer leaves. What could not be recorded is not begun."""
         scope, receive, send = call
@@ -153,7 +153,7 @@ class Guard:
 class _Log:
     """The record of one changing request, however it ends."""
 
-    door: Door
+    door: Authenticator
     visit: Visit
     action: str
     path: str

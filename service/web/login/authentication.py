@@ -38,7 +38,7 @@ class Front:
 ALONE = Front()
 
 
-class Door:
+class Authenticator:
     """Users, lockout, rate limits and audit of one service.
 
     Parameters

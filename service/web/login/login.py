@@ -17,7 +17,7 @@ from abbe.service.users.roles import Permission
 from abbe.service.web.listening import is_local
 from abbe.service.web.login.access import PUBLIC, needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.login.authentication import Door, csrf_token
+from abbe.service.web.login.authentication import Authenticator, csrf_token
 from abbe.service.web.login.origin import is_tls
 from abbe.service.web.problems import problem
 from abbe.service.web.schemas import Problem
@@ -28,7 +28,7 @@ DEVICE_S = 90 * 86_400
 """So long a browser is known again; what that is good for stands in `service/users/lockout.py`."""
 
 
-def add_login(app: FastAPI, env: Environment, door: Door) -> None:
+def add_login(app: FastAPI, env: Environment, door: Authenticator) -> None:
     """Add the routes of users to the application."""
 
     def page(status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
@@ -82,7 +82,7 @@ def add_login(app: FastAPI, env: Environment, door: Door) -> None:
     _add_reading(app, door)
 
 
-def _add_reading(app: FastAPI, door: Door) -> None:
+def _add_reading(app: FastAPI, door: Authenticator) -> None:
     refusals: dict[int | str, dict[str, object]] = {
         401: {"model": Problem, "description": "Nobody is logged in"},
         403: {"model": Problem, "description": "The role does not allow it"},
@@ -128,13 +128,13 @@ async def _form(request: Request) -> dict[str, str] | None:
         return None
 
 
-def _came(door: Door, request: Request, name: str) -> Came:
+def _came(door: Authenticator, request: Request, name: str) -> Came:
     visit: Visit = request.state.visit
     device = door.people.device_of(name, request.cookies.get(door.device_cookie(), ""))
     return Came(visit.address, device, here=is_local(visit.address) and not door.behind_tls)
 
 
-def _set_cookie(door: Door, request: Request, answer: Response, secret: str) -> None:
+def _set_cookie(door: Authenticator, request: Request, answer: Response, secret: str) -> None:
     """The cookie dies with the browser; how long the session lasts is decided here, not there."""
     tls = is_tls(request, behind_tls=door.behind_tls)
     age = None if secret else 0

@@ -18,10 +18,10 @@ from abbe.service.storage.records import RunRecord
 from abbe.service.storage.store import Store
 from abbe.service.verification.compare_runs import (
     MOST,
-    Curve,
-    Difference,
+    ComparedCurve,
     FigureRow,
-    Loaded,
+    LoadedRun,
+    RunDifference,
     against,
     curve,
     difference,
@@ -98,10 +98,10 @@ def _choices(store: Store, there: Sequence[RunRecord]) -> list[RunRecord]:
     return [*there, *(run for run in newest if run.id not in kept)]
 
 
-def _load(store: Store, record: RunRecord, rules: Rules) -> Loaded:
+def _load(store: Store, record: RunRecord, rules: Rules) -> LoadedRun:
     run, document = run_document(store, record, rules)
     name = store.machine(store.campaign(record.campaign_id).machine_id).name
-    return Loaded(f"{record.campaign}/{record.label}", name, run, run_data(run), document.figures)
+    return LoadedRun(f"{record.campaign}/{record.label}", name, run, run_data(run), document.figures)
 
 
 def _feed(mm_min: float) -> str:
@@ -116,14 +116,14 @@ def _line(row: FigureRow) -> ComparedLine:
     return ComparedLine(row.symbol, row.name, frame.unit(row.unit), values, frame.with_u(row.difference, row.u, row.unit), told)
 
 
-def _summary(apart: Difference, say: Say) -> str:
+def _summary(apart: RunDifference, say: Say) -> str:
     at = apart.largest
     value, expanded = current().with_u(float(apart.difference_um[at]), float(apart.u_um[at]))
     share = apart.beyond
     return say("compare.largest", value=value, u=expanded, unit=current().unit(), share=f"{share:.0%}" if finite(share) else "–")
 
 
-def pictures(curves: Sequence[Curve], apart: Difference | None, say: Say) -> list[tuple[Markup, str]]:
+def pictures(curves: Sequence[ComparedCurve], apart: RunDifference | None, say: Say) -> list[tuple[Markup, str]]:
     """Pictures in the reader's units, and captions. The SVG writer has escaped every text; escaping again would show the tags."""
     error, place = current().drawn(), current().drawn("mm")
     y = say("compare.deviation", unit=error.sign)

@@ -17,13 +17,13 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from abbe.service.web import words
 from abbe.service.web.api.sources import storable
-from abbe.service.web.login.authentication import Door
+from abbe.service.web.login.authentication import Authenticator
 from abbe.service.web.schemas import Status, Verification
 
 T = TypeVar("T")
 
 
-class Source(Protocol):
+class PageSource(Protocol):
     """The moment, as the home page has it."""
 
     async def status(self) -> Status:
@@ -36,24 +36,24 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Desk:
+class PageContext:
     """Where the screens get everything from.
 
     Parameters
     ----------
     env : Environment
         The templates; they escape everything.
-    door : Door
+    door : Authenticator
         Its store is read, and its users approve.
-    source : Source
+    source : PageSource
         The moment.
     rules : Rules
         Limits and certificates of the machine file: a screen judges as the report does.
     """
 
     env: Environment
-    door: Door
-    source: Source
+    door: Authenticator
+    source: PageSource
     rules: Rules = field(default_factory=Rules)
 
     @property

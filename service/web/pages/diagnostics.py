@@ -16,7 +16,7 @@ from typing import Any
 
 from abbe.service.campaign_data.provenance import versions
 from abbe.service.secrets import mask_secrets
-from abbe.service.storage.repositories.health import Health
+from abbe.service.storage.repositories.health import StoreHealth
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.schemas import Status
 
@@ -104,7 +104,7 @@ class Diagnosis:
 def diagnosis(sources: Sources, version: str) -> Diagnosis:
     """Look at everything now."""
     store, now = sources.store, sources.clock.utc()
-    found: Health = store.health()
+    found: StoreHealth = store.health()
     since = None if found.since_utc is None else datetime.fromisoformat(found.since_utc)
     days = 0.0 if since is None else (now - since).total_seconds() / DAY_S
     oldest = None if found.outbox_oldest_utc is None else (now - datetime.fromisoformat(found.outbox_oldest_utc)).total_seconds()

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from abbe.service.scheduler.fleet import Figure, Stand, stands
+from abbe.service.scheduler.fleet import FleetFigure, MachineStatus, stands
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.base import utc_text
 from abbe.service.verification.alarm_states import folded, is_open
@@ -28,8 +28,8 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 class FleetLine:
     """One machine: where it stands, its worst figure, and how many alarms are open."""
 
-    machine: Stand
-    worst: Figure | None
+    machine: MachineStatus
+    worst: FleetFigure | None
     alarms: int
 
     @property
@@ -51,7 +51,7 @@ class FleetLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class FleetQuery:
     """What a reader wants to see: part of a name, a verdict, and in which order."""
 
     name: str = ""
@@ -59,7 +59,7 @@ class Asked:
     sort: str = SORTS[0]
 
 
-def fleet_lines(store: ServiceStore, now: datetime, asked: Asked) -> list[FleetLine]:
+def fleet_lines(store: ServiceStore, now: datetime, asked: FleetQuery) -> list[FleetLine]:
     """The machines that fit, in the order that was asked for."""
     lines = [_line(store, one) for one in stands(store, now) if _fits(one, asked)]
     if asked.sort == "machine":
@@ -73,11 +73,11 @@ def _moment(utc: str) -> str:
     return utc_text(datetime.fromisoformat(utc)) if utc else "~"  # what is not due comes last
 
 
-def _fits(one: Stand, asked: Asked) -> bool:
+def _fits(one: MachineStatus, asked: FleetQuery) -> bool:
     return asked.name.casefold() in one.machine.casefold() and asked.verdict in {"", one.verdict}
 
 
-def _line(store: ServiceStore, one: Stand) -> FleetLine:
+def _line(store: ServiceStore, one: MachineStatus) -> FleetLine:
     judged = [figure for figure in one.figures if figure.limit]
     worst = max(judged, key=lambda f: (f.value + (f.expanded or 0.0)) / (f.limit or 1.0), default=None)
     return FleetLine(one, worst, sum(is_open(alarm) for alarm in folded(store.alarm_entries(one.machine))))

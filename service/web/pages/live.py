@@ -13,8 +13,8 @@ from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.login.authentication import Door
-from abbe.service.web.pages.desk import Desk, Source
+from abbe.service.web.login.authentication import Authenticator
+from abbe.service.web.pages.desk import PageContext, PageSource
 
 SCRIPT_WORDS = (
     "live.abort", "live.ended", "live.gone", "live.old", "live.pause", "live.resume", "live.stop", "live.no_path",
@@ -23,9 +23,11 @@ SCRIPT_WORDS = (
 """What the script fills in; the states of a measurement, and how one ends, come on top."""
 
 
-def add_live_page(app: FastAPI, env: Environment, door: Door, source: Source, jobs: Callable[[], Sequence[JobSeen]] = tuple) -> None:
+def add_live_page(
+    app: FastAPI, env: Environment, door: Authenticator, source: PageSource, jobs: Callable[[], Sequence[JobSeen]] = tuple
+) -> None:
     """Add the screen to the application. ``jobs``: those since the service began, newest first; how the last one ended is told."""
-    desk = Desk(env, door, source)
+    desk = PageContext(env, door, source)
 
     @app.get("/live", include_in_schema=False)
     @needs(Permission.READ)

@@ -16,17 +16,17 @@ from abbe.service.channel.messages import RulesTold
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.login.authentication import Door
-from abbe.service.web.pages.desk import Desk, Source
+from abbe.service.web.login.authentication import Authenticator
+from abbe.service.web.pages.desk import PageContext, PageSource
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 
 Recipe = Annotated[str, Query(max_length=200)]
 Rate = Annotated[int, Query(ge=1, le=1000)]
 
 
-def add_new_page(app: FastAPI, env: Environment, door: Door, source: Source, plans: Rehearsals) -> None:
+def add_new_page(app: FastAPI, env: Environment, door: Authenticator, source: PageSource, plans: Rehearsals) -> None:
     """Add the screen to the application."""
-    desk = Desk(env, door, source)
+    desk = PageContext(env, door, source)
 
     @app.get("/new", include_in_schema=False)
     @needs(Permission.READ)

@@ -18,11 +18,11 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.frame import THEMES, current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.login.authentication import Door
-from abbe.service.web.pages.desk import Desk, Source, can_be_stored
+from abbe.service.web.login.authentication import Authenticator
+from abbe.service.web.pages.desk import PageContext, PageSource, can_be_stored
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
-from abbe.service.web.pages.fleet import SORTS, Asked, fleet_csv, fleet_lines
+from abbe.service.web.pages.fleet import SORTS, FleetQuery, fleet_csv, fleet_lines
 from abbe.service.web.units import SYSTEMS
 
 Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
@@ -30,19 +30,19 @@ Sort = Literal["worst", "machine", "due"]
 BUNDLE_ACTION = "support bundle"
 
 
-def add_plant_screens(app: FastAPI, env: Environment, door: Door, source: Source, sources: Sources) -> None:
+def add_plant_screens(app: FastAPI, env: Environment, door: Authenticator, source: PageSource, sources: Sources) -> None:
     """Add the screens."""
-    desk = Desk(env, door, source, sources.rules)
+    desk = PageContext(env, door, source, sources.rules)
     _add_fleet(app, desk, sources)
     _add_devices(app, desk, sources)
     _add_settings(app, desk, sources)
 
 
-def _add_fleet(app: FastAPI, desk: Desk, sources: Sources) -> None:
+def _add_fleet(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/fleet", include_in_schema=False)
     @needs(Permission.READ)
     async def fleet(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> HTMLResponse:
-        asked, now, lang = Asked(name, verdict, sort), sources.clock.utc(), current().lang
+        asked, now, lang = FleetQuery(name, verdict, sort), sources.clock.utc(), current().lang
         lines = await desk.read(fleet_lines, sources.store, now, asked)
 
         def named(key: str) -> tuple[str, str]:
@@ -63,12 +63,12 @@ def _add_fleet(app: FastAPI, desk: Desk, sources: Sources) -> None:
     @app.get("/fleet.csv", include_in_schema=False)
     @needs(Permission.READ)
     async def as_csv(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> Response:
-        lines = await desk.read(fleet_lines, sources.store, sources.clock.utc(), Asked(name, verdict, sort))
+        lines = await desk.read(fleet_lines, sources.store, sources.clock.utc(), FleetQuery(name, verdict, sort))
         headers = {"Content-Disposition": 'attachment; filename="fleet.csv"'}
         return Response(fleet_csv(lines), media_type="text/csv; charset=utf-8", headers=headers)
 
 
-def _add_devices(app: FastAPI, desk: Desk, sources: Sources) -> None:
+def _add_devices(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/devices", include_in_schema=False)
     @needs(Permission.READ)
     async def devices() -> HTMLResponse:
@@ -83,7 +83,7 @@ def _lines(sources: Sources) -> list[str]:
     return [] if sources.tail is None else sources.tail.lines()
 
 
-def _add_settings(app: FastAPI, desk: Desk, sources: Sources) -> None:
+def _add_settings(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/settings", include_in_schema=False)
     @needs(Permission.READ)
     async def settings() -> HTMLResponse:

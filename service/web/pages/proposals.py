@@ -12,7 +12,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proposal_checks import approve
 from abbe.service.compensation.proposal_diff import HEADINGS, compare, largest, rows
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposal_states import Standing, check_waiting, standing, standing_of
+from abbe.service.compensation.proposal_states import ProposalStatus, check_waiting, standing, standing_of
 from abbe.service.errors import StoreError
 from abbe.service.push.book import read_entries
 from abbe.service.rendering.plots.table_change import DiffCurve, change_plot
@@ -94,7 +94,7 @@ def promise(proposed: Proposed) -> str:
     return f"{texts[0]} → {texts[1]} {unit} (U = {texts[2]} {unit})"
 
 
-def _line(number: int, proposed: Proposed, now: Standing) -> ProposalLine:
+def _line(number: int, proposed: Proposed, now: ProposalStatus) -> ProposalLine:
     return ProposalLine(number, proposed.campaign, proposed.by, proposed.utc, promise(proposed), now.word, now.text)
 
 

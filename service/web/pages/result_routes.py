@@ -13,9 +13,9 @@ from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen
 from abbe.service.web.pages.compare import compare_screen
-from abbe.service.web.pages.desk import Desk, found
+from abbe.service.web.pages.desk import PageContext, found
 from abbe.service.web.pages.results import solution_lines
-from abbe.service.web.pages.volume import NODES, Asked, volume_screen
+from abbe.service.web.pages.volume import NODES, VolumeQuery, volume_screen
 from abbe.service.web.pages.whatif import whatif_screen
 
 LARGEST = 2**31 - 1
@@ -25,7 +25,7 @@ Runs = Annotated[list[Annotated[int, Query(ge=1, le=LARGEST)]], Query(max_length
 Plane = Literal["XY", "XZ", "YZ"]
 
 
-def add_result_pages(app: FastAPI, desk: Desk) -> None:
+def add_result_pages(app: FastAPI, desk: PageContext) -> None:
     """Add the screens to the application."""
     _add_volume(app, desk)
     _add_whatif(app, desk)
@@ -33,7 +33,7 @@ def add_result_pages(app: FastAPI, desk: Desk) -> None:
     _add_compare(app, desk)
 
 
-async def _solution(desk: Desk, number: int | None) -> SolutionRecord | HTMLResponse | None:
+async def _solution(desk: PageContext, number: int | None) -> SolutionRecord | HTMLResponse | None:
     """The solution that was asked for, or the newest; None: there is none at all; or the answer that it is not there."""
     if number is None:
         newest = await desk.read(solution_lines, desk.store, 1)
@@ -44,7 +44,7 @@ async def _solution(desk: Desk, number: int | None) -> SolutionRecord | HTMLResp
     return record if record is not None else await desk.missing("solution", number)
 
 
-def _add_volume(app: FastAPI, desk: Desk) -> None:
+def _add_volume(app: FastAPI, desk: PageContext) -> None:
     @app.get("/volume", include_in_schema=False)
     @needs(Permission.READ)
     async def volume(
@@ -57,12 +57,12 @@ def _add_volume(app: FastAPI, desk: Desk) -> None:
         record = await _solution(desk, id)
         if isinstance(record, HTMLResponse):
             return record
-        asked = Asked(tuple(motion), plane, at, nodes)
+        asked = VolumeQuery(tuple(motion), plane, at, nodes)
         screen = None if record is None else await desk.read(volume_screen, desk.store, record, asked, current().say)
         return await desk.show("volume.html", screen=screen, counts=NODES)
 
 
-def _add_whatif(app: FastAPI, desk: Desk) -> None:
+def _add_whatif(app: FastAPI, desk: PageContext) -> None:
     @app.get("/whatif", include_in_schema=False)
     @needs(Permission.READ)
     async def whatif(id: Number = None, take: Names = [], everything: bool = False) -> HTMLResponse:  # noqa: B006
@@ -73,7 +73,7 @@ def _add_whatif(app: FastAPI, desk: Desk) -> None:
         return await desk.show("whatif.html", 409 if screen is not None and screen.trouble else 200, screen=screen)
 
 
-def _add_budget(app: FastAPI, desk: Desk) -> None:
+def _add_budget(app: FastAPI, desk: PageContext) -> None:
     @app.get("/budget", include_in_schema=False)
     @needs(Permission.READ)
     async def budget(id: Number = None) -> HTMLResponse:
@@ -84,7 +84,7 @@ def _add_budget(app: FastAPI, desk: Desk) -> None:
         return await desk.show("budget.html", screen=screen)
 
 
-def _add_compare(app: FastAPI, desk: Desk) -> None:
+def _add_compare(app: FastAPI, desk: PageContext) -> None:
     @app.get("/compare", include_in_schema=False)
     @needs(Permission.READ)
     async def compare(run: Runs = []) -> HTMLResponse:  # noqa: B006

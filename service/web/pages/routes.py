@@ -20,13 +20,13 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.users.roles import Permission
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.login.authentication import Door
+from abbe.service.web.login.authentication import Authenticator
 from abbe.service.web.pages import times
-from abbe.service.web.pages.desk import Desk, Source, can_be_stored, found
+from abbe.service.web.pages.desk import PageContext, PageSource, can_be_stored, found
 from abbe.service.web.pages.proposals import approve_as, proposal_lines, proposal_screen
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_lines, discovery_screen, result_screen, solution_lines
-from abbe.service.web.pages.runs import STATES, TESTS, Wanted, newest_run, run_list, run_screen
+from abbe.service.web.pages.runs import STATES, TESTS, RunsQuery, newest_run, run_list, run_screen
 from abbe.service.web.pages.table import ends
 from abbe.service.web.problems import problem
 
@@ -56,9 +56,9 @@ Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 PLOT_STYLE = themed(style_rules())
 
 
-def add_pages(app: FastAPI, env: Environment, door: Door, source: Source, rules: Rules) -> None:
+def add_pages(app: FastAPI, env: Environment, door: Authenticator, source: PageSource, rules: Rules) -> None:
     """Add the screens to the application. ``rules``: limits and certificates of the machine file."""
-    desk = Desk(env, door, source, rules)
+    desk = PageContext(env, door, source, rules)
 
     @app.get("/plots.css", include_in_schema=False)
     @needs(Permission.READ)
@@ -73,11 +73,11 @@ def add_pages(app: FastAPI, env: Environment, door: Door, source: Source, rules:
     _add_times(app, desk)
 
 
-def _add_runs(app: FastAPI, desk: Desk) -> None:
+def _add_runs(app: FastAPI, desk: PageContext) -> None:
     @app.get("/runs", include_in_schema=False)
     @needs(Permission.READ)
     async def runs(campaign: Text = "", test: Text = "", state: Text = "") -> HTMLResponse:
-        wanted = Wanted(campaign, test, state)
+        wanted = RunsQuery(campaign, test, state)
         listed = await desk.read(run_list, desk.store, wanted)
         return await desk.show("runs.html", listed=listed, wanted=wanted, tests=TESTS, states=STATES)
 
@@ -95,7 +95,7 @@ def _add_runs(app: FastAPI, desk: Desk) -> None:
         return await desk.show("run.html", screen=screen, told=told)
 
 
-def _add_results(app: FastAPI, desk: Desk) -> None:
+def _add_results(app: FastAPI, desk: PageContext) -> None:
     @app.get("/results", include_in_schema=False)
     @needs(Permission.READ)
     async def results() -> HTMLResponse:
@@ -130,7 +130,7 @@ def _add_results(app: FastAPI, desk: Desk) -> None:
         return await desk.show("discovery.html", screen=screen, told=told)
 
 
-def _add_proposals(app: FastAPI, desk: Desk) -> None:
+def _add_proposals(app: FastAPI, desk: PageContext) -> None:
     @app.get("/proposals", include_in_schema=False)
     @needs(Permission.READ)
     async def proposals() -> HTMLResponse:
@@ -153,7 +153,7 @@ def _add_proposals(app: FastAPI, desk: Desk) -> None:
         return await desk.show("proposal.html", screen=screen, hours=HOURS, key=secrets.token_hex(8), words=ends("table.word"))
 
 
-def _add_approval(app: FastAPI, desk: Desk) -> None:
+def _add_approval(app: FastAPI, desk: PageContext) -> None:
     @app.post("/proposal/approve", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.APPROVE)
     async def approve(request: Request) -> Response:
@@ -196,7 +196,7 @@ async def _form(request: Request) -> dict[str, str]:
         return {}
 
 
-def _add_times(app: FastAPI, desk: Desk) -> None:
+def _add_times(app: FastAPI, desk: PageContext) -> None:
     @app.get("/trends", include_in_schema=False)
     @needs(Permission.READ)
     async def trends() -> HTMLResponse:

@@ -25,7 +25,7 @@ MOST_RUNNING = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class RunsQuery:
     """What a list of runs is limited to; empty: not limited."""
 
     campaign: str = ""
@@ -51,7 +51,7 @@ class RunScreen:
     trouble: str = ""
 
 
-def run_list(store: Store, wanted: Wanted) -> RunList:
+def run_list(store: Store, wanted: RunsQuery) -> RunList:
     """The newest runs that fit."""
     names = [c.name for c in reversed(store.campaigns())][:MOST_CAMPAIGNS]
     if wanted.state in (INCOMPLETE, RUNNING):  # both are written as running; which it is depends on whether its process still lives

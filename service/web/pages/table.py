@@ -14,8 +14,8 @@ from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.login.authentication import Door
-from abbe.service.web.pages.desk import Desk, Source
+from abbe.service.web.login.authentication import Authenticator
+from abbe.service.web.pages.desk import PageContext, PageSource
 
 MOST = 50
 SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}
@@ -28,9 +28,9 @@ def ends(group: str) -> dict[str, str]:
     return {word: current().state(group, word) for word in ENDS}
 
 
-def add_table_screen(app: FastAPI, env: Environment, door: Door, source: Source, sources: Sources) -> None:
+def add_table_screen(app: FastAPI, env: Environment, door: Authenticator, source: PageSource, sources: Sources) -> None:
     """Add the screen to the application."""
-    desk = Desk(env, door, source, sources.rules)
+    desk = PageContext(env, door, source, sources.rules)
 
     @app.get("/table", include_in_schema=False)
     @needs(Permission.READ)

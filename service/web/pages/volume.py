@@ -14,7 +14,7 @@ from abbe.models.uncertainty.what_if import expected_rms
 from abbe.service.errors import AbbeError
 from abbe.service.identification.solution_field import NodeMap, StoredField, node_map, stored_field
 from abbe.service.rendering.numbers import placed, tidy
-from abbe.service.rendering.plots.slices import PLANES, Slice, Words, colour_top, magnification, slice_plot, steps
+from abbe.service.rendering.plots.slices import PLANES, SlicePlane, Words, colour_top, magnification, slice_plot, steps
 from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
@@ -28,7 +28,7 @@ NOTHING = Markup("")
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class VolumeQuery:
     """What a reader wants to see. ``at``: number of the slice from 0, -1: the middle; ``motions``: none means all."""
 
     motions: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ class VolumeScreen:
 
     number: int
     campaign: str
-    asked: Asked
+    asked: VolumeQuery
     motions: Sequence[tuple[str, str, bool, bool]] = ()
     hidden: Sequence[tuple[str, str]] = ()
     lines: Sequence[NodeLine] = ()
@@ -75,7 +75,7 @@ class VolumeScreen:
         return [*groups, ("", [m for m in self.motions if m[0][1] == "0"])]
 
 
-def volume_screen(store: Store, record: SolutionRecord, asked: Asked, say: Say) -> VolumeScreen:
+def volume_screen(store: Store, record: SolutionRecord, asked: VolumeQuery, say: Say) -> VolumeScreen:
     """The map of a stored solution; what cannot be shown says why."""
     campaign = store.campaign(record.campaign_id).name
     try:
@@ -84,12 +84,12 @@ def volume_screen(store: Store, record: SolutionRecord, asked: Asked, say: Say) 
         return VolumeScreen(record.id, campaign, asked, trouble=error.detail if isinstance(error, AbbeError) else repr(error))
     # A motion that cannot be asked for alone, e.g. in a link of another solution, is left out; it is named below.
     chosen = tuple(name for name in stored.motions if name in asked.motions and name not in stored.hidden)
-    asked = Asked(chosen, asked.plane, asked.at, asked.nodes)
+    asked = VolumeQuery(chosen, asked.plane, asked.at, asked.nodes)
     found = node_map(stored, asked.nodes, chosen)
     return _screen(stored, campaign, asked, found, say)
 
 
-def _screen(stored: StoredField, campaign: str, asked: Asked, found: NodeMap, say: Say) -> VolumeScreen:
+def _screen(stored: StoredField, campaign: str, asked: VolumeQuery, found: NodeMap, say: Say) -> VolumeScreen:
     n, third = asked.nodes, PLANES[asked.plane][2]
     at = asked.at if 0 <= asked.at < n else n // 2
     levels = np.unique(found.points_mm[:, third])
@@ -110,7 +110,7 @@ def _screen(stored: StoredField, campaign: str, asked: Asked, found: NodeMap, sa
     # The SVG writer has escaped every text; escaping again would show the reader the tags.
     picture = Markup(slice_plot(cut, top, magnified, words))  # noqa: S704
     return VolumeScreen(
-        stored.number, campaign, Asked(asked.motions, asked.plane, at, n), motions, list(stored.hidden.items()), node_lines(found),
+        stored.number, campaign, VolumeQuery(asked.motions, asked.plane, at, n), motions, list(stored.hidden.items()), node_lines(found),
         [placed(float(v), place) for v in levels], f"/api/v1/solutions/{stored.number}/field?{urlencode(query)}", picture, figures,
         int((~found.told).sum()), steps(top), top, magnified,
     )  # fmt: skip
@@ -129,14 +129,14 @@ def _figures(found: NodeMap, rms_um: float, u_um: float, say: Say) -> list[tuple
     ]
 
 
-def _slice(found: NodeMap, plane: str, at: int) -> Slice:
+def _slice(found: NodeMap, plane: str, at: int) -> SlicePlane:
     n, (across, up, third) = found.nodes, PLANES[plane]
 
     def cut(values: Any) -> Any:
         grid = values.reshape(n, n, n, *values.shape[1:]).take(at, axis=third)
         return grid if across < up else np.swapaxes(grid, 0, 1)
 
-    return Slice(plane, cut(found.points_mm), cut(found.deviation_um), cut(2.0 * found.u_um[:, 3]), cut(found.told))
+    return SlicePlane(plane, cut(found.points_mm), cut(found.deviation_um), cut(2.0 * found.u_um[:, 3]), cut(found.told))
 
 
 def node_lines(found: NodeMap) -> list[NodeLine]:

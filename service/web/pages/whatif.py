@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from abbe.models.uncertainty.what_if import Outcome, check_figures, what_if
+from abbe.models.uncertainty.what_if import Forecast, check_figures, what_if
 from abbe.service.errors import AbbeError
 from abbe.service.identification.solution_field import StoredField, stored_field
 from abbe.service.rendering.numbers import COVERAGE, with_uncertainty
@@ -30,7 +30,7 @@ Say = Callable[..., str]
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class EffectChoice:
     """What can be taken as corrected.
 
     ``text``: its name for people; ``reason``: why it cannot be chosen alone, empty if it can; ``taken``: whether it was.
@@ -60,8 +60,8 @@ class WhatIfScreen:
 
     number: int
     campaign: str
-    means: Sequence[Choice] = ()
-    motions: Sequence[Choice] = ()
+    means: Sequence[EffectChoice] = ()
+    motions: Sequence[EffectChoice] = ()
     everything: bool = False
     lines: Sequence[ForecastLine] = ()
     picture: Markup = NOTHING
@@ -73,7 +73,7 @@ class WhatIfScreen:
         return self.everything or any(c.taken for c in (*self.means, *self.motions))
 
     @property
-    def shut(self) -> list[Choice]:
+    def shut(self) -> list[EffectChoice]:
         """What cannot be chosen alone."""
         return [c for c in self.motions if c.reason]
 
@@ -96,7 +96,7 @@ def whatif_screen(store: Store, record: SolutionRecord, take: Sequence[str], eve
     return WhatIfScreen(record.id, campaign, means, motions, everything, screen.lines, _picture(outcomes, say))
 
 
-def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = False) -> list[Outcome]:
+def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = False) -> list[Forecast]:
     """Figures of the volume and of the shipped check, before and after."""
     known = stored.known
     centre, radius = hemisphere(known.machine, CHECK_PLACE, CHECK_SHARE)
@@ -106,7 +106,7 @@ def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = Fal
     return what_if(known, off, check_figures(known, (np.array(centre), radius)))
 
 
-def _means(stored: StoredField, take: Sequence[str], say: Say) -> list[Choice]:
+def _means(stored: StoredField, take: Sequence[str], say: Say) -> list[EffectChoice]:
     """Linear errors over the volume with their values: a quantity that runs show even where they cannot tell single motions apart.
 
     µm/m is a ratio: the same number for a reader of inches (µin/in), and not converted.
@@ -115,15 +115,15 @@ def _means(stored: StoredField, take: Sequence[str], say: Say) -> list[Choice]:
     for name, (value, u) in stored.means.items():
         shown = "{} ± {}".format(*with_uncertainty(value * 1e6, u * 1e6)) + (" µm/m" if name[0] == "E" else " µrad")
         text = say("whatif.slope" if name[0] == "E" else "whatif.square", name=name, value=shown)
-        out.append(Choice(MEAN + name, text, "", "", MEAN + name in take))
+        out.append(EffectChoice(MEAN + name, text, "", "", MEAN + name in take))
     return out
 
 
-def _motions(stored: StoredField, take: Sequence[str]) -> list[Choice]:
-    return [Choice(m, m, stored.statuses.get(m, ""), stored.hidden.get(m, ""), m in take) for m in stored.motions]
+def _motions(stored: StoredField, take: Sequence[str]) -> list[EffectChoice]:
+    return [EffectChoice(m, m, stored.statuses.get(m, ""), stored.hidden.get(m, ""), m in take) for m in stored.motions]
 
 
-def _refusal(choices: Sequence[Choice], take: Sequence[str], say: Say) -> str:
+def _refusal(choices: Sequence[EffectChoice], take: Sequence[str], say: Say) -> str:
     """Why the question cannot be answered, in one line; empty if it can."""
     strange = [name for name in take if name not in {c.name for c in choices}]
     if strange:
@@ -135,7 +135,7 @@ def _refusal(choices: Sequence[Choice], take: Sequence[str], say: Say) -> str:
     return say("whatif.twice", names=", ".join(twice)) if twice else ""
 
 
-def _line(o: Outcome, say: Say) -> ForecastLine:
+def _line(o: Forecast, say: Say) -> ForecastLine:
     pairs = [(o.before_mm, o.u_before_mm), (o.after_mm, o.u_after_mm), (o.gain_mm, max(o.u_gain_mm, RESOLUTION_MM))]
     before, after, gain = (current().with_u(v * UM, u * UM) for v, u in pairs)
     if o.u_gain_mm < RESOLUTION_MM:  # taking a given scale out shifts a range by as much in every draw: what is left is rounding
@@ -144,12 +144,12 @@ def _line(o: Outcome, say: Say) -> ForecastLine:
     return ForecastLine(_name(o, say), before, after, gain, "unsure" if not sure else "better" if o.gain_mm > 0.0 else "worse")
 
 
-def _name(o: Outcome, say: Say) -> str:
+def _name(o: Forecast, say: Say) -> str:
     stem, _, rest = o.name.partition("_")
     return say("figure.diagonal", name=rest) if stem == "diagonal" else say(f"whatif.{o.name}")
 
 
-def _picture(outcomes: Sequence[Outcome], say: Say) -> Markup:
+def _picture(outcomes: Sequence[Forecast], say: Say) -> Markup:
     pairs = [Pair(_name(o, say), (o.before_mm * UM, o.u_before_mm * UM), (o.after_mm * UM, o.u_after_mm * UM)) for o in outcomes]
     names = (say("whatif.before"), say("whatif.after"))
     # The SVG writer has escaped every text; escaping again would show the reader the tags.

@@ -26,7 +26,7 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.core_link.logtail import keep_log
-from abbe.service.web.login.authentication import Door, Front
+from abbe.service.web.login.authentication import Authenticator, Front
 from abbe.service.web.login.connections import PatientProtocol
 from abbe.service.web.pages.rehearsal import Rehearsals
 from abbe.service.web.view import View
@@ -146,7 +146,7 @@ async def _serve(wire: Wire, begin: Begin, store: ServiceStore, listening: socke
     people.passwords.prepare()
     core = CoreLine(wire, clock)
     view = View(begin.machine, begin.version, core, store, core.next_due, begin.broker, clock, begin.control)
-    door = Door(store, people, AuditBook(store, begin.store_url), Front(begin.port, begin.behind_tls))
+    door = Authenticator(store, people, AuditBook(store, begin.store_url), Front(begin.port, begin.behind_tls))
     parts = Parts(
         core, store, begin.machine, begin.recipes, Rehearsals(begin.plan, begin.recipes, rules=begin.rules), begin.campaigns, begin.control
     )

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abbe.drivers.ballbar import frames
-from abbe.drivers.ballbar.frames import Ack, FrameDecoder, Info, Settings
+from abbe.drivers.ballbar.frames import Ack, BoxSettings, FrameDecoder, Info
 from abbe.drivers.laser import registers as laser
 from abbe.drivers.links.words import bytes_of, words_of
-from abbe.simulators.ballbar.device import Settings as BoxSettings
+from abbe.simulators.ballbar.device import Settings as DeviceSettings
 from abbe.simulators.ballbar.wire import Parser, encode_ack, encode_info, encode_settings
 
 u8, u16, u32, i32 = st.integers(0, 255), st.integers(0, 0xFFFF), st.integers(0, 2**32 - 1), st.integers(-(2**31), 2**31 - 1)
@@ -21,8 +21,8 @@ CONFIGURE = bytes.fromhex("A55A850C0600000040420F003CF6FFFFE3DC")
 
 
 def test_examples_of_the_protocol():
-    assert FrameDecoder().feed(SETTINGS) == [Settings(5, 1, frames.NANOMETRE, 1_000_000, 0)]
-    assert encode_settings(5, BoxSettings()) == SETTINGS
+    assert FrameDecoder().feed(SETTINGS) == [BoxSettings(5, 1, frames.NANOMETRE, 1_000_000, 0)]
+    assert encode_settings(5, DeviceSettings()) == SETTINGS
     assert frames.read_settings_command(5) == READ_SETTINGS
     assert frames.configure_command(6, frames.NANOMETRE, 1_000_000, -2500) == CONFIGURE
 
@@ -40,8 +40,8 @@ def test_ack(tag, command, result):
 
 @given(u16, st.integers(1, 255), st.booleans(), st.integers(1, 10_000_000), st.integers(-10_000_000, 10_000_000))
 def test_settings(tag, number, inch, range_nm, zero_nm):
-    frame = encode_settings(tag, BoxSettings(number, inch, range_nm * 1e-6, zero_nm * 1e-6))
-    assert FrameDecoder().feed(frame) == [Settings(tag, number, int(inch), range_nm, zero_nm)]
+    frame = encode_settings(tag, DeviceSettings(number, inch, range_nm * 1e-6, zero_nm * 1e-6))
+    assert FrameDecoder().feed(frame) == [BoxSettings(tag, number, int(inch), range_nm, zero_nm)]
 
 
 @given(u16, u16, u8, u32, i32)

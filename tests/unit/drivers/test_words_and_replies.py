@@ -13,7 +13,7 @@ from abbe.drivers.errors import WrongDevice
 from abbe.drivers.laser import registers as laser
 from abbe.drivers.links.identity import check_identity
 from abbe.drivers.links.modbus_reply import rtu_mismatch, tcp_mismatch
-from abbe.drivers.links.words import Block, Register, bytes_of, words_of
+from abbe.drivers.links.words import Register, RegisterBlock, bytes_of, words_of
 
 READ = bytes.fromhex("0007 0000 0006 01 03 0064 0002")
 WRITE = bytes.fromhex("0008 0000 000B 01 10 0064 0002 04 0001 0002")
@@ -21,7 +21,7 @@ WRITE = bytes.fromhex("0008 0000 000B 01 10 0064 0002 04 0001 0002")
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**31), 2**31 - 1), st.integers(-(2**15), 2**15 - 1), st.integers(0, 2**64 - 1))
 def test_signed_and_unsigned_words(i64, i32, i16, u64):
-    block = Block(10, 12, (Register(10, "i64", "A"), Register(14, "i32", "B"), Register(16, "i16", "C"), Register(18, "u64", "D")))
+    block = RegisterBlock(10, 12, (Register(10, "i64", "A"), Register(14, "i32", "B"), Register(16, "i16", "C"), Register(18, "u64", "D")))
     words = words_of(struct.pack(">qihxxQ", i64, i32, i16, u64))
     assert block.counts(words) == {"A": i64, "B": i32, "C": i16, "D": u64}
 
@@ -33,7 +33,7 @@ def test_words_and_bytes(words):
 
 def test_blocks_guard_their_edges():
     with pytest.raises(ValueError, match="outside"):
-        Block(10, 2, (Register(11, "u32", "X"),))
+        RegisterBlock(10, 2, (Register(11, "u32", "X"),))
     with pytest.raises(ValueError, match="18 registers"):
         laser.READING.counts((0,) * 17)
 

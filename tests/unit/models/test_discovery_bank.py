@@ -9,7 +9,7 @@ import pytest
 
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidates import Bank, bank_of, gain_of, rows_for, starts_of
-from abbe.models.discovery.whitened_problem import Scene, scene_of, taken_out
+from abbe.models.discovery.whitened_problem import WhitenedProblem, scene_of, taken_out
 from abbe.models.effects.catalogue import CATALOGUE
 from tests.physics.test_discovery_search import campaign
 
@@ -19,7 +19,7 @@ PICKS = [p for p in starts_of(CATALOGUE) if p.effect.name in NAMES]
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> WhitenedProblem:
     case = campaign(backlash_um=3.0)
     return scene_of(case, baseline_of(case))
 
@@ -33,7 +33,7 @@ def same(a: Bank, b: Bank) -> None:
         assert np.array_equal(x, y)
 
 
-def test_gains_of_a_bank_are_those_of_each_pick_alone(scene: Scene) -> None:
+def test_gains_of_a_bank_are_those_of_each_pick_alone(scene: WhitenedProblem) -> None:
     bank = bank_of(scene, PICKS)
     assert len(bank.parts) > 1
     assert {p.effect.name for p in bank.picks} == {"backlash", "cyclic_error", "lateral_play"}
@@ -44,12 +44,12 @@ def test_gains_of_a_bank_are_those_of_each_pick_alone(scene: Scene) -> None:
     assert gain_of(scene, PICKS[0], rows_for(scene, [])) > 100.0
 
 
-def test_what_another_bank_holds_is_not_made_again_and_is_the_same(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_another_bank_holds_is_not_made_again_and_is_the_same(scene: WhitenedProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = replace(scene, banks=type(scene.banks)())
     mixed = [*PICKS[7:60:3], *PICKS[:5], *(p for p in PICKS if p.effect.name == "dead_path")]
     fresh = bank_of(alone, mixed)
     held = bank_of(scene, PICKS)
-    monkeypatch.setattr(Scene, "white", None)  # nothing is whitened a second time
+    monkeypatch.setattr(WhitenedProblem, "white", None)  # nothing is whitened a second time
     found = bank_of(scene, mixed)
     assert np.concatenate(found.parts) == pytest.approx(np.concatenate(fresh.parts), rel=1e-5, abs=1e-7)
     assert found.moment == pytest.approx(fresh.moment, rel=1e-9, abs=1e-9)
@@ -58,7 +58,7 @@ def test_what_another_bank_holds_is_not_made_again_and_is_the_same(scene: Scene,
     same(bank_of(scene, PICKS), held)
 
 
-def test_another_scene_starts_without_banks(scene: Scene) -> None:
+def test_another_scene_starts_without_banks(scene: WhitenedProblem) -> None:
     bank = bank_of(scene, PICKS[:3])
     assert bank in scene.banks
     assert not taken_out(scene).banks

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from abbe.models.evaluation.iso230_2 import Approaches, ScaleBudget, positioning
-from abbe.models.evaluation.iso230_4 import Circle, both_ways, centred, circular
+from abbe.models.evaluation.iso230_4 import CircularTest, both_ways, centred, circular
 from abbe.models.evaluation.iso230_6 import FACE, diagonals
 
 ROOT2 = np.sqrt(2.0)
@@ -155,11 +155,11 @@ ANGLE = np.linspace(0.0, 2.0 * np.pi, 1441)[:-1]
 
 
 def test_centring_is_no_circular_deviation_and_an_ellipse_is():
-    one = circular(Circle(ANGLE, 0.003 + 0.02 * np.cos(ANGLE) - 0.01 * np.sin(ANGLE) + 0.005 * np.cos(2 * ANGLE)))
+    one = circular(CircularTest(ANGLE, 0.003 + 0.02 * np.cos(ANGLE) - 0.01 * np.sin(ANGLE) + 0.005 * np.cos(2 * ANGLE)))
     assert one.G_mm == pytest.approx(0.010, abs=1e-9)
     assert one.G_zone_mm == pytest.approx(0.010, abs=1e-9)
     assert one.centre_mm == pytest.approx((0.02, -0.01), abs=1e-12)
-    shifted = circular(Circle(ANGLE, 0.003 + 0.02 * np.cos(ANGLE)))
+    shifted = circular(CircularTest(ANGLE, 0.003 + 0.02 * np.cos(ANGLE)))
     assert (shifted.F_max_mm, shifted.F_min_mm) == pytest.approx((0.023, -0.017), abs=1e-9)  # about the set-up's centre: with the shift
     assert (one.F_max_centred_mm, one.F_min_centred_mm) == pytest.approx((0.008, -0.002), abs=1e-9)
     assert one.is_whole
@@ -170,7 +170,7 @@ def test_the_minimum_zone_is_never_wider_than_the_least_squares_one():
     for _ in range(5):
         y = sum(a * np.cos(k * ANGLE + b) for k, a, b in zip(range(1, 9), rng.normal(size=8), rng.uniform(0, 6, 8), strict=True))
         spike = np.where(np.abs(ANGLE - 2.0) < 0.05, 3.0, 0.0)
-        one = circular(Circle(ANGLE, y + spike))
+        one = circular(CircularTest(ANGLE, y + spike))
         assert one.G_zone_mm <= one.G_mm * (1.0 + 1e-9)
         tried = min(np.ptp(y + spike - a * np.cos(ANGLE) - b * np.sin(ANGLE)) for a, b in one.centre_mm + rng.normal(size=(400, 2)))
         assert one.G_zone_mm <= tried + 1e-6
@@ -179,7 +179,10 @@ def test_the_minimum_zone_is_never_wider_than_the_least_squares_one():
 def test_both_ways_lost_motion_is_hysteresis():
     """+2 µm on the way out, -2 µm on the way back, 1 µm of two-lobed form in both: H = 4, G(b) = 6, each path alone 2."""
     form = 0.001 * np.cos(2 * ANGLE)
-    there, back = Circle(ANGLE, 0.002 + form + 0.05 * np.cos(ANGLE)), Circle(ANGLE[::-1], (-0.002 + form + 0.05 * np.cos(ANGLE))[::-1])
+    there, back = (
+        CircularTest(ANGLE, 0.002 + form + 0.05 * np.cos(ANGLE)),
+        CircularTest(ANGLE[::-1], (-0.002 + form + 0.05 * np.cos(ANGLE))[::-1]),
+    )
     both = both_ways(there, back)
     assert both.H_mm == pytest.approx(0.004, abs=2e-6)
     assert both.G_b_mm == pytest.approx(0.006, abs=1e-9)
@@ -189,9 +192,9 @@ def test_both_ways_lost_motion_is_hysteresis():
 
 def test_arcs_that_share_nothing_are_refused_and_an_arc_is_no_circle():
     half = ANGLE[:500]
-    assert not circular(Circle(half, np.cos(3 * half))).is_whole
+    assert not circular(CircularTest(half, np.cos(3 * half))).is_whole
     with pytest.raises(ValueError, match="share no angle"):
-        both_ways(Circle(half, np.cos(3 * half)), Circle(half + np.pi, np.cos(3 * half)))
+        both_ways(CircularTest(half, np.cos(3 * half)), CircularTest(half + np.pi, np.cos(3 * half)))
 
 
 def test_the_worst_diagonal_counts_and_a_missing_one_is_named():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from abbe.models.solvers.observations import RunData
 from abbe.models.uncertainty.budget import budget_at, budget_over, worst_point
-from abbe.models.uncertainty.inputs import Inputs
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.mask import compensable_mask
 from abbe.models.uncertainty.prediction import Prediction
 from abbe.models.uncertainty.repeatability import machine_repeatability
@@ -131,4 +131,4 @@ def test_no_repeats_no_figure():
 )
 def test_inputs_without_sense_are_refused(wrong):
     with pytest.raises(ValueError, match="uncertainty inputs"):
-        Inputs(**wrong)
+        StatedInputs(**wrong)

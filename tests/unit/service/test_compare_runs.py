@@ -9,12 +9,12 @@ import pytest
 
 from abbe.service.rendering.document import Figure
 from abbe.service.runs.observations import run_data
-from abbe.service.verification.compare_runs import Loaded, against, curve, difference, figure_rows, remarks
+from abbe.service.verification.compare_runs import LoadedRun, against, curve, difference, figure_rows, remarks
 
 RADIUS = 100.0
 
 
-def circle(seed: int, bump_um: float = 0.0, *, reverse: bool = False, **setup: Any) -> Loaded:
+def circle(seed: int, bump_um: float = 0.0, *, reverse: bool = False, **setup: Any) -> LoadedRun:
     angle = np.linspace(0.0, 2 * np.pi, 400, endpoint=False)[:: -1 if reverse else 1]
     axes = np.column_stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), np.zeros(400)])
     rng = np.random.default_rng(seed)
@@ -23,7 +23,7 @@ def circle(seed: int, bump_um: float = 0.0, *, reverse: bool = False, **setup: A
     columns |= {"t_s": np.arange(400.0).tolist(), "deviation_mm": deviation.tolist()}
     known = {"setup_id": "A", "centre_mm": [0.0, 0.0, 0.0], "radius_mm": RADIUS, "plane": "XY"} | setup
     run = {"run_id": f"c{seed}", "test": "ballbar_circle", "setup": known, "columns": columns}
-    return Loaded(f"june/c{seed}", "mill-7", run, run_data(run), ())
+    return LoadedRun(f"june/c{seed}", "mill-7", run, run_data(run), ())
 
 
 def test_a_known_difference_is_found_where_it_is_whatever_the_sense() -> None:
@@ -48,10 +48,10 @@ def test_what_cannot_be_compared_says_why() -> None:
     one = circle(1)
     assert against(one, circle(2)) == ""
     other_plane = one.run | {"setup": one.run["setup"] | {"plane": "YZ"}}
-    assert "plane of june/c2 is YZ" in against(one, Loaded("june/c2", "mill-7", other_plane, one.data, ()))
-    assert "measured on machine lathe" in against(one, Loaded("june/c2", "lathe", one.run, one.data, ()))
+    assert "plane of june/c2 is YZ" in against(one, LoadedRun("june/c2", "mill-7", other_plane, one.data, ()))
+    assert "measured on machine lathe" in against(one, LoadedRun("june/c2", "lathe", one.run, one.data, ()))
     helix = one.run | {"test": "ballbar_helix"}
-    assert "only runs of one test" in against(one, Loaded("june/c2", "mill-7", helix, one.data, ()))
+    assert "only runs of one test" in against(one, LoadedRun("june/c2", "mill-7", helix, one.data, ()))
     moved = circle(2, centre_mm=[5.0, 0.0, 0.0])
     assert remarks([one, moved]) == ["june/c2 was measured elsewhere than june/c1 (centre_mm): the difference holds that too"]
     assert remarks([one, circle(5)]) == []
@@ -59,9 +59,9 @@ def test_what_cannot_be_compared_says_why() -> None:
 
 @pytest.mark.parametrize(("second", "u", "sure"), [(14.0, 1.0, True), (12.0, 1.0, False), (12.0, None, None)])
 def test_a_difference_of_figures_counts_both_uncertainties(second: float, u: float | None, sure: bool | None) -> None:
-    def of(value: float, own: float | None) -> Loaded:
+    def of(value: float, own: float | None) -> LoadedRun:
         one = circle(1)
-        return Loaded(
+        return LoadedRun(
             one.label,
             one.machine,
             one.run,

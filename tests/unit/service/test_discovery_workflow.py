@@ -17,7 +17,7 @@ import pytest
 
 from abbe.models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
 from abbe.service.campaign_data.campaign_folder import from_folder
-from abbe.service.discovery.discover import Job, Journal, discover, prepare
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
 from abbe.service.discovery.discovery_doc import finite
 from abbe.service.discovery.discovery_states import closed, entering, judge, not_entered, taken_back
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
@@ -46,7 +46,7 @@ def book(tmp_path: Path) -> Iterator[Store]:
         yield opened
 
 
-def job_of(folder: Path, store: Store | None = None) -> Job:
+def job_of(folder: Path, store: Store | None = None) -> DiscoveryJob:
     campaign = from_folder(folder)
     return prepare(campaign, catalogue(), None if store is None else current(store, campaign.site.name))
 
@@ -82,8 +82,8 @@ def test_states_follow_from_the_finding(folder: Path, book: Store, search: Searc
 
 def test_a_wrong_name_that_only_fits_is_not_proved(folder: Path) -> None:
     job = job_of(folder)
-    good = judge(discover(job, Journal(), Search(), ignore_progress))
-    bad = judge(discover(job, Journal(), Search(holds=False), ignore_progress))
+    good = judge(discover(job, DiscoveryJournal(), Search(), ignore_progress))
+    bad = judge(discover(job, DiscoveryJournal(), Search(holds=False), ignore_progress))
     assert (good["proved"], bad["proved"]) == (True, False)
     assert good["closed"] > 0.9
     assert bad["closed"] == pytest.approx(0.0, abs=1e-9)
@@ -100,7 +100,7 @@ def test_a_wrong_name_that_only_fits_is_not_proved(folder: Path) -> None:
 def test_a_name_that_is_taken_back_is_a_suspect_in_text_answer_and_page(folder: Path) -> None:
     """What the text takes back no script may read as a name; found by an older version and stored, it comes out alike."""
     job = job_of(folder)
-    bad = discover(job, Journal(), Search(holds=False), ignore_progress)
+    bad = discover(job, DiscoveryJournal(), Search(holds=False), ignore_progress)
     for told in (bad, bad["answer"]):
         assert (told["verdict"], told["effects"], told["proved"]) == ("unknown", [], False)
         assert [e["name"] for e in told["suspects"]] == ["backlash"]
@@ -117,11 +117,11 @@ def test_a_name_that_is_taken_back_is_a_suspect_in_text_answer_and_page(folder: 
 
 
 def test_the_answer_says_what_is_proved_and_by_which_rule(folder: Path) -> None:
-    answer = discover(job_of(folder), Journal(), Search(), ignore_progress)["answer"]
+    answer = discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress)["answer"]
     assert (answer["verdict"], answer["proved"]) == ("named", True)
     assert answer["proof"] == "at least 50% of the gap closes on the runs that judge"
     assert [e["proved"] for e in answer["effects"]] == [True]
-    assert discover(job_of(folder), Journal(), Search("none"), ignore_progress)["answer"]["proved"] is False
+    assert discover(job_of(folder), DiscoveryJournal(), Search("none"), ignore_progress)["answer"]["proved"] is False
 
 
 def variant(finding: dict[str, Any], **changes: Any) -> dict[str, Any]:
@@ -131,15 +131,15 @@ def variant(finding: dict[str, Any], **changes: Any) -> dict[str, Any]:
 
 
 def test_noise_that_is_named_does_not_excuse_a_name_beside_it(folder: Path) -> None:
-    wrong = discover(job_of(folder), Journal(), Search(holds=False), ignore_progress)
+    wrong = discover(job_of(folder), DiscoveryJournal(), Search(holds=False), ignore_progress)
     assert judge(wrong)["proved"] is judge(variant(wrong))["proved"] is False
-    right = variant(discover(job_of(folder), Journal(), Search(), ignore_progress))
+    right = variant(discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress))
     assert judge(right)["proved"] is True
     assert [e["label"] for e in entering(right)] == ["backlash:X"]
 
 
 def test_each_effect_has_to_be_needed_and_nothing_nameless_may_share_in_what_closes(folder: Path) -> None:
-    found = discover(job_of(folder), Journal(), Search(), ignore_progress)
+    found = discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress)
     assert not_entered(found, judge(found)) is None
     second = found["effects"][0] | {"label": "cyclic_error:Y", "alternatives": []}
     for needed, why in ((1.3, None), (1.0, "the runs that judge do not need cyclic_error:Y"), (None, None)):
@@ -150,7 +150,7 @@ def test_each_effect_has_to_be_needed_and_nothing_nameless_may_share_in_what_clo
 
 
 def test_scatter_is_told_without_a_gap_that_it_cannot_close(folder: Path) -> None:
-    finding = discover(job_of(folder), Journal(), Search(), ignore_progress)
+    finding = discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress)
     scatter = variant(finding, alternatives=[])["effects"][1:]
     alone = finding | {"effects": scatter, "next_test": None, "confounded_with": []}
     told = "\n".join(lines_of(alone))
@@ -195,7 +195,7 @@ def changed(search: Search, **changes: Any) -> Any:
 def test_runs_that_were_never_fitted_are_asked_before_nothing_is_said_to_be_missing(
     folder: Path, agreement: tuple[Agreement, ...], unjudged: tuple[Unjudged, ...], sign: str, words: str
 ) -> None:
-    journal = Journal()
+    journal = DiscoveryJournal()
     finding = discover(job_of(folder), journal, changed(Search("none"), agreement=agreement, unjudged=unjudged), ignore_progress)
     told = verdict_of(finding)
     assert told[0] == sign
@@ -207,7 +207,7 @@ def test_runs_that_were_never_fitted_are_asked_before_nothing_is_said_to_be_miss
 
 def test_what_could_not_be_seen_is_told_where_nothing_is_missing(folder: Path) -> None:
     slow = Unseen("what grows with the feed looks like geometry", "all ball-bar runs have one feed", "second_feed")
-    finding = discover(job_of(folder), Journal(), changed(Search("none"), unseen=(slow,)), ignore_progress)
+    finding = discover(job_of(folder), DiscoveryJournal(), changed(Search("none"), unseen=(slow,)), ignore_progress)
     (line,) = next_of(finding)
     assert line.startswith("could not be seen: what grows with the feed looks like geometry, because all ball-bar runs have one feed")
     assert line.endswith("what would show it: the same path at a second feed")
@@ -217,7 +217,7 @@ def test_what_could_not_be_seen_is_told_where_nothing_is_missing(folder: Path) -
 
 def test_what_has_no_name_gets_a_proposal_like_a_name(folder: Path) -> None:
     test = NextTest(("longer_session",), ("something of the machine", "something of that session"), None, 150.0, "run r02 again, later")
-    finding = discover(job_of(folder), Journal(), changed(Search("unknown"), next_test=test), ignore_progress)
+    finding = discover(job_of(folder), DiscoveryJournal(), changed(Search("unknown"), next_test=test), ignore_progress)
     first, why = next_of(finding)
     assert first == (
         "measure next: a repeat late in the session to tell something of the machine from something of that session (about 150 min)"
@@ -228,20 +228,20 @@ def test_what_has_no_name_gets_a_proposal_like_a_name(folder: Path) -> None:
 
 def test_kin_that_explains_nearly_all_but_costs_more_is_listed_with_its_odds(folder: Path) -> None:
     """It lies 25 behind by its price: no headline, but no reader may miss it."""
-    finding = discover(job_of(folder), Journal(), Search(ahead=25.0), ignore_progress)
+    finding = discover(job_of(folder), DiscoveryJournal(), Search(ahead=25.0), ignore_progress)
     assert finding["confounded_with"] == []
     (line,) = rival_lines(finding["effects"][0])
     assert line.endswith("(10^11 times less likely, but slightly bent it would look the same)")
     assert any(line in told for told in lines_of(finding))
     page = discovery_page(finding, from_folder(folder).runs, {}, {"title": "", "flags": [], "states": [], "provenance": {}})
     assert page.effects[0].rivals == [line]
-    near = discover(job_of(folder), Journal(), Search(ahead=4.2), ignore_progress)
+    near = discover(job_of(folder), DiscoveryJournal(), Search(ahead=4.2), ignore_progress)
     assert rival_lines(near["effects"][0])[0].endswith("(67 times less likely)")
 
 
 def test_runs_whose_readings_are_all_flagged_judge_nothing(folder: Path) -> None:
     gaps = {"identify": Gap(3e-3, 3e-4, 3e-4), "holdout": Gap(float("nan"), float("nan"), 3e-4)}
-    finding = discover(job_of(folder), Journal(), gapped(Search(), **gaps), ignore_progress)
+    finding = discover(job_of(folder), DiscoveryJournal(), gapped(Search(), **gaps), ignore_progress)
     assert list(finding["gaps"]) == ["identify"]
     assert judge(finding)["rule"] == "no run of this campaign only judges"
     for run in folder.glob("r03.json"):
@@ -295,7 +295,7 @@ def test_the_same_search_is_found_again_and_not_done_twice(folder: Path, book: S
     assert len(book.discoveries()) == len(book.models()) == 1
 
 
-def edited(folder: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> Job:
+def edited(folder: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> DiscoveryJob:
     """The campaign with one of its files changed."""
     doc = json.loads((folder / name).read_text())
     change(doc)
@@ -340,7 +340,7 @@ def test_another_code_under_the_same_name_is_another_search(folder: Path, monkey
 
 def test_states_keep_their_order(folder: Path, book: Store) -> None:
     with pytest.raises(ValueError, match="TESTING cannot follow None"):
-        Journal().write("TESTING", {})
+        DiscoveryJournal().write("TESTING", {})
     job = job_of(folder)
     one, other = journal_of(book, job), journal_of(book, job)
     assert one.id == other.id

@@ -13,7 +13,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation.rollback import known_images, table_after
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import StoreBook, read_entries
-from abbe.service.push.entries import Entry
+from abbe.service.push.entries import JournalEntry
 from abbe.service.push.states import S
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import ended_as, last_kept, pushes_of
@@ -28,7 +28,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
         yield opened
 
 
-def journal(store: Store, states: tuple[S, ...], accepted: bytes) -> list[Entry]:
+def journal(store: Store, states: tuple[S, ...], accepted: bytes) -> list[JournalEntry]:
     """A push that ended so, and a person's word after it."""
 
     async def write() -> None:

@@ -18,7 +18,7 @@ from abbe.service.report.report_measured import Measured, run_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.helix_axis import helix_axis
 from abbe.service.runs.observations import run_data
-from abbe.service.verification.compare_runs import Loaded, against, curve
+from abbe.service.verification.compare_runs import LoadedRun, against, curve
 from tests.scenarios.campaign_files import measured
 
 CENTRE = np.array([300.0, 250.0, 200.0])
@@ -52,8 +52,8 @@ def drawn(run: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> tuple[Documen
     return run_report(Measured(Campaign("june", site, [run], None, {})), run["run_id"], Rules()), seen
 
 
-def compared(run: dict[str, Any]) -> Loaded:
-    return Loaded(f"june/{run['run_id']}", "mill-7", run, run_data(run), ())
+def compared(run: dict[str, Any]) -> LoadedRun:
+    return LoadedRun(f"june/{run['run_id']}", "mill-7", run, run_data(run), ())
 
 
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])

@@ -16,7 +16,7 @@ from sqlalchemy import event
 
 from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder
-from abbe.service.discovery.discover import Job, discover, prepare
+from abbe.service.discovery.discover import DiscoveryJob, discover, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current, revert
@@ -47,7 +47,7 @@ def pair(url: str) -> Iterator[tuple[Store, Store]]:
         yield one, other
 
 
-def job_of(folder: Path, store: Store) -> Job:
+def job_of(folder: Path, store: Store) -> DiscoveryJob:
     return prepare(from_folder(folder), catalogue(), current(store, NAME))
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from abbe.drivers.cnc.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
-from abbe.models.solvers.in_force import InForce
+from abbe.models.solvers.in_force import AppliedTables
 from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder, from_store
 from abbe.service.compensation.proposals import check_same_table
@@ -21,7 +21,7 @@ from abbe.service.discovery.discover import prepare
 from abbe.service.discovery.simulate import simulate
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
-from abbe.service.identification.table_removal import NO_TABLE, STAYS, TABLE_OUT, Taken, as_left, less, table_line, table_then
+from abbe.service.identification.table_removal import NO_TABLE, STAYS, TABLE_OUT, RemovedTable, as_left, less, table_line, table_then
 from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
@@ -44,7 +44,7 @@ def steps() -> np.ndarray:
     return np.vstack([np.zeros(3), np.cumsum(moves, axis=0)])
 
 
-OUT = Taken(InForce(correction, LOST), InForce(correction))
+OUT = RemovedTable(AppliedTables(correction, LOST), AppliedTables(correction))
 
 
 def run(axes: np.ndarray, reading: np.ndarray, kind: str, **setup: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 from abbe.service.campaign_data import decimation as module
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.campaign_data.decimation import picked, thinned, thinning
-from abbe.service.discovery.discover import Journal, discover, prepare
+from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.rendering.discovery_page import render_discovery
@@ -127,7 +127,7 @@ def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, m
     folder = write_case(tmp_path / "c1")
     monkeypatch.setattr(module, "MOST_READINGS", 200)
     job = prepare(from_folder(folder), catalogue())
-    journal = Journal()
+    journal = DiscoveryJournal()
     finding = discover(job, journal, Search("none"), ignore_progress)
     assert job.thinning is not None
     assert set(job.thinning.lines) <= set(job.flags)  # `abbe discover` prints every flag
@@ -143,7 +143,7 @@ def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, m
 
 def test_a_short_campaign_says_nothing_of_it(tmp_path: Path) -> None:
     job = prepare(from_folder(write_case(tmp_path / "c1")), catalogue())
-    finding = discover(job, Journal(), Search("none"), ignore_progress)
+    finding = discover(job, DiscoveryJournal(), Search("none"), ignore_progress)
     assert job.thinning is None
     assert "thinning" not in finding["answer"]
     assert not any("readings are more than" in line for line in job.flags)

@@ -11,16 +11,18 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from abbe.models.verification import Figure
+from abbe.models.verification import VerificationFigure
 from abbe.service.compensation import correct
-from abbe.service.compensation.pushing import Pushed
+from abbe.service.compensation.pushing import PushResult
 from abbe.service.errors import StoreError
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
-from abbe.service.verification.verify import DIAGONALS, Decision, Figures
+from abbe.service.verification.verify import DIAGONALS, VerificationDecision, VerificationFigures
 
 NONE = np.zeros(0)
-AFTER = Figures({name: Figure(0.004, 0.001, NONE, NONE) for name in DIAGONALS}, Figure(0.002, 0.001, NONE, NONE))
+AFTER = VerificationFigures(
+    {name: VerificationFigure(0.004, 0.001, NONE, NONE) for name in DIAGONALS}, VerificationFigure(0.002, 0.001, NONE, NONE)
+)
 WORDS = {True: "the table is kept and in force: as decided", False: "the table is taken back: as decided"}
 
 
@@ -43,9 +45,9 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
 
             def __init__(self, *_: object, **__: object) -> None: ...
 
-            async def bring(self, *_: object) -> Pushed:
-                work.after, work.decision, work.verified_as = AFTER, Decision(kept, "as decided"), "verify-after-push-1"
-                return Pushed(1, 1, 1, 7, 0, 5, kept, "as decided", ())
+            async def bring(self, *_: object) -> PushResult:
+                work.after, work.decision, work.verified_as = AFTER, VerificationDecision(kept, "as decided"), "verify-after-push-1"
+                return PushResult(1, 1, 1, 7, 0, 5, kept, "as decided", ())
 
         held = SimpleNamespace(by="anna", approval=lambda clock: None)
         work = Work(cast("Any", bench), cast("Any", held), None, None, AFTER)

@@ -28,7 +28,7 @@ from abbe.service.rendering.document import Document
 from abbe.service.report.report import numbered_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler import record
-from abbe.service.scheduler.fleet import Stand, stands
+from abbe.service.scheduler.fleet import MachineStatus, stands
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.verification.verified_by import STRANGE, VerifiedBy, verified_by
@@ -80,7 +80,7 @@ class World:
     def known(self) -> VerifiedBy:
         return verified_by(self.store, "mill-7")
 
-    def fleet(self) -> Stand:
+    def fleet(self) -> MachineStatus:
         return stands(self.store, datetime.now(UTC))[0]
 
     def _view(self) -> View:

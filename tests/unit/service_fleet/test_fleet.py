@@ -18,7 +18,7 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import Event
 from abbe.service.cli import run
-from abbe.service.scheduler.fleet import HEADINGS, Stand, fleet, row, stands, state_of
+from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, row, stands, state_of
 from abbe.service.scheduler.heartbeat import SILENT_AFTER, Station
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
@@ -88,7 +88,9 @@ def test_the_list_of_a_history(url: str, capsys: pytest.CaptureFixture[str]) -> 
         store.put_station("new-4", {"state": "waiting", "due": []})
         one, two, three, new = fleet(store, now)
         standing = stands(store, now)
-    assert standing == [Stand(**{field.name: getattr(line, field.name) for field in fields(Stand)}) for line in (one, two, three, new)]
+    assert standing == [
+        MachineStatus(**{field.name: getattr(line, field.name) for field in fields(MachineStatus)}) for line in (one, two, three, new)
+    ]
     assert (one.state, one.verdict, one.next_due_utc, one.next_recipe) == ("waiting", "pass", due[1]["due_utc"], "quick-check")
     assert [(f.name, f.expanded, f.limit) for f in one.figures] == [("body_diagonal_um", 1.1, 20.0), ("helix_rms_um", 0.2, 5.0)]
     assert one.check_utc == (START + timedelta(days=29)).isoformat()

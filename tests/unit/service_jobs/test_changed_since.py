@@ -20,7 +20,7 @@ from abbe.models.discovery.changed import comparison as changed
 from abbe.service.campaign_data.campaign_folder import from_store, keep
 from abbe.service.discovery.changed_since import since_of
 from abbe.service.discovery.changed_words import changed_lines, changed_words
-from abbe.service.discovery.discover import Journal, discover, prepare
+from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import solution_doc
@@ -252,7 +252,7 @@ def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path
     campaign = from_store(store, "july")
     job = prepare(campaign, catalogue(), None, since=since_of(store, campaign))
     assert job.digest == prepare(campaign, catalogue(), None).digest, "a solution that comes later makes no other search of it"
-    journal = Journal()
+    journal = DiscoveryJournal()
     search = Search("none")
     finding = discover(job, journal, search, lambda _: None)
     assert finding["changed"]["since"] == 1

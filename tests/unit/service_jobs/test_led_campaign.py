@@ -22,7 +22,7 @@ from abbe.service.cli.measure import _plan
 from abbe.service.clock import SystemClock
 from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
-from abbe.service.jobs.guided_campaign import Led
+from abbe.service.jobs.guided_campaign import CampaignOutcome
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes.recipe import Helix, Linear
@@ -132,7 +132,7 @@ async def test_an_answer_that_is_no_is_the_end_s_text(monkeypatch: pytest.Monkey
     monkeypatch.setattr(work, "_measured", measured)
     monkeypatch.setattr(work, "made_of", refuse)
     led = await work.led_campaign(pretended(), {}, "bob")
-    assert led == Led("ended", f"no proposal: {no}; campaign 'full 1' stays, and `abbe solve` shows what it says")
+    assert led == CampaignOutcome("ended", f"no proposal: {no}; campaign 'full 1' stays, and `abbe solve` shows what it says")
 
 
 async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,7 +146,7 @@ async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypat
     monkeypatch.setattr(work, "_measured", measured)
     monkeypatch.setattr(work, "made_of", made)
     led = await work.led_campaign(pretended(), {}, "bob")
-    assert led == Led("ended", "proposal 3 cannot be approved: LIMITS: too much; STALE", 2, 3)
+    assert led == CampaignOutcome("ended", "proposal 3 cannot be approved: LIMITS: too much; STALE", 2, 3)
     assert seen == ["full 1 by bob"]
 
 

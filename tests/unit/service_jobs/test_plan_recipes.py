@@ -12,7 +12,7 @@ from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
-from abbe.models.planning.plan import Step
+from abbe.models.planning.plan import PlanStep
 from abbe.service.campaigns.plan import plan_for, plan_page, recipe_of, words
 from abbe.service.campaigns.plan_instruments import read_instruments
 from abbe.service.cli.app import app
@@ -98,7 +98,7 @@ def test_the_sequencer_moves_where_the_planner_thinks_and_takes_as_long(planned)
 
 @pytest.mark.parametrize("test", [DiagonalTest("pnp", "YZX"), DiagonalTest("ppp", ""), LineTest(1, (0.1, 0.9)), LineTest(2, (0.5, 0.5))])
 def test_laser_positions_are_those_of_the_sequencer(test):
-    plan = recipe_of(Step("a", "S1", test, 0.0, 0.0, 0.0, 0.0), Instruments()).plan(MACHINE)
+    plan = recipe_of(PlanStep("a", "S1", test, 0.0, 0.0, 0.0, 0.0), Instruments()).plan(MACHINE)
     moves = [s.target_mm for s in plan.steps if isinstance(s, MoveTo)][1:]
     path, beam = laser_path(MACHINE, test)
     kept = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > 0]]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from abbe.models.verification import Figure
+from abbe.models.verification import VerificationFigure
 from abbe.service.errors import TableRefused
-from abbe.service.verification.verify import Figures, check_before, decide, judge, overall
+from abbe.service.verification.verify import VerificationFigures, check_before, decide, judge, overall
 
 NONE = np.zeros(0)
 
@@ -13,12 +13,14 @@ NONE = np.zeros(0)
 AIR = (20.0, 20.4)
 
 
-def figures(ppp: float, others: float = 5.0, helix: float | None = 5.0, u: float = 0.5, u_helix: float = 0.5, air=AIR, crc=(7,)) -> Figures:
-    def figure(um: float, u: float = u) -> Figure:
-        return Figure(um * 1e-3, u * 1e-3, NONE, NONE)
+def figures(
+    ppp: float, others: float = 5.0, helix: float | None = 5.0, u: float = 0.5, u_helix: float = 0.5, air=AIR, crc=(7,)
+) -> VerificationFigures:
+    def figure(um: float, u: float = u) -> VerificationFigure:
+        return VerificationFigure(um * 1e-3, u * 1e-3, NONE, NONE)
 
     diagonals = {"ppp": figure(ppp)} | {k: figure(others) for k in ("npp", "pnp", "ppn")}
-    return Figures(diagonals, None if helix is None else figure(helix, u_helix), air, frozenset(crc))
+    return VerificationFigures(diagonals, None if helix is None else figure(helix, u_helix), air, frozenset(crc))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from abbe.service.rendering.plots.comparison import Comparison, comparison_plot
 from abbe.service.rendering.plots.contours import contour_plot, level_lines
 from abbe.service.rendering.plots.deformed import deformed_grid
 from abbe.service.rendering.plots.facets import Surface, lobing_plot, surface_plot
-from abbe.service.rendering.plots.isometric import VIEW, Paper, Window, depth
+from abbe.service.rendering.plots.isometric import VIEW, Paper, ViewWindow, depth
 from abbe.service.rendering.plots.signed import SignedScale
 
 
@@ -59,7 +59,7 @@ def test_the_scale_holds_all_values():
 def test_isometric_view_is_a_rotation_and_the_box_fits():
     assert np.allclose(VIEW @ VIEW.T, np.eye(3))
     low, high = np.array([0.0, -5.0, 2.0]), np.array([10.0, 5.0, 4.0])
-    paper = Paper.around(low, high, Window((50.0, 60.0), 80.0, 90.0))
+    paper = Paper.around(low, high, ViewWindow((50.0, 60.0), 80.0, 90.0))
     corners = np.array([paper(np.array([a, b, c])) for a in (0, 10) for b in (-5, 5) for c in (2, 4)])
     assert np.ptp(corners, axis=0) == pytest.approx([80.0, min(90.0, np.ptp(corners[:, 1]))])
     assert depth(np.array([[1.0, 0, 0]])) > depth(np.array([[0.0, 1, 0]]))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from abbe.service.papers.row import Row
+from abbe.service.papers.row import PaperRow
 from abbe.service.papers.run import TITLES, results
 
 
@@ -11,7 +11,7 @@ def everything():
     return {found.paper: found for found in results()}
 
 
-def one(found, where: str, quantity: str) -> Row:
+def one(found, where: str, quantity: str) -> PaperRow:
     (hit,) = [r for r in found.rows if r.where == where and r.quantity == quantity]
     return hit
 

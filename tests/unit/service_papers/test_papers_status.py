@@ -6,17 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abbe.service.papers.check import Check
+from abbe.service.papers.check import PaperCheck
 from abbe.service.papers.compare import Computed, agrees, computed_from
 from abbe.service.papers.printed import Printed
-from abbe.service.papers.row import Erratum, Row
+from abbe.service.papers.row import Erratum, PaperRow
 from abbe.service.papers.words import check_lines, digits_like, lines, note
 
 
-def row(text: str, computed: float | None, **more) -> Row:
+def row(text: str, computed: float | None, **more) -> PaperRow:
     allowance = more.pop("allowance", 0.0)
     value = None if computed is None else Computed(computed, allowance)
-    return Row("yang", "Table 0", "q", "µm", Printed(text, bound=more.pop("bound", False)), value, "how", "why", **more)
+    return PaperRow("yang", "Table 0", "q", "µm", Printed(text, bound=more.pop("bound", False)), value, "how", "why", **more)
 
 
 @pytest.mark.parametrize(
@@ -59,11 +59,11 @@ def test_status_follows_the_numbers():
 
 
 def test_status_cannot_be_typed_in():
-    assert "status" not in {f.name for f in dataclasses.fields(Row)}
+    assert "status" not in {f.name for f in dataclasses.fields(PaperRow)}
     with pytest.raises(ValueError, match="nobody says why"):
-        Row("yang", "Table 0", "q", "µm", Printed("1"))
+        PaperRow("yang", "Table 0", "q", "µm", Printed("1"))
     with pytest.raises(ValueError, match="nobody says from what"):
-        Row("yang", "Table 0", "q", "µm", Printed("1"), Computed(1.0))
+        PaperRow("yang", "Table 0", "q", "µm", Printed("1"), Computed(1.0))
     with pytest.raises(ValueError, match="computed all the same"):
         row("1", 1.0, given=True)
 
@@ -88,22 +88,22 @@ def test_a_bound_speaks_of_a_size_and_is_a_rounded_number_itself():
 
 def test_padded_zeros_make_a_row_consistent_at_most_and_say_so():
     number = Printed("4.240e-2", digits=3, padding="all end in 0")
-    padded = Row("kwon", "Table 0", "q", "", number, Computed(4.2385e-2), "how")
+    padded = PaperRow("kwon", "Table 0", "q", "", number, Computed(4.2385e-2), "how")
     assert padded.status == "consistent"
     assert padded.remark == "only if all end in 0"
     assert padded.doc()["padding_because"] == "all end in 0"
     assert padded.doc()["within"] == pytest.approx(5e-5)
     assert "only if all end in 0" in note(padded)
-    assert Row("kwon", "Table 0", "q", "", number, Computed(4.2404e-2), "how").status == "reproduced"
-    assert Row("kwon", "Table 0", "q", "", number, Computed(4.2451e-2), "how").status == "differs"
+    assert PaperRow("kwon", "Table 0", "q", "", number, Computed(4.2404e-2), "how").status == "reproduced"
+    assert PaperRow("kwon", "Table 0", "q", "", number, Computed(4.2451e-2), "how").status == "differs"
 
 
 def test_padding_of_an_operand_is_told_from_its_rounding():
     operand = Printed("1.20", digits=2, padding="it ends in 0")
     found = computed_from(lambda a: 10.0 * a, operand)
     assert (found.allowance, found.allowance_if_padded) == pytest.approx((0.05, 0.5))
-    assert Row("kwon", "Table 0", "q", "", Printed("12.30"), found, "how").remark == "only if it ends in 0"
-    by_it = Row("kwon", "Table 0", "q", "", Printed("12.30"), Computed(13.0), "how", erratum=Erratum("slip", found))
+    assert PaperRow("kwon", "Table 0", "q", "", Printed("12.30"), found, "how").remark == "only if it ends in 0"
+    by_it = PaperRow("kwon", "Table 0", "q", "", Printed("12.30"), Computed(13.0), "how", erratum=Erratum("slip", found))
     assert by_it.explained is False
     assert by_it.gap == "explained by the erratum only if it ends in 0"
 
@@ -133,7 +133,7 @@ def test_a_series_is_one_line_and_shows_its_worst():
 
 @pytest.mark.parametrize(("found", "status"), [(1.019, "holds"), (0.981, "holds"), (1.021, "fails"), (float("nan"), "fails")])
 def test_a_check_holds_inside_its_bound_only(found, status):
-    check = Check("yang", "8", "q", "µrad", 1.0, found, 0.02, "how", "why", "s")
+    check = PaperCheck("yang", "8", "q", "µrad", 1.0, found, 0.02, "how", "why", "s")
     assert check.status == status
     assert check.doc()["status"] == status
     assert [line[5] for line in check_lines([check])] == [status]

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from abbe.service.errors import StoreError
-from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, Figure, Running, TableInForce
+from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, PlantFigure, Running, TableInForce
 from tests.patience import within
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -17,7 +17,7 @@ RUNNING = Running("weekly", "quick-check", NOON, "helix", "revolution 3 of 10", 
 
 def check(number: int, verdict: str = "pass", **figures: float | None) -> Check:
     chosen = figures or {"body_diagonal_um": 11.8, "helix_rms_um": 1.4}
-    rows = tuple(Figure(key, value, 1.1, 20.0) for key, value in chosen.items())
+    rows = tuple(PlantFigure(key, value, 1.1, 20.0) for key, value in chosen.items())
     return Check(number, "weekly", "quick-check", NOON - timedelta(hours=100 - number), 61.0, verdict, f"check {number}: {verdict}", rows)
 
 

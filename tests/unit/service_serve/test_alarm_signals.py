@@ -14,7 +14,7 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
-from abbe.service.compensation.push_approved import Outcome
+from abbe.service.tables.push_outcome import PushOutcome
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
@@ -27,8 +27,8 @@ from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import PushEntryRecord, VerificationRecord
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Kind
-from abbe.service.verification.alarms import Terms, acknowledge, alarms_of, found_in, open_alarms, series_begins
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
+from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, open_alarms, series_begins
 from tests.unit.service_serve.fakes import FakeClock, FakeWatcher, Result, utc
 
 START = utc(2026, 3, 1, 5)
@@ -50,7 +50,7 @@ def records(*results: Result, recipe: str = "quick-check") -> list[VerificationR
 
 
 def kinds(*results: Result, **terms: Any) -> set[tuple[str, str]]:
-    return {(s.figure, s.kind) for s in found_in(records(*results), Terms("quick-check", **terms)).signals}
+    return {(s.figure, s.kind) for s in found_in(records(*results), AlarmTerms("quick-check", **terms)).signals}
 
 
 def test_above_the_limit_by_more_than_its_uncertainty() -> None:
@@ -64,7 +64,7 @@ def test_a_jump_among_few_checks_is_more_than_uncertainty_and_worth_a_look() -> 
     loose = {"uncertainties": {"body_diagonal_um": 4.0, "helix_rms_um": 0.2}}
     assert kinds(result(0, **loose), result(1, 15.0, **loose)) == set()  # U of the difference 5.7
     assert kinds(result(0, 15.0), result(1, 9.0)) == set()  # better
-    (signal,) = found_in(records(result(0), result(1, 15.0)), Terms("quick-check")).signals
+    (signal,) = found_in(records(result(0), result(1, 15.0)), AlarmTerms("quick-check")).signals
     assert signal.text == "worst body diagonal 15.0 ± 1.0 µm (U, k = 2) is +6.0 ± 1.4 µm from the checks before"
 
 
@@ -84,7 +84,7 @@ def test_a_drift_is_found_long_before_the_limit_and_warned_of_by_days(drifting: 
     assert kinds(*drifting[:40]) == set()
     assert kinds(*drifting) == {("body_diagonal_um", "drift")}  # by the worse end of the interval 15 days or more are left
     assert kinds(*drifting, warn_days=30.0) == {("body_diagonal_um", "drift"), ("body_diagonal_um", "days")}
-    found = {s.kind: s.text for s in found_in(records(*drifting), Terms("quick-check", warn_days=30.0)).signals}
+    found = {s.kind: s.text for s in found_in(records(*drifting), AlarmTerms("quick-check", warn_days=30.0)).signals}
     assert "drifts up since 2026-0" in found["drift"]
     assert found["days"].startswith("worst body diagonal reaches its limit of 20 µm in 1")
     assert "(95 %)" in found["days"]
@@ -97,8 +97,8 @@ def test_a_new_table_begins_a_new_series(drifting: list[Result]) -> None:
 
 def test_other_recipes_and_checks_that_cannot_be_judged_say_nothing() -> None:
     verification = records(result(1, 50.0), recipe="verification")
-    assert found_in(verification, Terms("quick-check")).judged is False
-    hot = found_in(records(result(0), result(1, 50.0, comparable=False)), Terms("quick-check"))
+    assert found_in(verification, AlarmTerms("quick-check")).judged is False
+    hot = found_in(records(result(0), result(1, 50.0, comparable=False)), AlarmTerms("quick-check"))
     assert (hot.judged, hot.signals) == (False, ())
     assert kinds(result(0), result(1, 30.0, comparable=False), result(2)) == set()
 
@@ -118,10 +118,10 @@ class Bench:
             self.asked.append(one)
             if self.trouble is not None:
                 raise self.trouble
-            await note(Kind.ENDED, {"text": "no proposal: the tables promise too little"})
+            await note(AlarmKind.ENDED, {"text": "no proposal: the tables promise too little"})
 
-        async def push_one(order: Any) -> Outcome:
-            return Outcome("kept", "better")
+        async def push_one(order: Any) -> PushOutcome:
+            return PushOutcome("kept", "better")
 
         duties = Duties(14.0, "identification", look_into, push_one if push else None)
         self.desk = AlarmManager(store, self.clock, "mill-7", [DAILY], duties, telling)

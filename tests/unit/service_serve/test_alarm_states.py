@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abbe.service.verification.alarm_states import Alarm, Found, Kind, Signal, after_check, folded, is_open, next_step
+from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, Signal, after_check, folded, is_open, next_step
 
 RECIPE = "quick-check"
 SIGNAL = Signal("helix_rms_um", "limit", 8.8, 0.2, 7.0, "helix rms 8.8 ± 0.2 µm (U, k = 2) is above its limit of 7 µm")
-BAD = Found(True, "fail", (SIGNAL,))
-GOOD = Found(True, "pass")
-UNSURE = Found(True, "cannot tell")
-NOT_MEASURED = Found(False, "cannot tell")
+BAD = FiredRule(True, "fail", (SIGNAL,))
+GOOD = FiredRule(True, "pass")
+UNSURE = FiredRule(True, "cannot tell")
+NOT_MEASURED = FiredRule(False, "cannot tell")
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Book:
     def active(self) -> Alarm | None:
         return next((a for a in reversed(self.alarms) if a.active), None)
 
-    def add(self, number: int | None, kind: Kind, **doc: Any) -> None:
+    def add(self, number: int | None, kind: AlarmKind, **doc: Any) -> None:
         number = number or max((line.alarm for line in self.lines), default=0) + 1
         seq = max((line.seq for line in self.lines if line.alarm == number), default=-1) + 1
         self.lines.append(Line(number, seq, str(kind), doc, f"2026-11-22T00:00:{len(self.lines):02d}Z"))
 
-    def check(self, found: Found) -> Kind | None:
+    def check(self, found: FiredRule) -> AlarmKind | None:
         now = self.active
         kind = after_check(now, found)
         if kind is not None:
@@ -56,26 +56,26 @@ class Book:
         return kind
 
     def acknowledge(self, name: str = "otto") -> None:
-        self.add(self.alarms[-1].number, Kind.ACKNOWLEDGED, name=name)
+        self.add(self.alarms[-1].number, AlarmKind.ACKNOWLEDGED, name=name)
 
 
 def test_the_life_of_an_alarm() -> None:
     book = Book()
     assert [book.check(f) for f in (GOOD, UNSURE, NOT_MEASURED)] == [None, None, None]
-    assert book.check(BAD) is Kind.RAISED
+    assert book.check(BAD) is AlarmKind.RAISED
     assert book.alarms[0].word == "raised"
     assert book.check(NOT_MEASURED) is None
-    assert book.check(UNSURE) is Kind.HELD  # too near to the limit to say that it is over
+    assert book.check(UNSURE) is AlarmKind.HELD  # too near to the limit to say that it is over
     book.acknowledge()
     assert book.alarms[0].word == "acknowledged"
-    assert book.check(BAD) is Kind.HELD
+    assert book.check(BAD) is AlarmKind.HELD
     assert book.alarms[0].word == "acknowledged"
-    assert book.check(GOOD) is Kind.CLEARED
+    assert book.check(GOOD) is AlarmKind.CLEARED
     assert book.alarms[0].word == "closed"
     assert not is_open(book.alarms[0])
-    assert book.check(BAD) is Kind.RAISED
+    assert book.check(BAD) is AlarmKind.RAISED
     assert [a.number for a in book.alarms] == [1, 2]
-    assert book.check(GOOD) is Kind.CLEARED
+    assert book.check(GOOD) is AlarmKind.CLEARED
     assert book.alarms[1].word == "cleared"  # it stays to be seen
     assert is_open(book.alarms[1])
     book.acknowledge("anna")
@@ -89,7 +89,7 @@ ACTS = st.lists(st.one_of(CHECKS, st.just("ack")), max_size=40)
 
 
 @given(ACTS)
-def test_whatever_happens(acts: list[Found | str]) -> None:
+def test_whatever_happens(acts: list[FiredRule | str]) -> None:
     """Beside the machine a model of three lines: is it on, has somebody seen it, how many were there."""
     book, on, seen, count = Book(), False, False, 0
     for act in acts:
@@ -100,12 +100,12 @@ def test_whatever_happens(acts: list[Found | str]) -> None:
         else:
             kind = book.check(act)
             if act is BAD:
-                assert kind is (Kind.HELD if on else Kind.RAISED)
+                assert kind is (AlarmKind.HELD if on else AlarmKind.RAISED)
                 count, seen, on = (count, seen, True) if on else (count + 1, False, True)
             elif act is NOT_MEASURED or not on:
                 assert kind is None
             else:
-                assert kind is (Kind.CLEARED if act is GOOD else Kind.HELD)
+                assert kind is (AlarmKind.CLEARED if act is GOOD else AlarmKind.HELD)
                 on = act is not GOOD
         alarms = book.alarms
         assert len(alarms) == count
@@ -118,7 +118,7 @@ def test_whatever_happens(acts: list[Found | str]) -> None:
 
 
 @given(ACTS, st.integers(0, 60))
-def test_a_restart_anywhere_finds_the_same(acts: list[Found | str], cut: int) -> None:
+def test_a_restart_anywhere_finds_the_same(acts: list[FiredRule | str], cut: int) -> None:
     """What is read at a start follows from the lines alone: a prefix of them is what stood there then."""
     book, then = Book(), []
     for act in acts:
@@ -144,21 +144,21 @@ def raised() -> Book:
 
 
 def test_an_investigation_goes_on_where_its_lines_end(raised: Book) -> None:
-    def step() -> Kind | None:
+    def step() -> AlarmKind | None:
         return next_step(raised.alarms[0])
 
-    assert step() is Kind.MEASURED
-    raised.add(1, Kind.BEGUN, text="measuring")
-    assert step() is Kind.MEASURED  # interrupted: anew
-    raised.add(1, Kind.MEASURED, text="measured", campaign="c")
-    assert step() is Kind.DISCOVERED
-    raised.add(1, Kind.DISCOVERED, text="found")
-    assert step() is Kind.PROPOSED
-    raised.add(1, Kind.FAILED, text="the link is down")
+    assert step() is AlarmKind.MEASURED
+    raised.add(1, AlarmKind.BEGUN, text="measuring")
+    assert step() is AlarmKind.MEASURED  # interrupted: anew
+    raised.add(1, AlarmKind.MEASURED, text="measured", campaign="c")
+    assert step() is AlarmKind.DISCOVERED
+    raised.add(1, AlarmKind.DISCOVERED, text="found")
+    assert step() is AlarmKind.PROPOSED
+    raised.add(1, AlarmKind.FAILED, text="the link is down")
     assert step() is None  # not at once
     raised.check(BAD)
-    assert step() is Kind.PROPOSED
-    raised.add(1, Kind.PROPOSED, text="proposal 1", proposal=1)
+    assert step() is AlarmKind.PROPOSED
+    raised.add(1, AlarmKind.PROPOSED, text="proposal 1", proposal=1)
     assert step() is None
     assert raised.alarms[0].outcome == "proposal 1"
 
@@ -169,6 +169,6 @@ def test_a_cleared_alarm_asks_for_nothing(raised: Book) -> None:
 
 
 def test_an_ended_investigation_is_not_begun_again(raised: Book) -> None:
-    raised.add(1, Kind.ENDED, text="no proposal: not enough to write")
+    raised.add(1, AlarmKind.ENDED, text="no proposal: not enough to write")
     raised.check(BAD)
     assert next_step(raised.alarms[0]) is None

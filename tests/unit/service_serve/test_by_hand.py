@@ -12,7 +12,7 @@ import pytest
 
 from abbe.drivers.errors import LinkDown
 from abbe.service.channel.messages import MOST_JOBS, Answer, How, StartJob, SteerJob
-from abbe.service.core.jobs import JobBook
+from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, OpenEnds
 from abbe.service.core.rights import may_measure
 from abbe.service.errors import MachineInUse, StillActive, StoreError
@@ -43,7 +43,7 @@ class Bench:
     numbers: int = 0
 
     def __post_init__(self) -> None:
-        self.book = JobBook(self.run, ("quick-check", "verify"), self.may, self.clock, self.changed)
+        self.book = JobRegistry(self.run, ("quick-check", "verify"), self.may, self.clock, self.changed)
         self.scheduler = Scheduler([HOURLY], self.ledger, self.book, self.shelf, self.clock)
 
     def changed(self) -> None:

@@ -18,11 +18,11 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, DoneByHand, How, JobSeen, StartJob, SteerJob
-from abbe.service.core.campaigns import CampaignOrder, Campaigns
-from abbe.service.core.jobs import JobBook
-from abbe.service.core.snapshot import Moments
+from abbe.service.core.campaigns import CampaignJobs, CampaignOrder
+from abbe.service.core.jobs import JobRegistry
+from abbe.service.core.snapshot import SnapshotSource
 from abbe.service.errors import StoreError, TableMismatch
-from abbe.service.jobs.guided_campaign import Led
+from abbe.service.jobs.guided_campaign import CampaignOutcome
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, Prompts
@@ -30,7 +30,7 @@ from abbe.service.web.core_link.board import Board
 from tests.patience import within
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
-LED = Led("proposed", "proposal 4 waits for approval", 7, 4)
+LED = CampaignOutcome("proposed", "proposal 4 waits for approval", 7, 4)
 BAR, LASER = "hang in the bar", "set up the laser"
 
 
@@ -42,7 +42,7 @@ class Bench:
     audit: AuditBook
     clock: FakeClock = field(default_factory=lambda: FakeClock(utc(2026, 6, 1, 12)))
     orders: list[CampaignOrder] = field(default_factory=list)
-    end: Led | BaseException = LED
+    end: CampaignOutcome | BaseException = LED
     notes: tuple[str, ...] = ()
     allowed: set[str] = field(default_factory=lambda: {"token:bob/ci", "user:oscar"})
     proposers: set[str] = field(default_factory=lambda: {"token:bob/ci", "user:pia"})
@@ -56,16 +56,16 @@ class Bench:
         async def may_propose(who: str) -> bool:
             return who in self.proposers
 
-        self.book = JobBook(self.check, ("quick-check",), may, self.clock, self.news.set)
+        self.book = JobRegistry(self.check, ("quick-check",), may, self.clock, self.news.set)
         self.board = Board({}, self.clock)
-        self.book.full = Campaigns("mill-7", ("identification", "own.toml"), self.measure, self.audit, [self.board]).full(may_propose)
+        self.book.full = CampaignJobs("mill-7", ("identification", "own.toml"), self.measure, self.audit, [self.board]).full(may_propose)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
-        self.moments = Moments(self.board, self.book, list, self.clock)
+        self.moments = SnapshotSource(self.board, self.book, list, self.clock)
 
     async def check(self, schedule: object, slot: datetime, control: Control) -> tuple[str, int]:
         raise AssertionError
 
-    async def measure(self, order: CampaignOrder) -> Led:
+    async def measure(self, order: CampaignOrder) -> CampaignOutcome:
         self.orders.append(order)
         self.news.set()
         try:
@@ -192,7 +192,7 @@ async def test_one_key_is_one_campaign_and_only_declared_ones_are_started(bench:
 @pytest.mark.parametrize(
     ("end", "state", "text"),
     [
-        (Led("ended", "no proposal: not enough to write"), "done: ended", "no proposal: not enough to write"),
+        (CampaignOutcome("ended", "no proposal: not enough to write"), "done: ended", "no proposal: not enough to write"),
         (LinkDown("modbus+tcp://127.0.0.1:502", "read", "refused", "is it on?"), "done: failed", "read: refused; is it on?"),
         (ExceptionGroup("two", [TableMismatch("another table", "measure again")]), "done: failed", "another table; measure again"),
     ],

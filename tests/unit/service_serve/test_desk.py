@@ -17,25 +17,25 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import How, JobSeen, SteerJob
 from abbe.service.compensation import push_approved
-from abbe.service.compensation.push_approved import Approved, Order
-from abbe.service.core.jobs import JobBook
+from abbe.service.compensation.push_approved import Approved, PushOrder
+from abbe.service.core.jobs import JobRegistry
 from abbe.service.devices.machine_lock import ENVIRONMENT
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.at_start import push_is_open
-from abbe.service.jobs.investigate import Bench as Investigation
+from abbe.service.jobs.investigate import InvestigationContext as Investigation
 from abbe.service.jobs.investigate import Note, investigate
 from abbe.service.push.book import StoreBook
-from abbe.service.push.states import State as Push
+from abbe.service.push.states import PushState as Push
 from abbe.service.scheduler.alarm_manager import AlarmManager, Duties, Telling
-from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.records import AlarmEntryRecord
-from abbe.service.tables.push_outcome import Outcome, by_journal, open_push
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Kind
+from abbe.service.tables.push_outcome import PushOutcome, by_journal, open_push
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, utc
@@ -68,7 +68,7 @@ class Bench:
     url: str
     clock: FakeClock = field(default_factory=lambda: FakeClock(NOON))
     investigate: Investigate | None = None
-    push: Callable[[Order], Awaitable[Outcome]] | None = None
+    push: Callable[[PushOrder], Awaitable[PushOutcome]] | None = None
 
     def __post_init__(self) -> None:
         self.machine = self.store.add_machine("mill-7", {"name": "mill-7"})
@@ -76,8 +76,8 @@ class Bench:
         self.desk = AlarmManager(
             self.store, self.clock, "mill-7", [YEARLY], duties, Telling(None, lambda: None, AuditBook(self.store, self.url))
         )
-        self.book = JobBook(self._check, ("quick-check",), self._may, self.clock, lambda: None)
-        terms = Terms(errands=self.desk, carry=self.book.errand)
+        self.book = JobRegistry(self._check, ("quick-check",), self._may, self.clock, lambda: None)
+        terms = LoopTerms(errands=self.desk, carry=self.book.errand)
         self.scheduler = Scheduler([YEARLY], FakeLedger(), self.book, FakeShelf(), self.clock, terms)
 
     async def _may(self, who: str) -> bool:
@@ -90,7 +90,7 @@ class Bench:
         assert self.investigate is not None
         await self.investigate(alarm, note, progress, control)
 
-    async def _push(self, order: Order) -> Outcome:
+    async def _push(self, order: PushOrder) -> PushOutcome:
         assert self.push is not None
         return await self.push(order)
 
@@ -130,7 +130,7 @@ class Bench:
         """Let the desk push proposal 4; the word and the sentence that the alarm's line says."""
         state = await self.desk._pushed(Approved(4, 9, NO_ALARM), YEARLY, control or Control())
         last = self.lines()[-1]
-        assert (last.kind, state) == (Kind.PUSHED, f"done: {last.doc['word']}")
+        assert (last.kind, state) == (AlarmKind.PUSHED, f"done: {last.doc['word']}")
         return last.doc["word"], last.doc["text"]
 
 
@@ -196,7 +196,7 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
 
     async def deaf(alarm: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
         control.now(State.RUNNING)
-        await note(Kind.BEGUN, {"text": "measuring", "campaign": "c"})
+        await note(AlarmKind.BEGUN, {"text": "measuring", "campaign": "c"})
         try:
             await waits.wait()
         except asyncio.CancelledError as error:
@@ -205,7 +205,7 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
 
     running.investigate = deaf
     running.store.add_alarm_entry("mill-7", 1, running.alarm().last_seq + 1, "held", RAISED, [])
-    await running.until(lambda: running.alarm().work[-1].kind is Kind.BEGUN)
+    await running.until(lambda: running.alarm().work[-1].kind is AlarmKind.BEGUN)
     assert (await running.steer("abort"))[0] == "done"  # at once: nothing of the work looks at the control
     await running.until(lambda: len(running.jobs("done: failed")) == 2)
     assert "aborted as asked" in running.alarm().outcome
@@ -216,22 +216,22 @@ async def test_a_push_is_a_job_and_is_not_paused_while_a_table_is_not_verified(b
     seen: list[tuple[str, str]] = []
     pausing: list[bool] = []
 
-    async def push(order: Order) -> Outcome:
+    async def push(order: PushOrder) -> PushOutcome:
         await order.begun()
         order.control.now(State.RUNNING)
         for hurry in ("a table that nobody has verified may be in force", ""):
             order.control.hurry = hurry
             seen.append(await bench.steer("pause"))
             pausing.append(order.control.pausing)
-        return Outcome("refused", "not today")
+        return PushOutcome("refused", "not today")
 
     bench.push = push
-    from abbe.service.scheduler.ports import Errand
+    from abbe.service.scheduler.ports import FollowUp
 
     def work(control: Control) -> Awaitable[str]:
         return bench.desk._pushed(Approved(4, 9, NO_ALARM), YEARLY, control)
 
-    assert await bench.book.errand(Errand("push of proposal 4", YEARLY, work, "push")) == "done: refused"
+    assert await bench.book.errand(FollowUp("push of proposal 4", YEARLY, work, "push")) == "done: refused"
     assert seen == [("conflict", "it cannot be paused now: a table that nobody has verified may be in force"), ("done", "")]
     (job,) = bench.jobs()
     assert (job.kind, job.state, job.text) == ("push", "done: refused", "not today")
@@ -292,18 +292,18 @@ async def test_a_machine_in_use_is_waited_for_and_no_try_is_counted(running: Ben
     running.investigate = free
     other.communicate("\n", timeout=20)
     await running.until(lambda: running.jobs("done: ended"))
-    assert [step.kind for step in running.alarm().work] == [Kind.ENDED]
+    assert [step.kind for step in running.alarm().work] == [AlarmKind.ENDED]
 
 
 async def free(alarm: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
-    await note(Kind.ENDED, {"text": "nothing to gain"})
+    await note(AlarmKind.ENDED, {"text": "nothing to gain"})
 
 
 # ---- the word for a push ------------------------------------------------------------------------------------------------
 
 
 async def test_a_kept_table_is_kept_whatever_failed_afterwards(bench: Bench) -> None:
-    async def push(order: Order) -> Outcome:
+    async def push(order: PushOrder) -> PushOutcome:
         await order.begun()
         await bench.journal(*KEPT, verify="better by 4 µm")
         raise StoreError("the disk is full")
@@ -314,31 +314,36 @@ async def test_a_kept_table_is_kept_whatever_failed_afterwards(bench: Bench) -> 
     assert text.startswith("proposal 4 kept: push 1: the new table is kept and in force: ")
     assert text.endswith("; the disk is full")
     begun = bench.lines()[0]
-    assert (begun.kind, begun.doc["approval"], begun.doc["after"]) == (Kind.PUSHING, 9, 0)
+    assert (begun.kind, begun.doc["approval"], begun.doc["after"]) == (AlarmKind.PUSHING, 9, 0)
 
 
-Heard = Exception | Outcome
+Heard = Exception | PushOutcome
 
 
 @pytest.mark.parametrize(
     ("states", "heard", "word", "part"),
     [
-        (KEPT, Outcome("failed", "no answer"), "kept", "in force"),
-        ((*IN_FORCE, Push.ROLLBACK, Push.ROLLED_BACK), Outcome("failed", "no answer"), "rolled back", "the old table is in force again"),
+        (KEPT, PushOutcome("failed", "no answer"), "kept", "in force"),
+        (
+            (*IN_FORCE, Push.ROLLBACK, Push.ROLLED_BACK),
+            PushOutcome("failed", "no answer"),
+            "rolled back",
+            "the old table is in force again",
+        ),
         ((*IN_FORCE, Push.ROLLBACK, Push.ROLLED_BACK), ArithmeticError("no number"), "rolled back", "no number"),
         (IN_FORCE, StillActive("the door is open"), "open", "stands at PROBED: an unverified table may be in force"),
-        (IN_FORCE, Outcome("rolled back", "as somebody thought"), "open", "an unverified table may be in force"),
-        ((Push.SNAPSHOT, Push.VALIDATED), Outcome("failed", "no answer"), "open", "the old table is in force"),
-        ((Push.SNAPSHOT, Push.REJECTED), Outcome("failed", "no answer"), "refused", "nothing was written"),
-        ((Push.SNAPSHOT, Push.ABORTED), Outcome("kept", "as somebody thought"), "failed", "the new one never was"),
-        ((Push.SNAPSHOT, Push.ABORTED), Outcome("stopped", "by a person"), "stopped", "the new one never was"),
+        (IN_FORCE, PushOutcome("rolled back", "as somebody thought"), "open", "an unverified table may be in force"),
+        ((Push.SNAPSHOT, Push.VALIDATED), PushOutcome("failed", "no answer"), "open", "the old table is in force"),
+        ((Push.SNAPSHOT, Push.REJECTED), PushOutcome("failed", "no answer"), "refused", "nothing was written"),
+        ((Push.SNAPSHOT, Push.ABORTED), PushOutcome("kept", "as somebody thought"), "failed", "the new one never was"),
+        ((Push.SNAPSHOT, Push.ABORTED), PushOutcome("stopped", "by a person"), "stopped", "the new one never was"),
         ((), TableRefused("too old"), "failed", "too old"),
-        ((), Outcome("refused", "too old"), "refused", "too old"),
-        ((), Outcome("kept", "as somebody thought"), "failed", "thought"),
+        ((), PushOutcome("refused", "too old"), "refused", "too old"),
+        ((), PushOutcome("kept", "as somebody thought"), "failed", "thought"),
     ],
 )
 async def test_the_word_is_that_of_the_journal(bench: Bench, states: tuple[Push, ...], heard: Heard, word: str, part: str) -> None:
-    async def push(order: Order) -> Outcome:
+    async def push(order: PushOrder) -> PushOutcome:
         await order.begun()
         if states:
             await bench.journal(*states)
@@ -355,21 +360,21 @@ async def test_the_word_is_that_of_the_journal(bench: Bench, states: tuple[Push,
 async def test_a_push_before_this_one_says_nothing_of_it(bench: Bench) -> None:
     await bench.journal(*KEPT)
 
-    async def push(order: Order) -> Outcome:
+    async def push(order: PushOrder) -> PushOutcome:
         await order.begun()
-        return Outcome("failed", "no answer")
+        return PushOutcome("failed", "no answer")
 
     bench.push = push
     assert (await bench.pushed())[0] == "failed"
-    assert by_journal(bench.store, "mill-7", 4, 0, Outcome("failed", "")).word == "kept"
-    assert by_journal(bench.store, "mill-7", 5, 0, Outcome("failed", "")).word == "failed"
+    assert by_journal(bench.store, "mill-7", 4, 0, PushOutcome("failed", "")).word == "kept"
+    assert by_journal(bench.store, "mill-7", 5, 0, PushOutcome("failed", "")).word == "failed"
 
 
 async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def push(order: Order) -> Outcome:
+    async def push(order: PushOrder) -> PushOutcome:
         await order.begun()
         await bench.journal(*KEPT)
-        return Outcome("failed", "no answer")
+        return PushOutcome("failed", "no answer")
 
     bench.push = push
     bench.clock.sleep = lambda s: asyncio.sleep(0)  # type: ignore[method-assign]
@@ -377,19 +382,19 @@ async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(be
         patch.setattr("abbe.service.scheduler.alarm_manager.by_journal", _unreadable)
         with pytest.raises(StoreError):
             await bench.pushed()
-    assert [line.kind for line in bench.lines()] == [Kind.PUSHING]
+    assert [line.kind for line in bench.lines()] == [AlarmKind.PUSHING]
     await bench.desk.due()
-    assert (bench.lines()[-1].kind, bench.lines()[-1].doc["word"]) == (Kind.PUSHED, "kept")
+    assert (bench.lines()[-1].kind, bench.lines()[-1].doc["word"]) == (AlarmKind.PUSHED, "kept")
 
 
-def _unreadable(*_: object) -> Outcome:
+def _unreadable(*_: object) -> PushOutcome:
     raise StoreError("the database is locked")
 
 
 async def test_what_stays_open_is_told_and_told_again_when_it_is_closed(bench: Bench) -> None:
     """As after a stop of the service, and after a door that was open."""
 
-    async def push(order: Order) -> Outcome:
+    async def push(order: PushOrder) -> PushOutcome:
         await order.begun()
         await bench.journal(*IN_FORCE)
         await asyncio.Event().wait()
@@ -428,12 +433,14 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
         await safe.wait()
         return "the old table was made active again"
 
-    async def back(ask: Callable[[Control], None]) -> Outcome:
+    async def back(ask: Callable[[Control], None]) -> PushOutcome:
         begun.clear()
         control, nothing = Control(), cast("Any", SimpleNamespace(controller=None))
         control.stop()  # before the way back begins
-        order = Order(4, cast("Any", None), lambda now: None, control)
-        task = asyncio.create_task(push_approved._back(push_approved._Bench(nothing, nothing, bench.store, bench.clock, 100), order, told))
+        order = PushOrder(4, cast("Any", None), lambda now: None, control)
+        task = asyncio.create_task(
+            push_approved._back(push_approved._PushContext(nothing, nothing, bench.store, bench.clock, 100), order, told)
+        )
         async with asyncio.timeout(within(20)):
             await begun.wait()
             ask(control)
@@ -442,7 +449,7 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
     monkeypatch.setattr(push_approved, "finish_when_safe", finish)
     aborted = await back(Control.abort)
     assert (aborted.word, aborted.text.endswith("it is taken back as soon as it can be")) == ("failed", True)
-    assert await back(lambda control: safe.set()) == Outcome("rolled back", "the door is open; the old table was made active again")
+    assert await back(lambda control: safe.set()) == PushOutcome("rolled back", "the door is open; the old table was made active again")
 
 
 async def test_what_is_open_by_the_journal(bench: Bench) -> None:

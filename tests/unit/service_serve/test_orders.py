@@ -19,16 +19,16 @@ from abbe.drivers.cnc.tables import crc32
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, JobSeen, RollBack, StartJob
 from abbe.service.compensation.ordered_rollback import BackOrder
-from abbe.service.core.jobs import JobBook
+from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders
 from abbe.service.core.rights import may
 from abbe.service.errors import StoreError
-from abbe.service.push.states import S, State
+from abbe.service.push.states import PushState, S
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.tables.push_history import KIND
-from abbe.service.tables.push_outcome import Outcome
+from abbe.service.tables.push_outcome import PushOutcome
 from abbe.service.tables.table_history import story
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
@@ -48,8 +48,8 @@ class Bench:
     audit: AuditBook
     clock: FakeClock = field(default_factory=lambda: FakeClock(utc(2026, 6, 1, 12)))
     orders_seen: list[BackOrder] = field(default_factory=list)
-    states: tuple[State, ...] = KEPT
-    said: Outcome | Exception = field(default_factory=lambda: Outcome("kept", "push 2"))
+    states: tuple[PushState, ...] = KEPT
+    said: PushOutcome | Exception = field(default_factory=lambda: PushOutcome("kept", "push 2"))
     may_end: asyncio.Event = field(default_factory=asyncio.Event)
     written: asyncio.Event = field(default_factory=asyncio.Event)
     news: asyncio.Event = field(default_factory=asyncio.Event)
@@ -61,7 +61,7 @@ class Bench:
         async def anybody(_: str) -> bool:
             return True
 
-        self.book = JobBook(self.check, ("quick-check",), anybody, self.clock, self.news.set)
+        self.book = JobRegistry(self.check, ("quick-check",), anybody, self.clock, self.news.set)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
         self.orders = Orders(self.store, self.clock, self.book, Ground(MACHINE, allowed, self.audit), Hands(self.bring_back))
 
@@ -69,11 +69,11 @@ class Bench:
         await self.may_end.wait()
         return "done: pass", 1
 
-    async def push(self, doc: dict[str, Any], base: bytes, image: bytes, states: tuple[State, ...]) -> None:
+    async def push(self, doc: dict[str, Any], base: bytes, image: bytes, states: tuple[PushState, ...]) -> None:
         """A push in the journal, as far as ``states`` go."""
         await as_if_pushed(self.store, self.clock, MACHINE, doc, (base, image), states)
 
-    async def bring_back(self, order: BackOrder) -> Outcome:
+    async def bring_back(self, order: BackOrder) -> PushOutcome:
         self.orders_seen.append(order)
         if self.states:
             await self.push({"kind": KIND, "order": order.ordered.number, "reason": order.ordered.reason}, NEW, OLD, self.states)
@@ -134,14 +134,16 @@ async def test_it_is_a_job_with_who_and_why_in_the_audit(bench: Bench) -> None:
     ("states", "said", "state", "text"),
     [
         (KEPT, StoreError("the disk is full"), "done: kept", "the table ordered back is kept and in force"),
-        (TAKEN_BACK, Outcome("kept", "all is well"), "done: rolled back", "the table from before the order is in force again"),
-        (UP_TO_ACTIVE, Outcome("kept", "all is well"), "done: open", "an unverified table may be in force"),
+        (TAKEN_BACK, PushOutcome("kept", "all is well"), "done: rolled back", "the table from before the order is in force again"),
+        (UP_TO_ACTIVE, PushOutcome("kept", "all is well"), "done: open", "an unverified table may be in force"),
         ((*UP_TO_ACTIVE[:4], S.ABORTED), OSError("the cable"), "done: failed", "the cable"),
-        ((), Outcome("kept", "all is well"), "done: failed", "all is well"),
-        ((), Outcome("refused", "door open"), "done: refused", "door open"),
+        ((), PushOutcome("kept", "all is well"), "done: failed", "all is well"),
+        ((), PushOutcome("refused", "door open"), "done: refused", "door open"),
     ],
 )
-async def test_the_word_is_the_journal_s(bench: Bench, states: tuple[State, ...], said: Outcome | Exception, state: str, text: str) -> None:
+async def test_the_word_is_the_journal_s(
+    bench: Bench, states: tuple[PushState, ...], said: PushOutcome | Exception, state: str, text: str
+) -> None:
     await bench.push({}, OLD, NEW, KEPT)
     bench.states, bench.said = states, said
     assert (await bench.ask()).outcome == "done"

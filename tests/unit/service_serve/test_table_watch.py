@@ -11,8 +11,8 @@ import pytest
 
 from abbe.drivers.errors import LinkDown
 from abbe.service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWatch
-from abbe.service.push.entries import Entry
-from abbe.service.push.states import State
+from abbe.service.push.entries import JournalEntry
+from abbe.service.push.states import PushState
 from abbe.service.tables.in_force import InForce
 from abbe.service.tables.push_history import wanted_by
 from tests.unit.service_serve.fakes import FakeClock, FakeShelf, settle, utc
@@ -148,13 +148,13 @@ def test_the_remedy_names_nothing_that_is_refused_then() -> None:
     assert "accept-table" in REMEDY
 
 
-def entries(state: State, *docs: dict[str, int], push: int = 1) -> list[Entry]:
-    states = [State.SNAPSHOT] * (len(docs) - 1) + [state]
-    return [Entry(push, k, one, doc, "", "", "") for k, (one, doc) in enumerate(zip(states, docs, strict=True))]
+def entries(state: PushState, *docs: dict[str, int], push: int = 1) -> list[JournalEntry]:
+    states = [PushState.SNAPSHOT] * (len(docs) - 1) + [state]
+    return [JournalEntry(push, k, one, doc, "", "", "") for k, (one, doc) in enumerate(zip(states, docs, strict=True))]
 
 
-KEPT = entries(State.KEEP, {"crc": 2, "base_crc": 1}, {})
-ACCEPTED = entries(State.ACCEPTED, {"crc": 4, "base_crc": 2}, {"accepted_crc": 3}, push=2)
+KEPT = entries(PushState.KEEP, {"crc": 2, "base_crc": 1}, {})
+ACCEPTED = entries(PushState.ACCEPTED, {"crc": 4, "base_crc": 2}, {"accepted_crc": 3}, push=2)
 ON_STRANGE = {"crc": 5, "base_crc": 9}
 
 
@@ -162,21 +162,21 @@ ON_STRANGE = {"crc": 5, "base_crc": 9}
     ("journal", "wanted"),
     [
         ([], (None, True)),
-        (entries(State.KEEP, {"crc": 2, "base_crc": 1}, {}), (2, True)),
-        (entries(State.ROLLED_BACK, {"crc": 2, "base_crc": 1}, {}), (1, True)),
-        (entries(State.REJECTED, {"crc": 2, "base_crc": 1}, {}), (1, True)),
-        (entries(State.ACCEPTED, {"crc": 2, "base_crc": 1}, {"accepted_crc": 3}), (3, True)),
-        (entries(State.PROBATION, {"crc": 2, "base_crc": 1}, {}), (None, False)),
-        (entries(State.OPERATOR, {"crc": 2, "base_crc": 1}, {}), (None, False)),
+        (entries(PushState.KEEP, {"crc": 2, "base_crc": 1}, {}), (2, True)),
+        (entries(PushState.ROLLED_BACK, {"crc": 2, "base_crc": 1}, {}), (1, True)),
+        (entries(PushState.REJECTED, {"crc": 2, "base_crc": 1}, {}), (1, True)),
+        (entries(PushState.ACCEPTED, {"crc": 2, "base_crc": 1}, {"accepted_crc": 3}), (3, True)),
+        (entries(PushState.PROBATION, {"crc": 2, "base_crc": 1}, {}), (None, False)),
+        (entries(PushState.OPERATOR, {"crc": 2, "base_crc": 1}, {}), (None, False)),
         # a push that comes to nothing on a strange table does not make that one expected
-        (KEPT + entries(State.ROLLED_BACK, ON_STRANGE, {}, push=2), (2, True)),
-        (KEPT + entries(State.REJECTED, ON_STRANGE, {}, push=2) + entries(State.ABORTED, ON_STRANGE, {}, push=3), (2, True)),
-        (KEPT + ACCEPTED + entries(State.ROLLED_BACK, ON_STRANGE, {}, push=3), (3, True)),
-        (ACCEPTED + entries(State.KEEP, ON_STRANGE, {}, push=3), (5, True)),
-        (entries(State.ABORTED, {"crc": 2, "base_crc": 1}, {}) + entries(State.REJECTED, ON_STRANGE, {}, push=2), (1, True)),
-        (entries(State.ABORTED, {}, {}), (None, True)),
-        (KEPT + entries(State.PROBATION, ON_STRANGE, {}, push=2), (None, False)),
+        (KEPT + entries(PushState.ROLLED_BACK, ON_STRANGE, {}, push=2), (2, True)),
+        (KEPT + entries(PushState.REJECTED, ON_STRANGE, {}, push=2) + entries(PushState.ABORTED, ON_STRANGE, {}, push=3), (2, True)),
+        (KEPT + ACCEPTED + entries(PushState.ROLLED_BACK, ON_STRANGE, {}, push=3), (3, True)),
+        (ACCEPTED + entries(PushState.KEEP, ON_STRANGE, {}, push=3), (5, True)),
+        (entries(PushState.ABORTED, {"crc": 2, "base_crc": 1}, {}) + entries(PushState.REJECTED, ON_STRANGE, {}, push=2), (1, True)),
+        (entries(PushState.ABORTED, {}, {}), (None, True)),
+        (KEPT + entries(PushState.PROBATION, ON_STRANGE, {}, push=2), (None, False)),
     ],
 )
-def test_what_the_journal_left_in_force(journal: list[Entry], wanted: tuple[int | None, bool]) -> None:
+def test_what_the_journal_left_in_force(journal: list[JournalEntry], wanted: tuple[int | None, bool]) -> None:
     assert wanted_by(journal) == wanted

@@ -12,8 +12,8 @@ import pytest
 
 from abbe.drivers.api import ControllerStatus
 from abbe.drivers.errors import LinkDown
-from abbe.service.scheduler.loop import Scheduler, Terms
-from abbe.service.scheduler.ready import Ready, Seen
+from abbe.service.scheduler.loop import LoopTerms, Scheduler
+from abbe.service.scheduler.ready import Ready, SeenDevices
 from abbe.service.scheduler.slots import Needs, Schedule, cron_in_words, next_slot, previous_slot, slots_between
 from abbe.service.scheduler.windows import Window
 from tests.unit.service_serve.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
@@ -31,7 +31,7 @@ class Bench:
         self.clock, self.ledger, self.shelf = FakeClock(start), ledger or FakeLedger(), FakeShelf()
         self.lacks = ""
         self.ran: list[tuple[datetime, datetime]] = []
-        self.scheduler = Scheduler(schedules, self.ledger, self.job, self.shelf, self.clock, Terms(maintenance, self))
+        self.scheduler = Scheduler(schedules, self.ledger, self.job, self.shelf, self.clock, LoopTerms(maintenance, self))
 
     async def lack(self, schedule: Schedule) -> str:
         return self.lacks
@@ -168,20 +168,20 @@ MONDAY_8, MONDAY_20 = utc(2026, 6, 1, 8), utc(2026, 6, 1, 20)
         (Needs(operator="present"), MONDAY_8, None, ""),
         (Needs(operator="present"), MONDAY_20, None, "no operator is there"),
         (Needs(operator="absent"), MONDAY_8, None, "an operator is there"),
-        (Needs(operator="absent"), MONDAY_20, Seen(status()), ""),
-        (Needs(operator="absent"), MONDAY_20, Seen(status(READY_BITS | 1 << 1)), "somebody is at the machine"),
-        (Needs(idle=True), MONDAY_8, Seen(status()), ""),
-        (Needs(idle=True), MONDAY_8, Seen(status(READY_BITS | 1 << 11)), "not idle: an NC program runs"),
-        (Needs(idle=True), MONDAY_8, Seen(status(READY_BITS | 1 << 12)), "not idle: the spindle turns"),
-        (Needs(idle=True), MONDAY_8, Seen(status(READY_BITS | 1 << 6)), "not idle: an axis moves"),
+        (Needs(operator="absent"), MONDAY_20, SeenDevices(status()), ""),
+        (Needs(operator="absent"), MONDAY_20, SeenDevices(status(READY_BITS | 1 << 1)), "somebody is at the machine"),
+        (Needs(idle=True), MONDAY_8, SeenDevices(status()), ""),
+        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY_BITS | 1 << 11)), "not idle: an NC program runs"),
+        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY_BITS | 1 << 12)), "not idle: the spindle turns"),
+        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY_BITS | 1 << 6)), "not idle: an axis moves"),
         (Needs(idle=True), MONDAY_8, None, "the devices cannot be asked"),
-        (Needs(air=True), MONDAY_8, Seen(status(), 20.0), ""),
-        (Needs(air=True), MONDAY_8, Seen(status(), 25.5), "the air has 25.5 C, allowed are 18..24 C"),
-        (Needs(air=True), MONDAY_8, Seen(status(), None), "nobody measures the air"),
+        (Needs(air=True), MONDAY_8, SeenDevices(status(), 20.0), ""),
+        (Needs(air=True), MONDAY_8, SeenDevices(status(), 25.5), "the air has 25.5 C, allowed are 18..24 C"),
+        (Needs(air=True), MONDAY_8, SeenDevices(status(), None), "nobody measures the air"),
     ],
 )
-async def test_preconditions(needs: Needs, at: datetime, seen: Seen | None, lack: str) -> None:
-    async def look(with_air: bool) -> Seen:
+async def test_preconditions(needs: Needs, at: datetime, seen: SeenDevices | None, lack: str) -> None:
+    async def look(with_air: bool) -> SeenDevices:
         if seen is None:
             raise LinkDown("tcp://127.0.0.1:5021", "connect", "refused", "switch it on")
         return seen
@@ -197,12 +197,12 @@ async def test_a_machine_is_warm_when_it_was_seen_at_work() -> None:
     clock = FakeClock(MONDAY_8)
     minute = 0
 
-    async def look(with_air: bool) -> Seen:
+    async def look(with_air: bool) -> SeenDevices:
         nonlocal minute
         minute += 1
         if 10 <= minute < 20:
             raise LinkDown("tcp://127.0.0.1:5021", "read", "gone", "")
-        return Seen(status(READY_BITS | (minute % 2) << 12, x=float(minute % 4)) if minute <= 30 else status(x=30.0 % 4))
+        return SeenDevices(status(READY_BITS | (minute % 2) << 12, x=float(minute % 4)) if minute <= 30 else status(x=30.0 % 4))
 
     schedule = replace(HOURLY, needs=Needs(warm_min=15.0))
     ready = Ready(look, [schedule], (18.0, 24.0), (), clock)
@@ -220,7 +220,7 @@ async def test_a_machine_is_warm_when_it_was_seen_at_work() -> None:
 
 
 async def test_nobody_is_looked_at_without_need() -> None:
-    async def look(with_air: bool) -> Seen:
+    async def look(with_air: bool) -> SeenDevices:
         raise AssertionError
 
     ready = Ready(look, [HOURLY], (18.0, 24.0), (), FakeClock(MONDAY_8))

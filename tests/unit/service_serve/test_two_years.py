@@ -20,7 +20,7 @@ from zlib import crc32
 import pytest
 import structlog
 
-from abbe.service.scheduler.loop import Scheduler, Terms
+from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.slots import FIRST_UTC, Needs, Schedule, slots_between
 from abbe.service.scheduler.windows import Window, covering
 from tests.unit.service_serve.cron_oracle import Minutes
@@ -115,7 +115,7 @@ class World:
 
     async def live(self, until: datetime, *, killed: bool) -> None:
         """One service from its start to its end. ``killed``: by the power, so that it writes nothing any more."""
-        terms = Terms(self.maintenance, self, poll_s=4 * 3600.0, recheck_s=600.0)
+        terms = LoopTerms(self.maintenance, self, poll_s=4 * 3600.0, recheck_s=600.0)
         scheduler = Scheduler(self.schedules, self.ledger, self.job, self.shelf, self.clock, terms)
         task = asyncio.create_task(scheduler.run())
         await settle()

@@ -21,7 +21,7 @@ from abbe.service.web.document import HEADERS
 from abbe.service.web.listening import check_exposure
 from abbe.service.web.login.access import MUTATING, PUBLIC, Open, cells, needs
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
-from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
+from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.view import View
 from tests.unit.service_users.conftest import PHRASE, World
 
@@ -43,7 +43,7 @@ class Somebody:
 class Gate:
     world: World
     app: FastAPI
-    door: Door
+    door: Authenticator
     client: httpx.AsyncClient
 
     def session(self, name: str) -> dict[str, str]:
@@ -59,7 +59,7 @@ class Gate:
         return answer
 
 
-def app_of(world: World, door: Door | None) -> FastAPI:
+def app_of(world: World, door: Authenticator | None) -> FastAPI:
     board = Board({}, world.clock)
     none: list[tuple[Schedule, Any]] = []
     view = View("mill-7", "0.1.0", board, world.store, lambda: none, "", world.clock)
@@ -83,7 +83,7 @@ async def gate(world: World) -> AsyncIterator[Gate]:
     for role in Role:
         world.people.add(f"a-{role}", role, PHRASE)
     world.people.add("a-second-admin", "admin", PHRASE)
-    door = Door(world.store, world.people, world.book, now_s=world.clock.monotonic_s, rate_hz=1e6, burst=1e6)
+    door = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s, rate_hz=1e6, burst=1e6)
     door.noise._burst = 1e6
     app = app_of(world, door)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:
@@ -280,7 +280,7 @@ async def test_a_login_is_a_short_form(gate: Gate) -> None:
 
 async def test_a_flood_from_one_address_is_turned_away(world: World) -> None:
     world.people.add("root", "admin", PHRASE)
-    door = Door(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
+    door = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app_of(world, door), False), base_url=BASE) as client:
         codes = [(await client.get("/healthz")).status_code for _ in range(300)]
         assert codes == [200] * 200 + [429] * 100
@@ -292,7 +292,7 @@ async def test_a_flood_from_one_address_is_turned_away(world: World) -> None:
 
 
 async def test_without_users_everybody_may_look_and_nobody_may_change(world: World) -> None:
-    door = Door(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
+    door = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
     app = app_of(world, door)
     with_one_route_for_each_right(app)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:

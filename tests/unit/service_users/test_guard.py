@@ -18,15 +18,15 @@ from abbe.service.users.roles import Permission
 from abbe.service.web.app import as_in_host_header, create_app
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
-from abbe.service.web.login.authentication import Door, Front
+from abbe.service.web.login.authentication import Authenticator, Front
 from tests.unit.service_users.conftest import PHRASE, World
 from tests.unit.service_users.test_access import BASE, OWN, Gate, app_of, gate, log_in
 
 __all__ = ["gate"]  # the fixture
 
 
-def behind(world: World, front: Front) -> tuple[FastAPI, Door]:
-    door = Door(world.store, world.people, world.book, front, now_s=world.clock.monotonic_s)
+def behind(world: World, front: Front) -> tuple[FastAPI, Authenticator]:
+    door = Authenticator(world.store, world.people, world.book, front, now_s=world.clock.monotonic_s)
     return app_of(world, door), door
 
 

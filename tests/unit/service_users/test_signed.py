@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from abbe.service.cli import run
 from abbe.service.errors import KeyRefused, SignatureRefused
-from abbe.service.signed.container import Expected, check, claims_of, sign
+from abbe.service.signed.container import ExpectedContent, check, claims_of, sign
 from abbe.service.signed.keys import new_key, public_of, read_key
 from abbe.service.storage.store import Store
 from tests.formats.test_choice import _document, _known
@@ -36,9 +36,9 @@ def sealed(key: Ed25519PrivateKey, days: float = 30.0) -> bytes:
     return sign(claims_of("mill-7", "siemens-cec", FILES, "none", "5" * 64, (NOW, NOW + timedelta(days=days))), key)
 
 
-def expected(key: Ed25519PrivateKey, **other: str) -> Expected:
+def expected(key: Ed25519PrivateKey, **other: str) -> ExpectedContent:
     here = {"machine": "mill-7", "limits": "5" * 64, "form": "siemens-cec", "base": "none"} | other
-    return Expected(**here, trusted=[public_of(key)])  # type: ignore[arg-type]
+    return ExpectedContent(**here, trusted=[public_of(key)])  # type: ignore[arg-type]
 
 
 def test_what_was_signed_is_taken_in(key: Ed25519PrivateKey) -> None:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from abbe.service.errors import FileFormatError
-from abbe.service.vectors.case import Case
+from abbe.service.vectors.case import VectorCase
 from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.run import check_file, vector_files
 
 
-def case(doc) -> Case:
-    return Case(doc, ("x.json",))
+def case(doc) -> VectorCase:
+    return VectorCase(doc, ("x.json",))
 
 
 def test_a_number_nobody_looked_at_is_named():

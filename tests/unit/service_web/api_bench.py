@@ -24,7 +24,7 @@ from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.push.book import StoreBook
-from abbe.service.push.states import State
+from abbe.service.push.states import PushState
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler.slots import Schedule
@@ -38,7 +38,7 @@ from abbe.service.web.app import create_app
 from abbe.service.web.core_link.board import Board
 from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
-from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
+from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.process.serving import make_server
 from abbe.service.web.view import View
 from tests.unit.service.discovery_bench import MACHINE, Search, write_case
@@ -77,7 +77,7 @@ class Plant:
     people: People
     book: AuditBook
     app: FastAPI
-    door: Door
+    door: Authenticator
     approvable: list[int]
     """Proposals that can be approved."""
 
@@ -182,7 +182,7 @@ async def _push(store: ServiceStore) -> None:
         "meaning": "m",
     }
     known |= {"base_bank": 0, "crc": crc32(image), "approved_by": "somebody", "reasons": [], "target": 1}
-    for state, doc in ((State.SNAPSHOT, known), (State.REJECTED, {"why": "TEMPERATURE: the shop is too warm"})):
+    for state, doc in ((PushState.SNAPSHOT, known), (PushState.REJECTED, {"why": "TEMPERATURE: the shop is too warm"})):
         await book.append(await book.entries(), state, doc)
 
 
@@ -196,13 +196,13 @@ def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
     for role in Role:
         people.add(f"a-{role}", role, PHRASE)
     book = AuditBook(store, url)
-    door = Door(store, people, book, now_s=clock.monotonic_s, rate_hz=1e9, burst=1e9)
+    door = Authenticator(store, people, book, now_s=clock.monotonic_s, rate_hz=1e9, burst=1e9)
     door.noise._burst = 1e9
     app = app_of(store, clock, door)
     return Plant(store, url, clock, people, book, app, door, approvable), stack
 
 
-def app_of(store: ServiceStore, clock: Hour, door: Door | None) -> FastAPI:
+def app_of(store: ServiceStore, clock: Hour, door: Authenticator | None) -> FastAPI:
     board = Board({"cnc": "modbus://127.0.0.1:5020"}, clock)
     schedules = (Schedule("daily", "0 6 * * *", "Europe/Berlin", "quick-check"), Schedule("hours", "", "UTC", "verification", every_h=8.0))
     view = View(NAME, "0.1.0", board, store, list, "", clock)

@@ -128,11 +128,11 @@ async def test_a_rejection_is_final_and_says_why(client, plant, fresh):
 
 
 async def test_a_push_is_told_of_a_rejection(plant, fresh):
-    from abbe.service.compensation.proposal_checks import Held
+    from abbe.service.compensation.proposal_checks import HoldReason
 
     rejection = reject(plant.store, fresh, "somebody", "no", "user:somebody")
     assert isinstance(rejection, RejectionRecord)
-    held = Held.__new__(Held)
+    held = HoldReason.__new__(HoldReason)
     object.__setattr__(held, "rejections", (rejection,))
     assert list(held._rejected()) == [f"REJECTED: by somebody at {rejection.utc}: no"]
 

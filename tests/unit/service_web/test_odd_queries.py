@@ -22,7 +22,7 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.board import Board
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
-from abbe.service.web.login.authentication import COOKIE, Door, csrf_token
+from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.view import View
 
 PHRASE = "correct horse battery staple"
@@ -41,7 +41,7 @@ async def test_every_text_of_every_query(url: str) -> None:
     with ServiceStore.open(url) as store:
         people = People(store, clock, Passwords(memory_kib=64, passes=1))
         people.add("adam", "admin", PHRASE)
-        door = Door(store, people, AuditBook(store, url), rate_hz=1e9, burst=1e9)
+        door = Authenticator(store, people, AuditBook(store, url), rate_hz=1e9, burst=1e9)
         board = Board({}, clock)
         schedules = (Schedule("s", "0 6 * * *", "UTC", "r"),)
         view = View("m", "0", board, store, list, "", clock)

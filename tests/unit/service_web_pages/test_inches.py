@@ -20,7 +20,7 @@ from abbe.service.identification.solution_field import stored_field
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
-from abbe.service.verification.compare_runs import Curve, Difference, Loaded, curve, figure_rows
+from abbe.service.verification.compare_runs import ComparedCurve, LoadedRun, RunDifference, curve, figure_rows
 from abbe.service.web import frame, language
 from abbe.service.web.frame import Frame
 from abbe.service.web.page import environment
@@ -159,7 +159,7 @@ def test_compared_runs(running: Served) -> None:
     loaded = []
     for record in records:
         run, document = run_document(running.store, record, Rules())
-        loaded.append(Loaded(record.label, "m", run, run_data(run), document.figures))
+        loaded.append(LoadedRun(record.label, "m", run, run_data(run), document.figures))
     for row in figure_rows(loaded):
         size = {"µm": UIN, "mm": IN}.get(row.unit, 1.0)
         cells = re.findall(PAIR, re.findall(rf'<th scope="row">{re.escape(row.symbol)}</th>.*?</tr>', page)[0])
@@ -178,8 +178,8 @@ def test_compared_runs(running: Served) -> None:
 @pytest.mark.usefixtures("inches")
 def test_compared_lines() -> None:
     x, y, u = np.array([0.0, 254.0, 508.0]), np.array([0.0, 2.54, -5.08]), np.full(3, 0.254)
-    lines = [Curve(False, x, k * y, u, x[:, None]) for k in (1.0, 2.0)]
-    shown = pictures(lines, Difference(x, y, u), lambda key, **values: language.say("en", key, **values))
+    lines = [ComparedCurve(False, x, k * y, u, x[:, None]) for k in (1.0, 2.0)]
+    shown = pictures(lines, RunDifference(x, y, u), lambda key, **values: language.say("en", key, **values))
     both, apart = (str(svg) for svg, _ in shown)
     assert "A: −200 … 100 µin; B: −400 … 200 µin" in both
     assert ": 200 µin." in apart

@@ -13,12 +13,12 @@ import httpx
 import pytest
 
 from abbe.service.clock import SystemClock
-from abbe.service.scheduler.fleet import Figure, MachineLine
+from abbe.service.scheduler.fleet import FleetFigure, MachineLine
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web.app import create_app
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import HIDDEN, blanked, blanked_doc, blanked_line
-from abbe.service.web.pages.fleet import Asked, FleetLine, fleet_csv, fleet_lines
+from abbe.service.web.pages.fleet import FleetLine, FleetQuery, fleet_csv, fleet_lines
 from abbe.service.web.schemas import Device
 from abbe.service.web.view import View
 from tests.pages_world import Served
@@ -49,18 +49,18 @@ def test_machines_stand_worst_first_and_can_be_filtered(tmp_path: Path) -> None:
         now = datetime.now(UTC)
 
         def names(**asked: str) -> list[str]:
-            return [line.machine.machine for line in fleet_lines(store, now, Asked(**asked))]
+            return [line.machine.machine for line in fleet_lines(store, now, FleetQuery(**asked))]
 
         assert names() == ["broken", "bad", "good"]
         assert names(sort="machine") == ["bad", "broken", "good"]
         assert names(verdict="fail") == ["bad"]
         assert names(name="BRO") == ["broken"]
-        line = fleet_lines(store, now, Asked(name="good"))[0]
+        line = fleet_lines(store, now, FleetQuery(name="good"))[0]
         assert (line.share, line.share_u) == (pytest.approx(0.4), pytest.approx(0.1))
 
 
 def test_the_csv_holds_si_and_no_formula() -> None:
-    line = FleetLine(MachineLine('=cmd("x")', "waiting", verdict="pass"), Figure("body_diagonal_um", 8.0, 2.0, 20.0), 1)
+    line = FleetLine(MachineLine('=cmd("x")', "waiting", verdict="pass"), FleetFigure("body_diagonal_um", 8.0, 2.0, 20.0), 1)
     head, row = fleet_csv([line]).splitlines()
     assert head.startswith("machine,state,")
     assert row == '"\'=cmd(""x"")",waiting,,pass,body_diagonal_um,8.0,2.0,20.0,0.4,,,1,not checked yet'

@@ -14,12 +14,12 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, JobSeen, PushNow
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.push_approved import Order
-from abbe.service.core.jobs import JobBook
+from abbe.service.compensation.push_approved import PushOrder
+from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.tables.push_outcome import Outcome
+from abbe.service.tables.push_outcome import PushOutcome
 from abbe.service.web.pages.proposals import approve_as
 from tests.pages_world import Filled, Served
 from tests.patience import within
@@ -39,7 +39,7 @@ class Bench:
 
     def __post_init__(self) -> None:
         self.news = asyncio.Event()
-        self.book = JobBook(self.never, (), self.anybody, self.clock, self.news.set)
+        self.book = JobRegistry(self.never, (), self.anybody, self.clock, self.news.set)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
         self.orders = self.with_hands(Hands(push=self.push))
 
@@ -55,10 +55,10 @@ class Bench:
     async def anna(self, who: str) -> bool:
         return who == "user:anna"
 
-    async def push(self, order: Order) -> Outcome:
+    async def push(self, order: PushOrder) -> PushOutcome:
         self.pushed.append(order.proposal)
         await as_if_pushed(self.store, self.clock, self.filled.machine, {"proposal": order.proposal}, (b"June", b"July"), TAKEN_BACK)
-        return Outcome("kept", "all is well")
+        return PushOutcome("kept", "all is well")
 
     async def ask(self, number: int, who: str = "user:anna", key: str = "") -> Answer:
         return await self.orders.push(PushNow("push", 1, number, key, who))

@@ -16,7 +16,7 @@ from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
 from abbe.service.site import machine_from_doc
-from abbe.service.verification.compare_runs import Difference, Loaded, curve, difference, remarks
+from abbe.service.verification.compare_runs import LoadedRun, RunDifference, curve, difference, remarks
 from abbe.service.web.api.field import Motion
 from abbe.service.web.pages.runs import run_document
 from tests.pages_world import Served, as_user
@@ -179,17 +179,17 @@ def test_runs_of_one_kind_are_compared_and_others_refused(running: Served) -> No
 def test_a_difference_counts_the_mounting_and_names_direction_and_feed(running: Served) -> None:
     record = running.store.run(runs_of(running, "ballbar_helix")[0])
     run, document = run_document(running.store, record, Rules())
-    one = Loaded("a", "m", run, run_data(run), document.figures)
+    one = LoadedRun("a", "m", run, run_data(run), document.figures)
     columns = {name: list(values) for name, values in run["columns"].items()}
     columns["direction"], columns["feed_mm_min"] = [-v for v in columns["direction"]], [2 * v for v in columns["feed_mm_min"]]
-    other = Loaded("b", "m", run | {"columns": columns}, one.data, document.figures)
+    other = LoadedRun("b", "m", run | {"columns": columns}, one.data, document.figures)
     told = remarks([one, other])
     assert ["another direction" in told[0], "depends on feed" in told[1], len(told), remarks([one, one])] == [True, True, 2, []]
     found = difference(curve(one), curve(one))
     assert found is not None
     assert found.u_um.min() > np.sqrt(2.0) * U_REPEAT_MM * 1e3
-    nothing = Difference(np.arange(2.0), np.array([1.0, 1.0]), np.array([0.0, 2.0]))
-    assert (nothing.beyond, np.isnan(Difference(nothing.x, nothing.difference_um, np.zeros(2)).beyond)) == (0.0, True)
+    nothing = RunDifference(np.arange(2.0), np.array([1.0, 1.0]), np.array([0.0, 2.0]))
+    assert (nothing.beyond, np.isnan(RunDifference(nothing.x, nothing.difference_um, np.zeros(2)).beyond)) == (0.0, True)
 
 
 def test_a_run_compared_with_itself_measured_again_differs_by_nothing(running: Served) -> None:

@@ -14,10 +14,10 @@ from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import Setup, predict
+from abbe.models.solvers.observe import SetupUnknowns, predict
 from abbe.models.uncertainty.coverage import apart_from_zero
 from abbe.models.uncertainty.known_field import KnownField, field_map
-from abbe.models.uncertainty.what_if import Outcome, check_figures, diagonal_figures, expected_rms, helix_figure, volume_figures, what_if
+from abbe.models.uncertainty.what_if import Forecast, check_figures, diagonal_figures, expected_rms, helix_figure, volume_figures, what_if
 from abbe.models.verification import diagonal_figure
 from abbe.models.verification import helix_figure as measured_helix
 from abbe.models.volumetric import remove_rigid, volume_grid
@@ -150,7 +150,7 @@ def test_predicted_check_figures_are_those_of_exact_readings(known) -> None:
 def reading(kind, machine: Machine, known: KnownField, axes: np.ndarray, theta: np.ndarray, **setup) -> RunData:
     n = len(axes)
     empty = RunData("r", "S", kind, axes, np.zeros(n), np.zeros((n, 3)), np.arange(float(n)), np.ones(n), **setup)
-    return replace(empty, deviation_mm=predict(machine, known.terms, empty, Setup((), np.zeros(0), {}), theta))
+    return replace(empty, deviation_mm=predict(machine, known.terms, empty, SetupUnknowns((), np.zeros(0), {}), theta))
 
 
 def test_what_is_corrected_leaves_its_uncertainty(known) -> None:
@@ -164,7 +164,7 @@ def test_what_is_corrected_leaves_its_uncertainty(known) -> None:
         assert after.before_mm == before.before_mm  # the same draws
     d = known.per_unit(volume_grid(known.machine.stroke_mm, 6))
     unknown = np.sqrt(np.einsum("mik,kl,mil->", d, known.covariance, d, optimize=True) / len(d))
-    rms: Outcome = all_of_it[0]
+    rms: Forecast = all_of_it[0]
     assert np.hypot(rms.after_mm, rms.u_after_mm) == pytest.approx(unknown, rel=0.05)
 
 
