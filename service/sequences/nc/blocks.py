@@ -106,7 +106,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
     """The NC program of a campaign: every position of its plan in order, a dwell at each reading, a stop wherever a person is needed.
 
     ``arcs``: planes in which circles are written as arcs. How long it takes is said by who knows the controller
-    (`abbe.service.sequences.nc.duration`).
+    (`abbe.service.sequences.nc.write`).
     """
     moves = [s.feed_mm_min for t in plan.tests for s in t.steps if isinstance(s, MoveTo | RecordPath | FollowPath)]
     readings = sum(isinstance(s, ReadLaser | ReadBar) for t in plan.tests for s in t.steps)

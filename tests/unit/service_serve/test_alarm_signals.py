@@ -14,7 +14,6 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
-from abbe.service.tables.push_outcome import PushOutcome
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
@@ -27,6 +26,7 @@ from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import PushEntryRecord, VerificationRecord
+from abbe.service.tables.push_outcome import PushOutcome
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, open_alarms, series_begins
 from tests.unit.service_serve.fakes import FakeClock, FakeWatcher, Result, utc
