@@ -233,7 +233,10 @@ signal.pause()
 def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signals, code: int) -> None:
     child = tmp_path / "child.py"
     child.write_text(CHILD)
-    instead = f"from abbe.service.cli import main; from abbe.service.cli.administration import system; system.python_words = lambda _, *words: [{sys.executable!r}, {str(child)!r}, *words]"
+    instead = (
+        "from abbe.service.cli import main; from abbe.service.cli.administration import system; "
+        f"system.python_words = lambda _, *words: [{sys.executable!r}, {str(child)!r}, *words]"
+    )
     command = [sys.executable, "-c", f"{instead}; main()", "sim", "a.toml", "--help", "--speed=3"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

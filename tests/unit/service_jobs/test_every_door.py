@@ -20,7 +20,7 @@ ROOT = Path(abbe.service.__file__).parent
 ONLY_LOOKS = {
     ("scheduler/ready.py", "look_at"): "reads the status",
     ("tables/in_force.py", "look_at_table"): "reads which table is in force",
-    ("cli/table.py", "accept_table"): "a person vouches",
+    ("cli/tables/table.py", "accept_table"): "a person vouches",
     ("compensation/ordered_rollback.py", "bring_back"): "goes through `rollback`, which recovers",
     ("demo/demo.py", "run_demo"): "a control of its own, begun with this database",
     ("demo/demo_serve.py", "run_served_demo"): "the same",

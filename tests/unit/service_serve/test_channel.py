@@ -258,7 +258,7 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
 def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
     """In a fresh interpreter: everything that the process loads, and what it is refused afterwards."""
     program = (
-        "import sys\nfrom abbe.service.web.process import import_guard, process\nimport_guard.build()\n"
+        "import sys\nimport abbe.service.web.process.__main__\nfrom abbe.service.web.process import import_guard\nimport_guard.build()\n"
         "import abbe.service.web.process.serving, abbe.service.logs\n"
         "bad = [name for name in sys.modules if import_guard.behind(name)]\nassert not bad, bad\n"
         "for name in ('abbe.drivers.registry', 'pymodbus.client', 'serial', 'abbe.service.push.adapter', 'abbe.service.push.execute'):\n"
