@@ -43,7 +43,7 @@ fmt: $(DEV_READY) ## sort imports and format
 	$(BIN)/ruff format
 
 bench: $(BENCH_READY) ## speed and memory of the fast paths against other libraries (own environment, .venv-bench)
-	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/unit/test_kernel.py tests/unit/test_kernel_threads.py tests/unit/test_bench_case.py tests/unit/test_bench_trials.py tests/unit/test_bench_discovery.py
+	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/kernel/test_kernel_threads.py tests/unit/test_bench_case.py tests/unit/test_bench_trials.py tests/unit/test_bench_discovery.py
 	@$(BENCH_VENV)/bin/python -m tests.bench $(ARGS)
 
 lock: ## pin the dependencies of pyproject.toml anew (ARGS=--upgrade for newer versions)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F2, F3
-from abbe.models.geometry.table_machine import TableMachine, sampled
 from abbe.models.machine import AXES, Machine
+from tests.experiments.kernel.table_machine import TableMachine, sampled
 
 CASES = ("scattered", "grid")
 STROKE_MM = np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]])

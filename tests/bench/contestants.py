@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from abbe.models.arrays import F2
-from abbe.models.geometry import fast, kernel
 from tests.bench import peers
 from tests.bench.case import Case
+from tests.experiments.kernel import fast, kernel
 
 Run = Callable[[], F2]
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.geometry import kernel
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
 from tests.bench.__main__ import SECOND_ORDER_MM
 from tests.bench.case import CASES, make
+from tests.experiments.kernel import kernel
 
 POINTS = 20_000
 

@@ -9,13 +9,13 @@ import sys
 
 import pytest
 
-from tests.unit.test_kernel import NO_NUMBA
+from tests.experiments.kernel.test_kernel import NO_NUMBA
 
 PREPARE = """
 import os, sys, threading
 import numpy as np
-from abbe.models.geometry import fast, kernel
-from tests.unit.test_kernel import machine, points
+from tests.experiments.kernel import fast, kernel
+from tests.experiments.kernel.test_kernel import machine, points
 fast.WORTH_COMPILING = 1
 tables, p, axes = machine(), points(20_000), [np.linspace(0.0, 500.0, 30)] * 3
 expected, on_grid = kernel.scattered(tables, p), kernel.grid(tables, *axes)

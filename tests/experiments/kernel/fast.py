@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from abbe.models.arrays import F2
-from abbe.models.geometry import kernel
-from abbe.models.geometry.table_machine import TableMachine
+from tests.experiments.kernel import kernel
+from tests.experiments.kernel.table_machine import TableMachine
 
 WORTH_COMPILING = 200_000
 """Points from which on the compiled path is taken: loading it takes as long as numpy needs for some million points, once per process."""
@@ -19,7 +19,7 @@ WORTH_COMPILING = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Compiled:
-    """The compiled kernels (`abbe.models.geometry.compiled`), and how many cores they use when asked for all."""
+    """The compiled kernels (`tests.experiments.kernel.compiled`), and how many cores they use when asked for all."""
 
     scattered: Callable[..., F2]
     grid: Callable[..., NDArray[np.float64]]
@@ -30,7 +30,7 @@ class Compiled:
 def compiled_path() -> Compiled | None:
     """The compiled path, or None without numba. The first call of a process loads it, the first on a computer compiles it."""
     try:
-        from abbe.models.geometry import compiled
+        from tests.experiments.kernel import compiled
     except ImportError:
         return None
     return Compiled(compiled.scattered, compiled.grid, compiled.threads)

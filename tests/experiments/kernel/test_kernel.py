@@ -10,19 +10,18 @@ from functools import partial
 import numpy as np
 import pytest
 
-import abbe.models.geometry
 from abbe.models.functions.motions import ErrorMotions
 from abbe.models.functions.table import Table
-from abbe.models.geometry import fast, kernel
 from abbe.models.geometry.chain import all_chains, deviation_mm
-from abbe.models.geometry.table_machine import TableMachine, sampled
 from abbe.models.machine import Machine
+from tests.experiments.kernel import fast, kernel
+from tests.experiments.kernel.table_machine import TableMachine, sampled
 
 STROKE = np.array([[-50.0, 600.0], [100.0, 600.0], [0.0, 450.0]])
 RANGE = np.array([[-40.0, 560.0], [100.0, 590.0], [-5.0, 450.0]])
 NODES = (51, 2, 17)
 TOLERANCE_MM = 1e-12
-NO_NUMBA = "numba is not installed (extra `fast`); the developers' lock has it"
+NO_NUMBA = "numba is not installed; the developers' lock has it"
 
 
 @pytest.fixture(params=["numpy", "compiled", "all cores"])
@@ -31,7 +30,7 @@ def scattered(request, require):
     if request.param == "numpy":
         return kernel.scattered
     require("numba", importlib.util.find_spec("numba") is not None, NO_NUMBA)
-    from abbe.models.geometry import compiled
+    from tests.experiments.kernel import compiled
 
     return partial(compiled.scattered, all_cores=request.param == "all cores")
 
@@ -42,7 +41,7 @@ def grid(request, require):
     if request.param == "numpy":
         return kernel.grid
     require("numba", importlib.util.find_spec("numba") is not None, NO_NUMBA)
-    from abbe.models.geometry import compiled
+    from tests.experiments.kernel import compiled
 
     return partial(compiled.grid, all_cores=request.param == "all cores")
 
@@ -202,8 +201,8 @@ def test_positions_of_another_shape_are_refused(axes, scattered):
 
 
 def test_without_numba_the_automatic_choice_is_numpy(monkeypatch):
-    monkeypatch.setitem(sys.modules, "abbe.models.geometry.compiled", None)
-    monkeypatch.delattr(abbe.models.geometry, "compiled", raising=False)
+    monkeypatch.setitem(sys.modules, "tests.experiments.kernel.compiled", None)
+    monkeypatch.delattr(sys.modules["tests.experiments.kernel"], "compiled", raising=False)
     monkeypatch.setattr(fast, "WORTH_COMPILING", 5)
     fast.compiled_path.cache_clear()
     try:

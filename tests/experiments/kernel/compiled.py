@@ -1,6 +1,6 @@
 """`kernel.scattered` and `kernel.grid` as compiled loops, on one processor core or, when asked for, on all.
 
-The one file that knows numba (extra ``fast``). Without it, importing this file is an ImportError, and `abbe.models.geometry.fast` takes
+The one file that knows numba (extra ``fast``). Without it, importing this file is an ImportError, and `tests.experiments.kernel.fast` takes
 numpy.
 
 On one core there is no state and no thread library: any number of threads may be in these functions at once (Python's lock is free
@@ -23,8 +23,8 @@ from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import ArrayLike, NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry import kernel
-from abbe.models.geometry.table_machine import Segments, TableMachine
+from tests.experiments.kernel import kernel
+from tests.experiments.kernel.table_machine import Segments, TableMachine
 
 BLOCK = 4096
 """Points that one core takes at a time."""
@@ -38,7 +38,7 @@ _FIRST, _SECOND, _THIRD = 32, 24, 16
 
 
 def scattered(tables: TableMachine, axes_mm: ArrayLike, out: F2 | None = None, *, all_cores: bool = False) -> F2:
-    """First-order deviation at any positions (rule G, math.md 2), as `abbe.models.geometry.kernel.scattered` has it.
+    """First-order deviation at any positions (rule G, math.md 2), as `tests.experiments.kernel.kernel.scattered` has it.
 
     Agrees with it to rounding (sums are in another order, multiply-adds are rounded once).
 
@@ -81,7 +81,7 @@ def grid(
     *,
     all_cores: bool = False,
 ) -> NDArray[np.float64]:
-    """First-order deviation on a full grid (rule G, math.md 2), as `abbe.models.geometry.kernel.grid` has it.
+    """First-order deviation on a full grid (rule G, math.md 2), as `tests.experiments.kernel.kernel.grid` has it.
 
     Parameters
     ----------

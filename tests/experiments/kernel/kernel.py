@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.table_machine import Segments, TableMachine
 from abbe.models.machine import lever_masks
+from tests.experiments.kernel.table_machine import Segments, TableMachine
 
 BLOCK = 16384
 """Points worked on at a time: ten rows of 128 kB; smaller costs calls, larger falls out of the cache (measured)."""
