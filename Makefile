@@ -20,7 +20,7 @@ WORKERS ?= $(shell n=$$(( $(CORES) * 2 )); echo $$(( n < 8 ? n : 8 )))
 
 help: ## list what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
-	@echo "Options go into ARGS: make demo ARGS=--help, make test ARGS='tests/unit -k table'. Another Python: make test PYTHON=python3.12"
+	@echo "Options go into ARGS: make demo ARGS=--help, make test ARGS='tests/service -k table'. Another Python: make test PYTHON=python3.12"
 
 demo: $(RUN_READY) ## measure, correct and verify a simulated machine; writes a report
 	@$(BIN)/abbe demo $(ARGS)
@@ -30,7 +30,7 @@ test: $(DEV_READY) ## all tests, side by side, under 15 minutes on two cores; AR
 
 test-long: $(DEV_READY) ## hours: what is too long for every run, at full size; Ctrl-C stops it, and it goes on where it was
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.long $(ARGS)
-	$(if $(ARGS),,@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.campaigns.mutants)
+	$(if $(ARGS),,@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.experiments.campaigns.mutants)
 
 lint: $(DEV_READY) ## style, formatting, types, import walls
 	$(BIN)/ruff check --output-format concise
@@ -43,8 +43,8 @@ fmt: $(DEV_READY) ## sort imports and format
 	$(BIN)/ruff format
 
 bench: $(BENCH_READY) ## speed and memory of the fast paths against other libraries (own environment, .venv-bench)
-	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/kernel/test_kernel_threads.py tests/unit/test_bench_case.py tests/unit/test_bench_trials.py tests/unit/test_bench_discovery.py
-	@$(BENCH_VENV)/bin/python -m tests.bench $(ARGS)
+	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/kernel/test_kernel_threads.py tests/experiments/test_bench_case.py tests/experiments/test_bench_trials.py tests/experiments/test_bench_discovery.py
+	@$(BENCH_VENV)/bin/python -m tests.experiments.bench $(ARGS)
 
 lock: ## pin the dependencies of pyproject.toml anew (ARGS=--upgrade for newer versions)
 	@command -v uv >/dev/null || { echo "make lock needs uv, a Python package resolver: install it from your package source, then try again."; exit 1; }

@@ -16,7 +16,7 @@ RUN_FAILED = 2  # what make says when its command failed; a time-out says 124
 TESTS_FAILED = re.compile(r"^make(\[\d+\])?: \*\*\* .*\] Error 1$", re.MULTILINE)  # what pytest told make
 SAFETY = re.compile(
     r"^tests/(push|faults|linuxcnc)/|/test_[a-z0-9_]*"
-    r"(banks|commission|correct|desk|devices_first|door|interlock|kill|order|pending|proposal|push|recover|rollback|stop|table|unverified"
+    r"(alarm_manager|banks|commission|correct|desk|devices_first|door|interlock|kill|order|pending|proposal|push|recover|rollback|session|stop|table|unverified"
     r"|verified|watch|worse)"
 )
 """Tests of pushes, tables, recovery, interlocks and faults, by folder or by a word of the file's name: one failure is a failure."""

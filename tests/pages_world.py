@@ -54,8 +54,8 @@ from abbe.service.web.process.serving import make_server
 from abbe.service.web.view import View
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.scenarios.campaign_files import measured
+from tests.service.discovery.discovery_bench import Search, write_case
 from tests.system.serve_check import Result
-from tests.unit.service.discovery_bench import Search, write_case
 
 PHRASE = "correct horse battery staple"
 SEED = 3

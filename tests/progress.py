@@ -20,8 +20,8 @@ SECONDS = Path(__file__).with_name("seconds.txt")
 SLOW_S, QUICK_S = 2.0, 0.5
 """A file that takes longer is written into `SECONDS`; what a file takes that is not there."""
 WIRES = (
-    "tests/faults", "tests/push", "tests/linuxcnc", "tests/contract", "tests/system", "tests/scenarios", "tests/unit/drivers",
-    "tests/unit/service_capture", "tests/unit/service_serve", "tests/unit/service_plant", "tests/unit/service_web",
+    "tests/faults", "tests/push", "tests/linuxcnc", "tests/system", "tests/scenarios", "tests/drivers", "tests/service/capture",
+    "tests/service/core", "tests/service/plant", "tests/service/web",
 )  # fmt: skip
 """What talks to devices and browsers: some of its promises are tenths of a second, so what only computes gives way to it."""
 GIVES_WAY = 10

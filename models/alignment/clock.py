@@ -23,7 +23,7 @@ class Constants:
     """Of the line under delays whose number grows like a power of the delay, over the 24th least delay, by the estimated power.
 
     ``bias``: how far it lies too high in the middle; ``half`` and ``tilt``: half the width of 95.45 % of its error there, and of its rise
-    from end to end. Counted on 40 000 and 60 000 clouds with powers 0.6 to 4.5 (tests/campaigns/envelope_constants.py).
+    from end to end. Counted on 40 000 and 60 000 clouds with powers 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
     """
 
     shape: tuple[float, ...]

@@ -2,7 +2,7 @@
 
 The mean over the other two axes (the main effect) is the least-squares answer over the volume alone. What angles do at a distance that
 depends on two axes at once is left over, and much of it lies where people look first: along the body diagonals (ISO 230-6). So the four
-diagonals together count as much as the whole volume (tests/physics/test_tables.py says what that gives and what it costs).
+diagonals together count as much as the whole volume (tests/models/compensation/test_tables.py says what that gives and what it costs).
 """
 
 from __future__ import annotations

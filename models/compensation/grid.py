@@ -135,7 +135,8 @@ def node_design(solution: JointSolution, position_mm: tuple[F1, F1, F1], *, fitt
 
     ``fitted``: least-squares fit of the trilinear interpolant over the volume of the grid; else the terms' own values at the nodes. Every
     term bends along its own axis only and is at most linear in the others (rule G), where a trilinear field follows it exactly: so the fit
-    over the volume is the fit along the term's axis (tests/physics/test_tables_grid.py fits the whole volume and finds the same).
+    over the volume is the fit along the term's axis (tests/models/compensation/test_tables_grid.py fits the whole volume and finds the
+    same).
     """
     counts = tuple(p.size for p in position_mm)
     out: F3 = np.empty((int(np.prod(counts)), 3, len(solution.terms)))

@@ -202,7 +202,7 @@ def _demanded_variance(estimate: ParameterEstimate) -> float:
     Neighbouring residuals of a real machine are alike, so n readings are worth n (1 - r) / (1 + r), r their correlation at lag one (the
     integrated autocorrelation was tried and covers less: the fit has taken the slow part out of the residual). A curvature that cup offset
     and slopes absorb together leaves no residual and is not covered: A0Z and B0Z of a hemisphere about Z are the ones to doubt
-    (tests/physics/test_helix.py has the figures).
+    (tests/models/solvers/test_helix.py has the figures).
     """
     left = estimate.residual - estimate.residual.mean()
     power = float(left @ left)

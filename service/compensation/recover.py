@@ -31,7 +31,7 @@ READY = "make the machine ready (interlocks, link), then start again"
 async def recover(controller: Controller, store: Store, site: Site, *, accept_by: str = "") -> str | None:
     """Finish what the last push left open, and take over what interrupted runs left; returns what was done in a sentence or two, or None.
 
-    Everything that moves the machine, or builds on its table, calls this first (tests/unit/service_jobs/test_every_door.py).
+    Everything that moves the machine, or builds on its table, calls this first (tests/service/devices/test_every_session.py).
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """The one way to devices that are worked with: controller, then what an interrupted push left in it, and only then the instruments.
 
-An instrument that is missing or silent must not keep an unverified table in force (tests/unit/service_jobs/test_every_door.py).
+An instrument that is missing or silent must not keep an unverified table in force (tests/service/devices/test_every_session.py).
 """
 
 from __future__ import annotations

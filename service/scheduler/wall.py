@@ -1,7 +1,7 @@
 """Times that a cron expression names on a zone's wall clock, as UTC instants.
 
 cronsim only counts here, on clocks without zones: with a zone of its own it loses slots where the clocks change by half an hour
-(``20 */6 * * *`` in Australia/Lord_Howe, 2026-04-05 06:20; found by tests/unit/service_serve/test_two_years.py).
+(``20 */6 * * *`` in Australia/Lord_Howe, 2026-04-05 06:20; found by tests/service/core/test_two_years.py).
 """
 
 from __future__ import annotations

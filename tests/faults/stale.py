@@ -15,7 +15,7 @@ from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
-from tests.campaigns.late_replies import AddressMap, _tcp_device
+from tests.experiments.campaigns.late_replies import AddressMap, _tcp_device
 from tests.faults.contract import Observed, told_of
 from tests.faults.modbus_rig import records_of
 from tests.patience import within

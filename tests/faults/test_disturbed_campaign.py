@@ -1,6 +1,6 @@
 """A small campaign with a fault every 20 s of device time ends with the same solution, within its uncertainty, as the undisturbed one.
 
-The full one (the planner's hour, speed 60, a fault every 20 s) is ``python -m tests.campaigns.disturbed``.
+The full one (the planner's hour, speed 60, a fault every 20 s) is ``python -m tests.experiments.campaigns.disturbed``.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import pytest
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear
 from abbe.service.sequences.recipes.setups import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
-from tests.campaigns.disturbed import MACHINE, both, summary
+from tests.experiments.campaigns.disturbed import MACHINE, both, summary
 
 SPEED, EVERY_S, SEED = 60.0, 20.0, 5
 

@@ -1,6 +1,6 @@
 """The campaign of late, doubled and abandoned replies in small: none of ours is wrong, and the stock client shows that the test can tell.
 
-Full size: ``python -m tests.campaigns.late_replies --trials 100000``.
+Full size: ``python -m tests.experiments.campaigns.late_replies --trials 100000``.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 
 import pytest
 
-from tests.campaigns.late_replies import campaign
+from tests.experiments.campaigns.late_replies import campaign
 from tests.faults.patient import patience
 
 LONG = bool(os.environ.get("ABBE_TEST_LONG"))

@@ -16,7 +16,7 @@ from abbe.drivers.links.urls import ModbusRtuUrl, parse_url
 from abbe.simulators.faults.modbus_frames import RTU, Frame, parts
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
-from tests.campaigns.late_replies import AddressMap
+from tests.experiments.campaigns.late_replies import AddressMap
 from tests.faults.patient import patience
 
 TIMEOUT_S = 0.4

@@ -1,10 +1,11 @@
-"""Spoilt frames against all parsers; the whole million runs with ABBE_TEST_LONG=1, or as ``python -m tests.campaigns.parsers``."""
+"""Spoilt frames against all parsers; the whole million runs with ABBE_TEST_LONG=1, or as ``python -m
+tests.experiments.campaigns.parsers``."""
 
 from __future__ import annotations
 
 import os
 
-from tests.campaigns.parser_mutations import SHARES, WAYS, spoil
+from tests.experiments.campaigns.parser_mutations import SHARES, WAYS, spoil
 
 FRAMES = 1_000_000 if os.environ.get("ABBE_TEST_LONG") == "1" else 100_000
 

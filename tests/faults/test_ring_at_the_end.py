@@ -20,7 +20,7 @@ from abbe.service.runs.codec import decode_bar
 from abbe.service.storage.store import Store
 from tests.faults.serial_rig import Stage, Tap, stage
 from tests.patience import within
-from tests.unit.service_capture.capture_bench import new_run
+from tests.service.capture.capture_bench import new_run
 
 SENT = 400
 

@@ -1,6 +1,7 @@
 """Machines of known errors behind the drives of two controls: measured over the bridges, pushed, verified where the drives then stand.
 
-A machine is `tests.physics.truth.Truth`: exact kinematics with finite rotations, sines that no basis of the solver holds. It sees what
+A machine is `tests.models.solvers.truth.Truth`: exact kinematics with finite rotations, sines that no basis of the solver holds. It sees
+what
 the drives get (``drive-x..z``, after everything that the control adds), never the commands. Its instruments see only where the tool is.
 
 The first control gets a 3-D grid into its network, the second one its axes' own tables as COMP_FILE. Both run at the same time: nearly
@@ -32,7 +33,7 @@ from abbe.models.volumetric import field_figures
 from tests.linuxcnc.instance import Instance
 from tests.linuxcnc.test_control import OWNER, controller, push, until
 from tests.linuxcnc.test_files import settled
-from tests.physics.truth import FLOOR, MACHINE, PLACES, SIGMA, Truth
+from tests.models.solvers.truth import FLOOR, MACHINE, PLACES, SIGMA, Truth
 
 COUNTS = (13, 11, 10)
 LSB_MM = 1e-4

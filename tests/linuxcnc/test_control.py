@@ -27,8 +27,8 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from tests.linuxcnc.instance import Instance
 from tests.mbpoll import poll_table
+from tests.models.solvers.truth import MACHINE
 from tests.patience import within
-from tests.physics.truth import MACHINE
 
 OWNER = 0xABBE0001
 FEED = 20_000.0

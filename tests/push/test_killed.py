@@ -68,7 +68,7 @@ def test_killed_at_every_operation(bench: Bench, better: bool) -> None:
 
 
 def test_killed_from_outside_at_random_instants(bench: Bench) -> None:
-    """`python -m tests.campaigns.push kills` does 300."""
+    """`python -m tests.experiments.campaigns.push kills` does 300."""
     found = kills(bench, 300 if LONG else 12, 1)
     assert found.violations == [], found.text()
     assert found.killed >= 12, found.text()

@@ -28,7 +28,7 @@ def zygotes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Zygote, 
 
 @pytest.mark.parametrize("case", DATABASES)
 def test_two_that_push_at_once(tmp_path: Path, case: str, zygotes: tuple[Zygote, Zygote]) -> None:
-    """`python -m tests.campaigns.push races` does 200 of each."""
+    """`python -m tests.experiments.campaigns.push races` does 200 of each."""
     with simulated(tmp_path, "--speed", "60") as sims:
         found = races(sims.ready["cnc"], sims.ask, tmp_path, DATABASES[case], COUNT, 3, zygotes=zygotes)
     assert found.violations == [], found.text()

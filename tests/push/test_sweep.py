@@ -1,6 +1,6 @@
 """The push protocol against every fault: no invariant is violated; with a protection taken away, one is.
 
-Here all single faults and a fixed sample of the double ones; all of them by ``python -m tests.campaigns.push sweep``.
+Here all single faults and a fixed sample of the double ones; all of them by ``python -m tests.experiments.campaigns.push sweep``.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import pytest
 from abbe.models.solvers.observations import RunData
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.site import Site, machine_doc
-from tests.campaigns import population
+from tests.experiments.campaigns import population
 
 Doc = dict[str, Any]
 EVERY = 4

@@ -1,6 +1,7 @@
 """The planner's hour on a few machines of the population: how much better their distances become, and how near the bound that is.
 
-All hundred: ``python -m tests.campaigns.accuracy --machines 100``; bounds here hold for these seeds with room for other round-off only.
+All hundred: ``python -m tests.experiments.campaigns.accuracy --machines 100``; bounds here hold for these seeds with room for other
+round-off only.
 """
 
 import os
@@ -9,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.campaigns.accuracy import line, one, pooled, ratios, summary
+from tests.experiments.campaigns.accuracy import line, one, pooled, ratios, summary
 
 SEEDS = (0, 12, 25) if os.environ.get("ABBE_TEST_LONG") else (12, 25)
 """Machines that are good already, the hardest to make ten times better; the third one takes as long as the others together."""

@@ -10,8 +10,8 @@ import pytest
 from abbe.service.campaign_data.copied_runs import copies
 from abbe.service.errors import AbbeError, CampaignRefused
 from abbe.service.identification.solve import check_campaign
-from tests.campaigns import population
-from tests.campaigns.population import CAMPAIGNS
+from tests.experiments.campaigns import population
+from tests.experiments.campaigns.population import CAMPAIGNS
 from tests.scenarios.campaign_files import machine_of, measured
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"

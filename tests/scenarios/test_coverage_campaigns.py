@@ -1,7 +1,8 @@
 """Forty random machines, eight under each kind of campaign: stated intervals hold the truth as often as they say, and no claim is wrong.
 
-The same counting as ``python -m tests.campaigns.coverage`` on other machines. Forty cannot tell 93 % from 97 %: the intervals of one
-machine go right or wrong together, and what 40 such clusters leave is measured in the sample itself (`tests.campaigns.statistics`, ratio
+The same counting as ``python -m tests.experiments.campaigns.coverage`` on other machines. Forty cannot tell 93 % from 97 %: the intervals
+of one machine go right or wrong together, and what 40 such clusters leave is measured in the sample itself
+(`tests.experiments.campaigns.statistics`, ratio
 estimator). The band is the goal, 93 to 97 %, widened by three of these standard errors on either side: a coverage within the goal falls
 outside once in 370 times, a coverage more than six standard errors outside the goal hardly ever falls inside. The error itself is bounded,
 or a scatter of wrong intervals would excuse itself.
@@ -12,9 +13,9 @@ from functools import cache
 
 import pytest
 
-from tests.campaigns.population import CAMPAIGNS, Kind
-from tests.campaigns.scoring import judge
-from tests.campaigns.statistics import Share, parameter_share, point_share
+from tests.experiments.campaigns.population import CAMPAIGNS, Kind
+from tests.experiments.campaigns.scoring import judge
+from tests.experiments.campaigns.statistics import Share, parameter_share, point_share
 
 FIRST_SEED, MACHINES = 2001, 8
 LOW, HIGH, ERRORS = 0.93, 0.97, 3.0

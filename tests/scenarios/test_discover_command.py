@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.service import cli
-from tests.unit.service.discovery_bench import NOISE_MM, circle, write_case
+from tests.service.discovery.discovery_bench import NOISE_MM, circle, write_case
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
 ROLES = ("identify",) * 6 + ("holdout", "sealed")

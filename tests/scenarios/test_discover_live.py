@@ -11,7 +11,7 @@ from abbe.service import cli
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store
 from tests.scenarios.world import axes_at_rest, wait_for
-from tests.unit.service.discovery_bench import Search
+from tests.service.discovery.discovery_bench import Search
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 

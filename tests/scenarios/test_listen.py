@@ -8,7 +8,7 @@ import pytest
 
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store
-from tests.unit.service_jobs.nc_reader import read_gcode
+from tests.service.sequences.nc_reader import read_gcode
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 

@@ -2,8 +2,8 @@
 
 Mutations that were seen to be caught: removing the read-back comparison (`test_a_bit_lost_on_the_way_...`), removing the comparison of
 meaning (`test_an_encoder_that_lies_...`), flipping the sign of the tables or swapping two axes in the encoder
-(`test_every_entry_acts_on_its_own_axis_...`, tests/unit/service_jobs/test_tables_on_the_wire.py, tests/physics/test_joint.py), removing the
-roll-back (`test_a_stop_and_a_wrong_sign_...` in test_correction.py).
+(`test_every_entry_acts_on_its_own_axis_...`, tests/service/push/test_tables_on_the_wire.py, tests/models/solvers/test_joint.py), removing
+the roll-back (`test_a_stop_and_a_wrong_sign_...` in test_correction.py).
 """
 
 from contextlib import asynccontextmanager

@@ -16,7 +16,7 @@ from abbe.service.runs.exchange import import_folder
 from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
-from tests.campaigns.population import draw_case
+from tests.experiments.campaigns.population import draw_case
 from tests.scenarios.campaign_files import measured, write_folder
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]

@@ -1,7 +1,7 @@
 """A flood against the page: idle connections, slow ones and bodies of 10 MB, while the machine is measured. No sample may be lost for it.
 
 Counts and seconds are those of reliability.md 5: 2,000 idle, 200 slow, a minute. What the page does about each of them is tested one by one
-in `tests/unit/service_users/test_connections.py`.
+in `tests/service/users/test_connections.py`.
 """
 
 from __future__ import annotations

@@ -1,0 +1,78 @@
+"""What the tests of the service share because it is always the same and dear to make: the tree of commands, an empty SQLite database."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
+from uuid import uuid4
+
+import pytest
+import typer.main
+import typer.testing
+from sqlalchemy import Connection, create_engine
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _commands_built_once() -> Iterator[None]:
+    """Typer builds the tree of all commands anew at each call of one; it is a function of what is registered."""
+    build = typer.main.get_command
+    built: dict[tuple[int, int], tuple[typer.Typer, Any]] = {}
+
+    def get_command(app: typer.Typer) -> Any:
+        key = (id(app), len(app.registered_commands) + len(app.registered_groups))
+        if key not in built:
+            built[key] = (app, build(app))  # the application is held with it: its id stays its own
+        return built[key][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.main, "get_command", get_command)
+        patch.setattr(typer.testing, "_get_command", get_command)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _schema_built_once() -> Iterator[None]:
+    """An empty SQLite database gets what all migrations, played once, have made; one with content, and PostgreSQL, are migrated."""
+    with pytest.MonkeyPatch.context() as patch:
+        upgraded = _copying()
+        patch.setattr("alembic.command.upgrade", upgraded)
+        yield
+
+
+def _copying() -> Callable[[Any, str], None]:
+    from alembic import command
+
+    from abbe.service.storage.migrate import head_revision
+
+    migrate = command.upgrade
+
+    @cache
+    def statements(_head: str) -> tuple[str, ...]:
+        from abbe.service.storage.migrate import _config
+
+        engine = create_engine("sqlite://")
+        with engine.begin() as connection:
+            migrate(_config(connection), "head")
+            raw = connection.connection.driver_connection
+            assert isinstance(raw, sqlite3.Connection)
+            found = tuple(s for s in raw.iterdump() if s not in {"BEGIN TRANSACTION;", "COMMIT;"})
+        engine.dispose()
+        return found
+
+    def upgrade(config: Any, revision: str) -> None:
+        connection = config.attributes.get("connection")
+        if revision != "head" or not isinstance(connection, Connection) or connection.dialect.name != "sqlite" or _has_content(connection):
+            migrate(config, revision)
+            return
+        for statement in statements(head_revision()):
+            own = f"VALUES(1,'{uuid4().hex}')" if statement.startswith('INSERT INTO "identity"') else ""  # each is a database of its own
+            connection.exec_driver_sql(re.sub(r"VALUES\(1,'[0-9a-f]{32}'\)", own, statement) if own else statement)
+
+    return upgrade
+
+
+def _has_content(connection: Connection) -> bool:
+    return bool(connection.exec_driver_sql("SELECT count(*) FROM sqlite_master").scalar())

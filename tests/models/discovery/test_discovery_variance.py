@@ -1,0 +1,124 @@
+"""Effects of the scatter: found when they are there, silent on noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from abbe.models.arrays import F1
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, candidates, contaminated, extra_variance
+from abbe.models.effects.path import Path
+from tests.models.discovery.discovery_paths import bar, campaign, circle, noise
+
+PATHS = campaign()
+SIGMA = tuple(4e-4 if p.kind == "bar" else 3e-4 for p in PATHS)
+
+
+def found(add: list[F1], seed: int = 3) -> tuple[VarianceFinding, ...]:
+    rest = tuple(e + a / s for e, a, s in zip(noise(PATHS, seed), add, SIGMA, strict=True))
+    return extra_variance(PATHS, rest, SIGMA)
+
+
+def only_bars(make: object) -> list[F1]:
+    return [make(p) if p.kind == "bar" else np.zeros(p.n) for p in PATHS]  # type: ignore[operator]
+
+
+def test_vibration_by_axis_frequency_and_amplitude() -> None:
+    rng = np.random.default_rng(1)
+
+    def wave(p: Path) -> F1:
+        return np.asarray(0.6e-3 * np.sin(2 * np.pi * 37.3 * p.at.t_s + rng.uniform(0, 6.28)) * p.look[:, 1])
+
+    first = found(only_bars(wave))[0]
+    assert first.label == "vibration:Y"
+    assert abs(first.parameters["frequency_hz"] - 37.3) < 0.1
+    assert abs(first.strength - 0.6) < 3 * first.u_strength < 0.2
+
+
+def test_stick_slip_by_axis_and_size() -> None:
+    rng = np.random.default_rng(2)
+
+    def saw(p: Path) -> F1:
+        tooth = 2.0 * rng.uniform(size=p.n) - 1.0
+        gate = np.exp(-np.square(p.at.v_mm_s[:, 0] / 2.0)) * (np.ptp(p.at.q_mm[:, 0]) > 0)
+        return np.asarray(3e-3 * tooth * gate * p.look[:, 0])
+
+    first = found(only_bars(saw))[0]
+    assert first.label == "stick_slip:X"
+    assert first.where.axes == ("X",)
+    assert abs(first.strength - 3.0) < 0.5
+    assert 1.2 < first.parameters["v_c"] < 3.2
+
+
+def test_few_laser_readings_that_are_off() -> None:
+    rng = np.random.default_rng(4)
+    add = [np.where(rng.uniform(size=p.n) < 0.03, 2e-3 * rng.choice([-1, 1], p.n), 0.0) * (p.kind == "laser") for p in PATHS]
+    first = found(add)[0]
+    assert first.label == "beam_outliers"
+    assert first.where.tests == ("laser_diagonal",)
+    assert abs(first.strength - 2.0) < 0.6
+    assert 0.005 < first.parameters["rate"] < 0.08
+
+
+def test_a_burst_of_one_run_is_located_and_has_no_name() -> None:
+    rng = np.random.default_rng(5)
+    run = PATHS[1]
+    middle = float(run.at.t_s[len(run.at.t_s) // 2])
+    add = [6e-3 * rng.standard_normal(p.n) * (np.abs(p.at.t_s - middle) < 1.5) * (p is run) for p in PATHS]
+    bursts = [f for f in found(add) if f.name == "unnamed_burst"]
+    assert bursts
+    assert bursts[0].where.runs == (run.label,)
+    assert bursts[0].where.time_s is not None
+    assert bursts[0].where.time_s[0] - 1 < middle < bursts[0].where.time_s[1] + 1
+
+
+def test_noise_alone_names_nothing() -> None:
+    """15 campaigns of noise, four kinds of effect each: none above zero; a rate of 3 in 1000 each gives none of 60 with 84 %."""
+    best = [max(f.evidence for f in candidates(PATHS, noise(PATHS, 100 + seed), SIGMA)) for seed in range(15)]
+    assert max(best) < 0.0
+
+
+def test_mean_that_is_left_is_no_vibration() -> None:
+    def smooth(p: Path) -> F1:
+        return np.asarray(1e-3 * np.sin(3.0 * np.linspace(0.0, 2 * np.pi, p.n)) * p.look[:, 0])
+
+    assert not [f for f in found(only_bars(smooth)) if f.name == "vibration"]
+
+
+@pytest.mark.parametrize("feeds", [(1500.0,), (1500.0, 2600.0)])
+def test_what_comes_back_at_every_turn_of_the_bar_is_no_vibration(feeds: tuple[float, ...]) -> None:
+    """Nine lobes of a ball: a frequency in time as well, where all runs have one feed; only a run that meets them otherwise could tell."""
+    paths = tuple(bar(f"{f:.0f}{k}", circle((0, 1)), 620.0 + 90.0 * k, feed=f) for f in feeds for k in range(4))
+    sigma = (4e-4,) * len(paths)
+    angles = [np.arctan2(p.look[:, 1], p.look[:, 0]) for p in paths]
+    rest = tuple(e + 1e-3 * np.sin(9.0 * a) * p.look[:, 0] / s for e, a, p, s in zip(noise(paths, 5), angles, paths, sigma, strict=True))
+    assert "vibration" not in [f.name for f in extra_variance(paths, rest, sigma)]
+
+
+def test_mixture_needs_more_than_one_reading() -> None:
+    rest = np.random.default_rng(8).standard_normal(300)
+    rest[17] = 4.5
+    assert contaminated(rest).gain < 7.0
+
+
+def test_leverage_is_taken_back() -> None:
+    rest = noise(PATHS, 9)
+    squeezed = tuple(0.7 * r for r in rest)
+    leverage = tuple(np.full(p.n, 1.0 - 0.49) for p in PATHS)
+    a = [f.evidence for f in candidates(PATHS, rest, SIGMA)]
+    b = [f.evidence for f in candidates(PATHS, squeezed, SIGMA, leverage=leverage)]
+    assert np.allclose(a, b, rtol=1e-6, atol=1e-6)
+
+
+def test_a_place_where_the_machine_is_off_is_no_lost_beam() -> None:
+    """Two runs of each diagonal pass the same corner; a lost beam is not lost again there."""
+    laser = [p for p in PATHS if p.kind == "laser"]
+    corner = laser[0].at.q_mm[12]
+
+    def bump(p: Path) -> F1:
+        return np.asarray(4e-3 * np.exp(-0.5 * np.sum((p.at.q_mm - corner) ** 2, axis=1) / 15.0**2) * (p.kind == "laser"))
+
+    first = found([bump(p) for p in PATHS])[0]
+    assert first.label == "unnamed_place"
+    assert first.where.position_mm is not None
+    assert np.linalg.norm(np.array(first.where.position_mm) - corner) < 30.0

@@ -1,0 +1,149 @@
+"""Long ball-bar runs become means of equal blocks; everything else stays as it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from abbe.service.campaign_data import decimation as module
+from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.campaign_data.decimation import picked, thinned, thinning
+from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.events import ignore_progress
+from abbe.service.rendering.discovery_page import render_discovery
+from abbe.service.report.discovery_pages import discovery_page, page_facts
+from abbe.service.runs.discovery_file import DiscoveryFile
+from tests.service.discovery.discovery_bench import Search, circle, write_case
+
+
+def test_short_campaigns_stay_as_they_are() -> None:
+    runs = [circle(1, "identify"), circle(2, "sealed")]
+    assert thinned(runs) is runs
+
+
+def test_long_ones_become_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 100)
+    laser = circle(3, "identify") | {"test": "laser_linear"}
+    first = circle(1, "identify")
+    first["columns"]["valid"] = [0] * 3 + [1] * 2 + [0] + [1] * 114
+    runs = [first, circle(2, "holdout"), circle(4, "sealed"), laser]
+    short = thinned(runs)  # 240 measured readings of the ball-bar: blocks of three
+    assert [len(r["columns"]["t_s"]) for r in short] == [40, 40, 120, 120]
+    assert short[2:] == runs[2:]
+    columns = short[0]["columns"]
+    assert columns["valid"] == [0] + [1] * 39
+    deviation = np.array(first["columns"]["deviation_mm"])
+    assert columns["deviation_mm"][1] == pytest.approx(deviation[3:5].mean())  # the flagged one does not count
+    assert columns["deviation_mm"][5] == pytest.approx(deviation[15:18].mean())
+    assert columns["x_mm"][5] == first["columns"]["x_mm"][16]  # a point of the path: the mean of three lies inside the circle
+    assert columns["direction"] == first["columns"]["direction"][:40]
+    assert np.all(np.diff(columns["t_s"]) > 0)
+    assert len(first["columns"]["t_s"]) == 120
+
+
+def test_a_block_over_lost_readings_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 20)
+    run = circle(1, "identify")
+    lost = [i for i in range(120) if not 40 <= i < 70]
+    run["columns"] = {name: [values[i] for i in lost] for name, values in run["columns"].items()}
+    short = thinned([run])[0]["columns"]  # blocks of five, one of them from reading 40 to 74
+    assert len(short["t_s"]) == 18
+    whole = thinned([circle(1, "identify")])[0]["columns"]
+    assert set(short["x_mm"]) <= set(run["columns"]["x_mm"])
+    assert len(whole["t_s"]) == 20
+
+
+def test_lost_readings_do_not_change_how_many_one_value_stands_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 20)
+    run = circle(1, "identify")
+    for pause in (8, 38, 68):  # three of its blocks have a gap
+        run["columns"]["t_s"] = [t + 1000.0 * (i >= pause) for i, t in enumerate(run["columns"]["t_s"])]
+    run["columns"] = {name: values[:118] for name, values in run["columns"].items()}
+    short = thinned([run])
+    told = thinning([run], short)
+    assert told is not None
+    assert len(short[0]["columns"]["t_s"]) == 16
+    assert told.each == 6  # 118 readings over 16 values are 7
+
+
+def test_a_flagged_reading_that_is_no_number_leaves_its_mean_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 40)
+    run = circle(1, "identify")
+    run["columns"]["valid"] = [1] * 4 + [0] + [1] * 115
+    run["columns"]["deviation_mm"][4] = float("nan")
+    columns = thinned([run])[0]["columns"]  # blocks of three
+    assert columns["deviation_mm"][1] == pytest.approx(np.mean([run["columns"]["deviation_mm"][i] for i in (3, 5)]))
+    assert columns["valid"] == [1] * 40
+    told = thinning([run], picked([run], 40))
+    assert told is not None
+    assert not told.means  # a reading that is no number is not another one
+
+
+def test_a_short_run_beside_long_ones_keeps_its_readings() -> None:
+    long, short = circle(1, "identify"), circle(2, "identify")
+    short["columns"] = {name: values[:4] for name, values in short["columns"].items()}
+    few = picked([long, short], 10)  # one of 13: the middle one would be the seventh
+    assert few[1] is short
+    told = thinning([long, short], few)
+    assert told is not None
+    assert (told.each, told.kept) == (13, 13)
+
+
+def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_READINGS", 100)
+    runs = [circle(1, "identify"), circle(2, "holdout"), circle(4, "sealed")]
+    assert thinning(runs, runs) is None
+    told = thinning(runs, thinned(runs))
+    assert told is not None
+    assert (told.readings, told.kept, told.each, told.means) == (240, 80, 3, True)
+    step = np.diff(runs[0]["columns"]["t_s"])[0]
+    assert told.interval_s == pytest.approx(3.0 * step)
+    assert told.hertz == pytest.approx(1.0 / (6.0 * step))
+    assert 4 <= told.turning <= 8  # X and Y turn round twice a turn each; one of these is where the circle begins
+    done, hidden, remedy = told.lines
+    assert "every 3 of them became one mean, 80 values in all" in done
+    assert "could not be seen, which does not say that it is absent" in hidden
+    assert f"in {told.turning} means an axis turns round" in hidden
+    assert f"vibration above {told.hertz:.2g} Hz" in hidden
+    assert "is 1/3 as high" in hidden
+    assert f"keeps its height from {6.0 * step:.2g} s on" in hidden  # half as long, it lies in two means
+    assert "--without RUN" in remedy
+
+
+def test_readings_that_were_left_out_are_told_too() -> None:
+    runs = [circle(1, "identify"), circle(2, "holdout")]
+    told = thinning(runs, picked(runs, 80))
+    assert told is not None
+    assert (told.means, told.each) == (False, 3)
+    assert "of every 3 one was looked at" in told.lines[0]
+    assert told.doc()["how"] == "picked"
+
+
+def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_case(tmp_path / "c1")
+    monkeypatch.setattr(module, "MOST_READINGS", 200)
+    job = prepare(from_folder(folder), catalogue())
+    journal = DiscoveryJournal()
+    finding = discover(job, journal, Search("none"), ignore_progress)
+    assert job.thinning is not None
+    assert set(job.thinning.lines) <= set(job.flags)  # `abbe discover` prints every flag
+    assert journal.states[0][1]["flags"] == list(job.flags)
+    answer = finding["answer"]
+    assert DiscoveryFile.model_validate_json(json.dumps(answer)).thinning is not None
+    assert (answer["thinning"]["readings"], answer["thinning"]["readings_per_value"]) == (360, 2)
+    assert len(answer["thinning"]["not_seen"]) == 3
+    page = render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, "now")))
+    assert "every 2 of them became one mean" in page
+    assert "could not be seen, which does not say that it is absent" in page
+
+
+def test_a_short_campaign_says_nothing_of_it(tmp_path: Path) -> None:
+    job = prepare(from_folder(write_case(tmp_path / "c1")), catalogue())
+    finding = discover(job, DiscoveryJournal(), Search("none"), ignore_progress)
+    assert job.thinning is None
+    assert "thinning" not in finding["answer"]
+    assert not any("readings are more than" in line for line in job.flags)

@@ -1,0 +1,222 @@
+"""What documents and a real control say, against what the formats write and what the model does with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable, correction_at
+from abbe.service.formats.proof import all_proofs
+from abbe.service.formats.registry import FORMATS
+from abbe.service.formats.settings import FormatSettings
+from abbe.service.formats.text import TextFile
+from tests.service.formats.page import PAGE, page
+
+# controllers.md 5.7, by hand: what +10 µm of error at 100 mm must be in each file.
+STEP = {
+    ("isg", "X over X"): "100.0 0.01",
+    ("linuxcnc-1", "X over X"): "100 -0.0100 -0.0100",
+    ("linuxcnc-0", "X over X"): "100 100.0100 100.0100",
+    ("linuxcnc-1", "X over X, only while moving in −"): "100 0.0000 -0.0100",
+    ("linuxcnc-hal", "Y over X"): "setp t-yx.y-val-02 -0.01",
+    ("siemens-eec", "X over X"): "$AA_ENC_COMP[0,2,X1]=0.01",
+    ("siemens-cec", "Y over X"): "$AN_CEC[0,2]=-0.01",
+    ("fanuc-pitch", "X over X"): "N10001Q1P-10",
+    ("fanuc-lattice", "3-D grid, X"): "14,100,100,100,-10,0,0",
+    ("mach4", "X over X"): "3,100.0,-0.0100,-0.0100",
+    ("centroid", "X over X"): "-10",
+}
+
+
+def test_step_stands_in_every_file_as_the_specification_says() -> None:
+    found = {(p.format, p.what): p for p in all_proofs()}
+    assert {f for f, _ in found} == set(FORMATS)
+    for key, line in STEP.items():
+        assert line in found[key].lines, key
+    for proof in found.values():
+        assert proof.lines
+        assert proof.added_mm == pytest.approx(-0.010, abs=1e-9), proof
+
+
+def test_page_is_current() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page(), "run python -m tests.service.formats.page"
+
+
+def _added(comp: Compensation, x: float, way: int, axis: int = 0) -> float:
+    at, direction = np.zeros((1, 3)), np.full((1, 3), float(way))
+    at[0, axis] = x
+    return float(correction_at(comp, at, direction)[0, axis])
+
+
+def test_comp_files_do_what_linuxcnc_was_seen_to_do(shared: Path) -> None:
+    """controllers.md 1.4: motor minus commanded position, read from the running control."""
+    folder = shared / "examples" / "linuxcnc"
+    x = FORMATS["linuxcnc-1"].read((TextFile("x.comp", (folder / "x.comp").read_text()),), FormatSettings())
+    seen = ((50, 1, 0.0050), (150, 1, 0.0175), (250, 1, 0.0200), (250, -1, 0.0215), (333, 1, 0.0084), (450, 1, -0.0125), (450, -1, -0.0110))
+    for at, way, added in seen:
+        assert _added(x, at, way) == pytest.approx(added, abs=2e-6), (at, way)
+    z = FORMATS["linuxcnc-0"].read((TextFile("z.comp", (folder / "z.comp").read_text()),), FormatSettings())
+    assert _added(z, -100, -1, axis=2) == pytest.approx(-0.0120, abs=1e-9)
+    assert _added(z, -125, 1, axis=2) == pytest.approx(-0.00375, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["x.comp", "y.comp"])
+def test_comp_files_come_back_byte_for_byte(shared: Path, name: str) -> None:
+    text = (shared / "examples" / "linuxcnc" / name).read_text()
+    form = FORMATS["linuxcnc-1"]
+    settings = FormatSettings(decimals=3)
+    assert form.write(form.read((TextFile(name, text),), settings), settings) == (TextFile(name, text),)
+
+
+def test_hal_network_does_what_linuxcnc_was_seen_to_do() -> None:
+    """controllers.md 1.5: drive minus motor command of the tried network (voltest.py), written and read in our form."""
+    p = 50.0 * np.arange(11)
+    tables = (
+        AxisTable("Y", "X", p, *[0.008 * np.sin(p / 400 * np.pi)] * 2),
+        AxisTable("X", "Y", p, *[0.012 * (p / 500) ** 2 + 50e-6 * p] * 2),
+        AxisTable("X", "Z", p, *[-0.006 * p / 500] * 2),
+    )
+    product = ProductTable("Z", AxisCurve("Y", p, 20e-6 * p / 400), AxisCurve("Y", np.array([0.0, 500.0]), np.array([0.0, 500.0])))
+    form, settings = FORMATS["linuxcnc-hal"], FormatSettings(decimals=9)
+    comp = form.read(form.write(Compensation(tables, (product,)), settings), settings)
+    at = np.array([[100, 200, -100], [250, 100, -50], [500, 400, -300]], dtype=float)
+    seen = [[0.008000, 0.005480, 0.000800], [0.005657, 0.015500, -0.002500], [0.000000, 0.037000, 0.002000]]
+    np.testing.assert_allclose(correction_at(comp, at), seen, atol=1.5e-6)
+
+
+EEC_HEAD = """%_N_AX_EEC_INI
+CHANDATA(1)
+$AA_ENC_COMP[0,0,X1]=0.003
+$AA_ENC_COMP[0,1,X1]=0.01
+$AA_ENC_COMP[0,2,X1]=0.012
+"""
+EEC_TAIL = """$AA_ENC_COMP[0,800,X1]=0.0
+$AA_ENC_COMP_STEP[0,X1]=1.0
+$AA_ENC_COMP_MIN[0,X1]=-200.0
+$AA_ENC_COMP_MAX[0,X1]=600.0
+$AA_ENC_COMP_IS_MODULO[0,X1]=0
+M17
+"""
+
+
+def test_siemens_encoder_example_comes_out_byte_for_byte() -> None:
+    """6FC5397-1BP40-3BA1 p. 242, without its comments and its minus before the last zero: +3 µm at -200 mm moves the axis in −."""
+    value = np.zeros(801)
+    value[:3] = [-0.003, -0.010, -0.012]
+    table = AxisTable("X", "X", -200.0 + np.arange(801), value, value)
+    text = FORMATS["siemens-eec"].write(Compensation((table,)), FormatSettings())[0].text
+    assert text.startswith(EEC_HEAD)
+    assert text.endswith(EEC_TAIL)
+    middle = text[len(EEC_HEAD) : -len(EEC_TAIL)].splitlines()
+    assert middle == [f"$AA_ENC_COMP[0,{k},X1]=0.0" for k in range(3, 800)]
+
+
+CEC = """%_N_NC_CEC_INI
+CHANDATA(1)
+$AN_CEC[0,0]=0.0
+$AN_CEC[0,1]=0.01
+$AN_CEC[0,2]=0.012
+$AN_CEC_INPUT_AXIS[0]=(AX2)
+$AN_CEC_OUTPUT_AXIS[0]=(AX1)
+$AN_CEC_STEP[0]=8.0
+$AN_CEC_MIN[0]=-400.0
+$AN_CEC_MAX[0]=-384.0
+$AN_CEC_DIRECTION[0]=0
+$AN_CEC_MULT_BY_TABLE[0]=0
+$AN_CEC_IS_MODULO[0]=0
+M17
+"""
+
+
+def test_siemens_cross_example_comes_back_byte_for_byte() -> None:
+    """The variables of 6FC5397-1CP10-5BA0 p. 222 in their order (its own step of 6.73 mm does not divide its range: shortened here)."""
+    form = FORMATS["siemens-cec"]
+    comp = form.read((TextFile("NC_CEC.INI", CEC),), FormatSettings())
+    assert (comp.tables[0].axis, comp.tables[0].output) == ("Y", "X")
+    assert form.write(comp, FormatSettings())[0].text == CEC
+
+
+def test_fanuc_example_sums_up_as_drawn() -> None:
+    """B-63980EN p. 100: points 33 to 49, reference at point 40; the sum at the reference is zero and the numbers come back."""
+    numbers = [2, 1, 1, -2, 0, -1, 0, -1, 2, 1, 0, -1, -1, -2, 0, 1, 2]
+    head = ["%", "N03620Q1A1P40", "N03621Q1A1P33", "N03622Q1A1P49", "N03623Q1A1P1", "N03624Q1A1P50"]
+    text = "\n".join([*head, *(f"N{10033 + k}Q1P{v}" for k, v in enumerate(numbers)), "%"]) + "\n"
+    settings = FormatSettings(reference_mm=(0.0, 0.0, 0.0), first_point=33)
+    form = FORMATS["fanuc-pitch"]
+    comp = form.read((TextFile("PITCH.TXT", text),), settings)
+    assert comp.tables[0].position_mm[0] == -400.0
+    assert _added(comp, 0.0, 1) == 0.0
+    assert _added(comp, -400.0, 1) == pytest.approx(0.0, abs=1e-12)  # +2+1+1-2+0-1+0-1 = 0
+    assert _added(comp, -350.0, 1) == pytest.approx(0.002)
+    assert _added(comp, 50.0, 1) == pytest.approx(0.002)
+    assert form.write(comp, settings)[0].text == text
+
+
+CENTROID = (
+    "24 -1448819\n"
+    + "\n".join(
+        map(
+            str,
+            (
+                0,
+                -32,
+                -38,
+                -47,
+                -54,
+                -57,
+                -63,
+                -69,
+                -76,
+                -82,
+                -88,
+                -98,
+                -101,
+                -110,
+                -113,
+                -120,
+                -123,
+                -129,
+                -132,
+                -135,
+                -139,
+                -142,
+                -145,
+                -148,
+            ),
+        )
+    )
+    + "\n"
+)
+
+
+def test_centroid_example_comes_back_byte_for_byte() -> None:
+    """cncsnw.com, version 1: 24 values over -1448819 counts, which is 40 mm a point at 40000 counts an inch."""
+    settings = FormatSettings(reference_mm=(0.0, 0.0, 0.0), counts_per_mm=40000 / 25.4)
+    form = FORMATS["centroid"]
+    comp = form.read((TextFile("cnc-x.tab", CENTROID),), settings)
+    assert comp.tables[0].position_mm[0] == pytest.approx(-920.0, abs=1e-3)
+    assert form.write(comp, settings)[0].text == CENTROID
+
+
+ISG = """// component errors of the X axis
+X EXX EYX EZX EAX EBX ECX
+0.0 0.02 0.01 0.07 0.00 0.0042 0.003
+10.0 0.00 -0.1 0.01 0.00 0.0011 0.002
+"""
+
+
+def test_isg_example_is_read_number_by_number() -> None:
+    """Page 296429067. Its numbers have no one way of writing (0.02, 0.00): it comes back equal in value, not in bytes."""
+    from abbe.service.formats.proof import SETTINGS
+
+    form = FORMATS["isg"]
+    comp = form.read((TextFile("volcomp.csv", ISG),), SETTINGS)
+    assert comp.motions is not None
+    assert comp.motions.curves["EYX"].value.tolist() == [0.01, -0.1]
+    assert comp.motions.curves["EBX"].value.tolist() == [0.0042, 0.0011]
+    again = form.write(comp, SETTINGS)[0].text.splitlines()[1:]
+    for line, original in zip(again[1:], ISG.splitlines()[2:], strict=True):
+        assert [float(w) for w in line.split()] == [float(w) for w in original.split()]
+    assert again[0] == ISG.splitlines()[1]

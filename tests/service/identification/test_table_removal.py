@@ -1,0 +1,178 @@
+"""What the lost motion made of a table's moves leaves the readings, with the right sign; everything else stays in them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from abbe.drivers.cnc.tables import crc32, encode
+from abbe.models.compensation.tables import NineTables
+from abbe.models.solvers.in_force import AppliedTables
+from abbe.service import cli
+from abbe.service.campaign_data.campaign_folder import from_folder, from_store
+from abbe.service.compensation.proposals import check_same_table
+from abbe.service.discovery.discover import prepare
+from abbe.service.discovery.simulate import simulate
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.errors import TableMismatch
+from abbe.service.identification.table_removal import NO_TABLE, STAYS, TABLE_OUT, RemovedTable, as_left, less, table_line, table_then
+from abbe.service.runs.solution_file import SolutionFile
+from abbe.service.storage.store import Store
+from abbe.service.tables.base_table import Base
+from abbe.service.tables.nine_tables import table_image
+from tests.service.discovery.discovery_bench import WIDTH_MM, write_case
+
+DB = "sqlite:///book.sqlite3"
+LOST = np.array([6e-3, 4e-3, 0.0])
+BEAM = np.ones(3) / np.sqrt(3.0)
+
+
+def correction(axes_mm: np.ndarray) -> np.ndarray:
+    """Corrections that change along each axis by some micrometres per step, and turn round."""
+    return 4e-3 * np.sin(axes_mm[:, [1, 2, 0]] / 15.0)
+
+
+def steps() -> np.ndarray:
+    """One axis after the other, as on a step diagonal."""
+    moves = np.eye(3)[np.arange(60) % 3] * 10.0
+    return np.vstack([np.zeros(3), np.cumsum(moves, axis=0)])
+
+
+OUT = RemovedTable(AppliedTables(correction, LOST), AppliedTables(correction))
+
+
+def run(axes: np.ndarray, reading: np.ndarray, kind: str, **setup: Any) -> dict[str, Any]:
+    columns = {f"{c}_mm": axes[:, a].tolist() for a, c in enumerate("xyz")} | {"deviation_mm": reading.tolist()}
+    return {"run_id": "r", "role": "identify", "test": kind, "setup": setup, "columns": columns}
+
+
+def drives(axes: np.ndarray) -> np.ndarray:
+    """Where axes with lost motion stand, each following its drive at the last possible moment; approached from below."""
+    at = np.empty_like(axes)
+    for a in range(3):
+        half, axis = LOST[a] / 2, -np.inf
+        for n, drive in enumerate(axes[:, a]):
+            axis = drive - half if n == 0 else min(max(axis, drive - half), drive + half)
+            at[n, a] = axis
+    return at
+
+
+def test_the_play_leaves_and_the_correction_stays() -> None:
+    axes, own = steps(), 1e-3 * np.linspace(0.0, 5.0, 61)
+    commanded, corrected = drives(axes), drives(axes + correction(axes))
+    table = correction(axes) @ BEAM - correction(axes[:1]) @ BEAM
+    moved = (corrected - commanded) @ BEAM
+    read = own + moved - moved[0]
+    there = run(axes, read, "laser_step_diagonal", start_mm=axes[0].tolist(), end_mm=axes[-1].tolist(), order="XYZ")
+    told = np.array(less([there], OUT)[0]["columns"]["deviation_mm"])
+    assert np.abs(read - own - table).max() > 2e-3
+    assert np.abs(told - own - table).max() < 1e-4  # the beam of the set-up and BEAM are one line
+
+
+def test_a_run_without_readings_stays() -> None:
+    there = run(steps(), np.zeros(61), "laser_step_diagonal")
+    there["columns"]["deviation_mm"] = None
+    assert less([there], OUT) == [there]
+
+
+@pytest.mark.parametrize("acting", [False, None, True])
+def test_runs_of_a_table_that_did_not_act_are_refused(acting: bool | None) -> None:
+    base = cast("Base", SimpleNamespace(crc=5, tables="some"))
+    one = {"run_id": "r", "table": {"crc": 5} | ({} if acting is None else {"acting": acting})}
+    if acting is False:
+        with pytest.raises(TableMismatch, match="did not act"):
+            check_same_table(base, [one])
+    else:
+        check_same_table(base, [one])
+
+
+def kinked() -> NineTables:
+    """Corrections of X by X that change by 0.4 µm from point to point: kinks that are no error of a machine."""
+    at = np.linspace(0.0, 600.0, 25), np.linspace(0.0, 500.0, 21), np.linspace(0.0, 450.0, 19)
+    values = [np.zeros((a.size, 3)) for a in at]
+    values[0][1::2, 0] = 4e-4
+    none = [np.full_like(v, np.nan) for v in values]
+    return NineTables(at, (values[0], values[1], values[2]), (none[0], none[1], none[2]))
+
+
+def test_every_command_takes_the_table_out_that_the_database_knows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], clean_environment: object
+) -> None:
+    """Solved or searched, by a command or by the service: one and the same readings, else one machine would get two models."""
+    monkeypatch.chdir(tmp_path)
+    image = encode(table_image(kinked(), 100, 7))
+    folder = write_case(tmp_path / "files", campaign="july")
+    for path in folder.glob("r*.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"table": {"crc": crc32(image), "acting": True}}))
+    assert cli.run(["import", str(folder), "--db", DB]) == 0
+    with Store.open(DB) as store:
+        before = from_store(store, "july")
+        then = table_then(store, before)
+        assert (then.table, then.why) == (None, f"measured with table {crc32(image):08X}, which this database does not know: {STAYS}")
+        assert prepare(before, catalogue(), None, table=then).flags[-1] == then.why
+        store.add_table(store.campaign("july").machine_id, None, image, crc32(image), {})
+        then = table_then(store, before)
+        left = as_left(before, then.table)
+        job = prepare(before, catalogue(), None, table=then)
+        assert job.flags[-1] == table_line(left.doc[TABLE_OUT])
+        assert [r["columns"]["deviation_mm"] for r in job.runs] == [r["columns"]["deviation_mm"] for r in left.runs]
+        assert job.campaign is before
+        gap = np.array(before.runs[0]["columns"]["deviation_mm"]) - left.runs[0]["columns"]["deviation_mm"]
+        assert np.abs(gap).max() > 1e-4
+        # What is predicted is what the instrument reads: with the table, whose part was taken out of the readings only to be solved.
+        plain = prepare(left, catalogue(), None)
+        added = simulate(job).predicted_mm["r01"] - simulate(plain).predicted_mm["r01"]
+        assert np.allclose(added, gap, atol=1e-9)
+        # The digest of a search is that of what was measured: a solver's last digit makes no other search.
+        moved = [
+            run | {"columns": run["columns"] | {"deviation_mm": [v + 1e-12 for v in run["columns"]["deviation_mm"] or []] or None}}
+            for run in job.runs
+        ]
+        assert replace(job, runs=moved).digest == job.digest
+        assert prepare(before, catalogue(), None).digest != job.digest
+    capsys.readouterr()
+    assert cli.run(["solve", "july", "--db", DB, "--model", "rigid6", "--json"]) == 0
+    told = SolutionFile.model_validate_json(capsys.readouterr().out).table_taken_out
+    assert told is not None
+    assert told.crc == crc32(image)
+    assert {axis: one.value for axis, one in told.lost_motion_mm.items()} == {
+        axis: one["value"] for axis, one in left.doc[TABLE_OUT]["lost_motion_mm"].items()
+    }
+    x = told.lost_motion_mm["X"]
+    assert abs(x.value - WIDTH_MM) < 4.0 * x.u + 1e-3
+    assert cli.run(["solve", "july", "--db", DB, "--model", "rigid6"]) == 0
+    assert f"table {crc32(image):08X} was in force: what it did beyond smooth corrections is taken out" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
+def test_a_table_of_a_kind_that_nobody_reads_is_not_known(tmp_path: Path) -> None:
+    folder = write_case(tmp_path / "files", campaign="july")
+    with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
+        before = from_folder(folder)
+        for run in before.runs:
+            run["table"] = {"crc": 5}
+        store.add_table(store.add_machine("VMC-1", {}), None, b"someone else's", 5, {})
+        then = table_then(store, before)
+        assert (then.table, then.why) == (None, f"measured with table 00000005, of a kind that cannot be read: {STAYS}")
+
+
+def test_runs_of_another_table_or_of_none_keep_their_readings(tmp_path: Path) -> None:
+    before = from_folder(write_case(tmp_path / "files", campaign="july"))
+    for run, told in zip(before.runs, ({"crc": 5, "acting": True}, {"crc": 5}, {"crc": 5, "acting": False}, {"crc": 6}), strict=True):
+        run["table"] = told
+    left = as_left(before, kinked())
+    same = [a["columns"]["deviation_mm"] == b["columns"]["deviation_mm"] for a, b in zip(before.runs, left.runs, strict=True)]
+    assert same == [False, False, True, True]  # the third is held out, and was measured with the compensation switched off
+    with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
+        before.runs[1]["table"] = {"crc": 6}
+        assert table_then(store, before).why.startswith("these runs were not all measured with one table")
+        for run in before.runs:
+            run["table"] = {"crc": 6, "acting": False}
+        assert table_then(store, before) == NO_TABLE

@@ -1,0 +1,185 @@
+"""The full campaign that a page leads through: what can be gone on with, what a person is asked, and every way in which it ends.
+
+Mutations that were seen to be caught: a stop that nobody hears while it is solved or asked, the proposer's name left out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, nullcontext
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from abbe.service.campaigns.campaign_run import plan_hash
+from abbe.service.cli.administration.serve import _campaigns
+from abbe.service.cli.measure import _plan
+from abbe.service.clock import SystemClock
+from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
+from abbe.service.jobs import guided_campaign as work
+from abbe.service.jobs.guided_campaign import CampaignOutcome
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.recipes.recipe import Helix, Linear
+from abbe.service.sequences.recipes.recipe_file import recipe_text
+from abbe.service.sequences.steps import CampaignPlan
+from tests.service.core.fakes import settle
+from tests.service.web.pages.test_rehearsal import MACHINE
+
+
+@pytest.mark.parametrize("recipe", ["identification at 500 Hz", "own.toml", "our own recipe"])
+def test_what_was_broken_off_is_gone_on_with_by_the_command_line(recipe: str, tmp_path: Path) -> None:
+    site: Any = SimpleNamespace(machine=MACHINE, max_feed_mm_min=6000.0)
+    assert _campaigns("own.toml", site, tmp_path) == ("identification",), "a file that is not there cannot be started"
+    for name in ("own.toml", "our own recipe"):
+        (tmp_path / name).write_text(recipe_text("own", (Helix("h", "B1", "identify", (300.0, 250.0, 100.0), 100.0),)))
+    assert _campaigns("own.toml", site, tmp_path) == ("identification", "own.toml")
+    plan, source = work.full_campaign(recipe, MACHINE, tmp_path)
+    again = _plan(MACHINE, source)
+    assert plan_hash(replace(plan, name="x")) == plan_hash(replace(again, name="x"))
+
+
+def pretended(**site: Any) -> Any:
+    told = {"calibrated_until": {"laser": date(2099, 12, 31)}, "name": "mill-7", "watching": Watching()} | site
+    return SimpleNamespace(
+        plan=CampaignPlan("full 1", ()),
+        site=SimpleNamespace(**told),
+        control=Control(),
+        store=None,
+        progress=None,
+        clock=SystemClock(),
+    )
+
+
+async def measured(bench: Any, source: Any) -> None:
+    """All of it, without a device."""
+
+
+async def all_there(*_: object, **__: object) -> None:
+    """Every device answers."""
+
+
+async def test_after_the_last_day_of_a_certificate_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(work, "_measured")
+    bench = pretended(calibrated_until={"laser": date(2020, 5, 31), "ballbar": date(2020, 4, 30)})
+    line = Linear("l", "L1", "identify", 0, n=5).plan(MACHINE)
+    bench.plan = CampaignPlan("full 1", (line,))
+    led = await work.led_campaign(bench, {}, "bob")
+    assert (led.word, "certificate of the laser has ended on 2020-05-31" in led.text, "ball-bar" in led.text) == ("ended", True, False)
+
+
+async def test_without_certificates_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(work, "_measured")
+    led = await work.led_campaign(pretended(calibrated_until={}), {}, "bob")
+    assert (led.word, "no calibration certificate" in led.text) == ("ended", True)
+
+
+@pytest.mark.parametrize("how", ["stop", "abort"])
+async def test_what_is_ended_before_it_begins_asks_no_device(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(work, "_measured")
+    bench = pretended(calibrated_until={})
+    getattr(bench.control, how)()
+    with pytest.raises((Stopped, Aborted)):
+        await work.led_campaign(bench, {}, "bob")
+
+
+async def test_a_stop_while_a_push_is_taken_back_begins_no_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = pretended(max_feed_mm_min=6000.0, urls=SimpleNamespace(cnc="cnc"))
+
+    @asynccontextmanager
+    async def session(*_: object, **__: object) -> AsyncIterator[Any]:
+        bench.control.stop()
+        yield SimpleNamespace(controller=None)
+
+    for name, instead in (("alone", lambda _: nullcontext()), ("recovered_session", session)):
+        monkeypatch.setattr(work, name, instead)
+    for name, instead in (("paced", lambda plan, _: plan), ("check_devices", all_there)):
+        monkeypatch.setattr(work, name, instead)
+    monkeypatch.delattr(work, "start_campaign")
+    bench.live = None
+    with pytest.raises(Stopped):
+        await work.led_campaign(bench, {}, "bob")
+
+
+@pytest.mark.parametrize(
+    ("tables", "bits", "refused"), [(None, 0, False), ("some", 0, True), ("some", 1 << 10, False), ("some", 1 << 9, True)]
+)
+async def test_a_table_that_is_switched_off_is_told_before_anything_is_mounted(
+    tables: str | None, bits: int, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def status() -> Any:
+        return SimpleNamespace(bits=bits)
+
+    async def base(_: object) -> Any:
+        return SimpleNamespace(tables=tables, crc=0x5A)
+
+    monkeypatch.setattr(work, "read_base", base)
+    session: Any = SimpleNamespace(controller=SimpleNamespace(status=status))
+    with pytest.raises(TableMismatch, match="0000005A does not act") if refused else nullcontext():
+        await work._check_table_acts(session)
+
+
+@pytest.mark.parametrize("no", [TableRefused("too little", "stay"), NotObservable("E"), TableMismatch("F")])
+async def test_an_answer_that_is_no_is_the_end_s_text(monkeypatch: pytest.MonkeyPatch, no: Exception) -> None:
+    async def refuse(*_: object) -> Any:
+        raise no
+
+    monkeypatch.setattr(work, "_measured", measured)
+    monkeypatch.setattr(work, "made_of", refuse)
+    led = await work.led_campaign(pretended(), {}, "bob")
+    assert led == CampaignOutcome("ended", f"no proposal: {no}; campaign 'full 1' stays, and `abbe solve` shows what it says")
+
+
+async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+
+    async def made(bench: Any, campaign: str, agree: Any, by: str) -> Any:
+        assert bench.control.hurry, "nothing could hold it: it cannot be paused"
+        seen.append(f"{campaign} by {by}")
+        return SimpleNamespace(number=3, proposed=SimpleNamespace(solution_id=2, reasons=("LIMITS: too much", "STALE")))
+
+    monkeypatch.setattr(work, "_measured", measured)
+    monkeypatch.setattr(work, "made_of", made)
+    led = await work.led_campaign(pretended(), {}, "bob")
+    assert led == CampaignOutcome("ended", "proposal 3 cannot be approved: LIMITS: too much; STALE", 2, 3)
+    assert seen == ["full 1 by bob"]
+
+
+async def test_a_stop_while_it_is_solved_leaves_no_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def made(bench: Any, campaign: str, agree: Any, by: str) -> Any:
+        bench.control.stop()
+        agree(None)
+        raise AssertionError
+
+    monkeypatch.setattr(work, "_measured", measured)
+    monkeypatch.setattr(work, "made_of", made)
+    with pytest.raises(Stopped) as told:
+        await work.led_campaign(pretended(), {}, "bob")
+    assert "abbe comp propose MACHINE.toml 'full 1'" in told.value.__notes__[0]
+
+
+async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wait() -> None:
+    async def status() -> Any:
+        return SimpleNamespace(position_mm=(300.04, -1.0, 99.96))
+
+    control = Control()
+    whoever = work._Whoever(control)
+    whoever.session = SimpleNamespace(controller=SimpleNamespace(status=status))  # type: ignore[assignment]
+    control.now(State.RUNNING)
+    for number, word in ((1, control.prompts.answer), (2, lambda _: control.stop())):
+        asking = asyncio.create_task(whoever.ask("Hang in the bar. Done?"))
+        await settle()
+        assert control.prompts.now is not None
+        assert (control.prompts.now.number, control.prompts.now.text) == (
+            number,
+            "Spindle at X 300.0 mm Y -1.0 mm Z 100.0 mm. Hang in the bar. Done?",
+        )
+        word(number)
+        await asyncio.wait({asking}, timeout=10)
+        assert control.prompts.now is None
+        assert isinstance(asking.exception(), Stopped) == (number == 2)

@@ -1,0 +1,225 @@
+"""A store with one of everything, made by the store's and the workflows' own functions, and a real server over it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+
+from abbe.drivers.api import BarSample, CompStatus, TableFormat
+from abbe.drivers.cnc.tables import TableImage, crc32, encode
+from abbe.service.audit.book import AuditBook
+from abbe.service.campaign_data.campaign_folder import from_store
+from abbe.service.compensation.proposal_doc import digest_of_doc, doc_of, load
+from abbe.service.compensation.proposals import Gathered, make
+from abbe.service.discovery.discover import discover, prepare
+from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.events import ignore_progress
+from abbe.service.push.book import StoreBook
+from abbe.service.push.states import PushState
+from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
+from abbe.service.runs.exchange import import_folder
+from abbe.service.scheduler.slots import Schedule
+from abbe.service.scheduler.store import ServiceStore
+from abbe.service.tables.base_table import Base
+from abbe.service.users.passwords import Passwords
+from abbe.service.users.people import People
+from abbe.service.users.roles import ALLOWED, Role
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.app import create_app
+from abbe.service.web.core_link.board import Board
+from abbe.service.web.listening import bind
+from abbe.service.web.login.auth_middleware import CSRF_HEADER
+from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
+from abbe.service.web.process.serving import make_server
+from abbe.service.web.view import View
+from tests.service.discovery.discovery_bench import MACHINE, Search, write_case
+
+PHRASE = "correct horse battery staple"
+NAME = "VMC-1"
+RATE_HZ, PATH_US = 1000, 1_000_000
+POINTS = [[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [30.0, 40.0, 0.0], [30.0, 40.0, 30.0]]
+SAMPLES = 1040
+CHECKS = 12
+
+
+@dataclass
+class Hour:
+    """A clock that stands, an hour after everything was measured."""
+
+    now: datetime = field(default_factory=lambda: datetime(2026, 11, 22, 9, tzinfo=UTC))
+
+    def utc(self) -> datetime:
+        return self.now
+
+    def monotonic_s(self) -> float:
+        return self.now.timestamp()
+
+    async def sleep(self, s: float) -> None:
+        raise AssertionError("nothing sleeps here")
+
+
+@dataclass
+class Plant:
+    """A store with content, and the application over it."""
+
+    store: ServiceStore
+    url: str
+    clock: Hour
+    people: People
+    book: AuditBook
+    app: FastAPI
+    door: Authenticator
+    approvable: list[int]
+    """Proposals that can be approved."""
+
+    def session(self, role: str) -> dict[str, str]:
+        secret = self.people.begin(self.people.get(f"a-{role}"))
+        return {"Cookie": f"{COOKIE}={secret}", CSRF_HEADER: csrf_token(secret)}
+
+    def token(self, role: str) -> dict[str, str]:
+        scopes = sorted(ALLOWED[Role(role)])
+        title = f"t{len(self.store.tokens())}"
+        return {"Authorization": f"Bearer {self.people.add_token(f'a-{role}', title, scopes, 5.0)}"}
+
+
+def bar_samples() -> list[BarSample]:
+    out = []
+    for seq in range(SAMPLES):
+        since_us = (seq - 20) * 1000 + 300
+        out.append(BarSample(seq, 10**9 + seq * 1000, since_us, 8 if 0 <= since_us < PATH_US else 0))
+    return out
+
+
+def fill(store: ServiceStore, folder: Path) -> list[int]:
+    """One of everything; returns the proposals that can be approved."""
+    import_folder(store, write_case(folder / "c1"))
+    job = prepare(from_store(store, "c1"), catalogue())
+    discover(job, journal_of(store, job), Search(), ignore_progress)
+    machine = store.machines()[0].id
+    _runs(store, store.add_campaign(machine, "c2", {}))
+    store.add_campaign(store.add_machine("other mill", {"odd": True}), "empty", {})
+    _checks(store, machine)
+    store.add_solution(store.campaign("c1").id, "other", [], {"old": "form"})
+    made = asyncio.run(_proposals(store))
+    asyncio.run(_push(store))
+    return made
+
+
+def _runs(store: ServiceStore, campaign: int) -> None:
+    """A ball-bar run, one of the laser, one that broke off, one that was written by something else."""
+    path = {"feed_mm_min": 6000.0, "direction": -1, "points_mm": POINTS}
+    start = {"setup": {"setup_id": "A", "t_set_s": 3.5}, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": RATE_HZ}
+    samples = bar_samples()
+    for label, status in (("r01", "complete"), ("r02", "aborted")):
+        run = store.start_run(campaign, label, "ballbar_helix", "identify", start)
+        for number, at in enumerate(range(0, SAMPLES, 100)):
+            part = samples[at : at + 100]
+            store.append_chunk(run, "bar", number, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
+        end = {"path_start_us": 8_000_000, "path_end_us": 8_000_000 + PATH_US, "gaps": [{"first": 3, "last": 4}]}
+        store.finish_run(run, status, "", end if status == "complete" else None)
+    run = store.start_run(campaign, "r03", "laser_linear", "identify", {"setup": {"setup_id": "L", "t_set_s": 0.1}, "machine": MACHINE})
+    records = [{"t_s": 1.0 * k, "position_mm": [10.0 * k, 0.0, 0.0], "note": "é"} for k in range(25)]
+    store.append_chunk(run, "laser", 0, 25, JSON_CODEC, encode_json(records), 0.0, 0.0, 0, 0)
+    store.finish_run(run, "failed", "SEQ-003 beam", None)
+    store.finish_run(store.start_run(campaign, "r04 '; DROP", "ballbar_circle", "sealed", {}), "complete", "", None)
+
+
+def _checks(store: ServiceStore, machine: int) -> None:
+    for k in range(CHECKS):
+        at = (datetime(2026, 11, 1, 6, tzinfo=UTC) + timedelta(days=k)).isoformat()
+        doc = {"machine": NAME, "schedule": "daily", "recipe": "quick-check", "slot_utc": at, "started_utc": at, "duration_s": 60.0}
+        doc |= {"verdict": "pass", "values": {"body_diagonal_um": 10.0 + 0.3 * k, "helix_rms_um": None}}
+        doc |= {"uncertainties": {"body_diagonal_um": 1.0, "helix_rms_um": None}, "limits": {"body_diagonal_um": 20.0, "helix_rms_um": 3.0}}
+        doc |= {"campaign": "c1" if k == 0 else "", "runs": [], "text": "inside", "cause": None}
+        store.keep_verification(machine, doc, [])
+        store.claim_slot(f"{NAME}/daily", at)
+        store.finish_slot(f"{NAME}/daily", at, "done: pass", "as planned")
+
+
+async def _proposals(store: ServiceStore) -> list[int]:
+    """Proposals 1 as it was made, 2 and 3 without what spoke against it, 4 for a machine that needs two people, 5 that was altered."""
+    image = encode(TableImage(0, 0, 100, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0, 0, 0), ()))
+    base = Base(CompStatus(0xAB, 2, 0, (crc32(image), 0), (2, 0), 0, 0), image)
+    found = from_store(store, "c1")
+    records = store.runs("c1")
+    gathered = Gathered(store.campaign("c1"), records, found.runs, base, TableFormat(100, 4096))
+    made = await make(store, found.site, gathered, progress=ignore_progress)
+    assert made.proposed.reasons, "imported circles without temperatures speak against themselves"
+    free = replace(made.proposed, reasons=(), by="somebody")
+    numbers = [_stored(store, free), _stored(store, free), _stored(store, replace(free, two_people=True, by="a-approver"))]
+    row = store.proposal(numbers[0])
+    store.add_proposal(row.machine, row.solution_id, row.doc | {"by": "another"}, row.digest)
+    assert load(store, numbers[0]).valid_until_s > 0
+    return numbers[:2]
+
+
+def _stored(store: ServiceStore, proposed: Any) -> int:
+    doc = doc_of(proposed)
+    return store.add_proposal(NAME, proposed.solution_id, doc, digest_of_doc(doc))
+
+
+async def _push(store: ServiceStore) -> None:
+    """A push that was refused before anything was written."""
+    image = load(store, 2).image
+    base = load(store, 2).base.image
+    table = store.add_table(store.machines()[0].id, 1, image, crc32(image), {"proposal": 1})
+    book = await StoreBook.new(store, NAME, Hour())
+    known = {
+        "table": table,
+        "image": image.hex(),
+        "base_image": base.hex(),
+        "base_crc": crc32(base),
+        "base_meaning": "none",
+        "meaning": "m",
+    }
+    known |= {"base_bank": 0, "crc": crc32(image), "approved_by": "somebody", "reasons": [], "target": 1}
+    for state, doc in ((PushState.SNAPSHOT, known), (PushState.REJECTED, {"why": "TEMPERATURE: the shop is too warm"})):
+        await book.append(await book.entries(), state, doc)
+
+
+def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
+    """The plant over a SQLite file in ``folder``, with a user of each role; close the stack."""
+    stack, clock = contextlib.ExitStack(), Hour()
+    url = f"sqlite:///{folder / 'abbe.sqlite3'}"
+    store = stack.enter_context(ServiceStore.open(url, utcnow=clock.utc))
+    approvable = fill(store, folder)
+    people = People(store, clock, Passwords(memory_kib=64, passes=1))
+    for role in Role:
+        people.add(f"a-{role}", role, PHRASE)
+    book = AuditBook(store, url)
+    door = Authenticator(store, people, book, now_s=clock.monotonic_s, rate_hz=1e9, burst=1e9)
+    door.noise._burst = 1e9
+    app = app_of(store, clock, door)
+    return Plant(store, url, clock, people, book, app, door, approvable), stack
+
+
+def app_of(store: ServiceStore, clock: Hour, door: Authenticator | None) -> FastAPI:
+    board = Board({"cnc": "modbus://127.0.0.1:5020"}, clock)
+    schedules = (Schedule("daily", "0 6 * * *", "Europe/Berlin", "quick-check"), Schedule("hours", "", "UTC", "verification", every_h=8.0))
+    view = View(NAME, "0.1.0", board, store, list, "", clock)
+    sources = Sources(store, NAME, clock, schedules, lambda: board.devices)
+    return create_app(view, version="0.1.0", door=door, api=sources)
+
+
+@contextlib.contextmanager
+def served(app: FastAPI) -> Iterator[str]:
+    """A real uvicorn on the loopback, in a thread of its own; gives its address."""
+    listening = bind("127.0.0.1", 0)
+    server = make_server(app)
+    thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listening])), daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join(10)
+        listening.close()

@@ -1,0 +1,47 @@
+"""A core that says nothing: a screen for people, a problem document for programs, on every address."""
+
+from __future__ import annotations
+
+import httpx
+
+from abbe.service.clock import SystemClock
+from abbe.service.errors import CoreSilent
+from abbe.service.web.api.sources import Sources
+from abbe.service.web.app import create_app
+from abbe.service.web.schemas import Status, Verification
+from tests.pages_world import Served
+from tests.service.web.pages.test_screens import as_user
+
+
+class Silent:
+    async def status(self) -> Status:
+        raise CoreSilent("the core of the service does not answer, for 9 s now", "look at the machine")
+
+    async def verifications(self, limit: int) -> list[Verification]:
+        return []
+
+    async def ready(self) -> None:
+        await self.status()
+
+
+async def test_every_screen_says_so_and_the_api_gives_a_problem(running: Served) -> None:
+    store = running.store
+    app = create_app(Silent(), version="0", door=running.door, api=Sources(store, running.filled.machine, SystemClock()))
+    with as_user(running, "adam") as known:
+        headers = dict(known.headers) | {"host": "127.0.0.1"}
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url="http://127.0.0.1", headers=headers) as client:
+        screens = ("/", "/runs", "/result", "/trends", "/schedule", "/fleet", "/devices", "/settings", "/diagnostics", "/run?id=1")
+        moving = ("/live", "/new")
+        for path in (*screens, *moving):
+            answer = await client.get(path, headers={"Accept": "text/html,*/*;q=0.8"})
+            assert (answer.status_code, answer.headers["retry-after"]) == (503, "5"), path
+            assert answer.headers["content-type"].startswith("text/html"), path
+            assert "does not answer, for 9 s" in answer.text, path
+            assert "<nav" in answer.text, path
+        for path in ("/api/v1/status", "/runs", *moving):
+            answer = await client.get(path, headers={"Accept": "text/html" if path.startswith("/api/") else "*/*"})
+            assert (answer.status_code, answer.headers["content-type"], answer.json()["code"]) == (
+                503,
+                "application/problem+json",
+                "SRV-002",
+            )

@@ -1,0 +1,174 @@
+"""The full campaign at the page and over HTTP: its start, what it asks for, the word that it is done, how it ended."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import httpx
+import pytest
+
+from abbe.service.channel.messages import Answer, DoneByHand, Jobs, JobSeen, Moment, Outcome, StartJob, from_web
+from abbe.service.channel.wire import Wire
+from abbe.service.clock import SystemClock
+from abbe.service.users.roles import ALLOWED, Permission, Role
+from abbe.service.web.app import Parts, create_app
+from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
+from abbe.service.web.problems import MEDIA_TYPE
+from abbe.service.web.view import View
+from tests.service.core.test_channel import MOMENT
+from tests.service.web.api_bench import NAME, Plant
+from tests.service.web.pages.test_rehearsal import TOLD
+
+BASE, NUMBER = "http://127.0.0.1:8080", "0123456789ab"
+DONE = f"/api/v1/jobs/{NUMBER}/prompts/3/done"
+ASK = "Spindle at X 1.0 Y 2.0 Z 3.0. <b>hang in</b> the 150 mm bar. Done?"
+BEGUN = datetime(2026, 11, 22, tzinfo=UTC)
+JOB = JobSeen(NUMBER, "campaign", CAMPAIGN, "", "user:a", "asking", "", BEGUN, None, None, 3, ASK)
+ENDED = replace(JOB, state="done: proposed", text="proposal 1 waits", ended_utc=BEGUN, prompt=0, ask="", solution=7, proposal=1)
+
+
+@dataclass
+class Desk:
+    """The application with a core that asks for something, answers as it is told to, and ends its job when it is told to."""
+
+    client: httpx.AsyncClient
+    far: Wire
+    core: CoreLine
+    asked: list[Any] = field(default_factory=list)
+    answer: tuple[Outcome, str, str] = ("done", "", NUMBER)
+
+    async def says(self, job: JobSeen, moment: Moment) -> None:
+        self.far.send(Jobs("jobs", (job,)))
+        with self.core.listener() as moments:
+            assert moments is not None
+            self.far.send(moment)
+            async for heard in moments():
+                if heard == moment:
+                    return
+
+    async def serve(self) -> None:
+        while (body := await self.far.receive()) is not None:
+            message = from_web(body)
+            self.asked.append(message)
+            outcome, text, job = self.answer
+            self.far.send(Answer("answer", message.request, outcome, text, job))  # type: ignore[union-attr]
+
+    async def page(self, path: str, who: dict[str, str]) -> str:
+        return (await self.client.get(path, headers=who)).text
+
+
+def asking(prompt: int) -> Moment:
+    check = replace(MOMENT.check, job=NUMBER, state="asking", prompt=prompt, ask=ASK if prompt else "")  # type: ignore[type-var]
+    return replace(MOMENT, check=check, changes=100 + prompt)
+
+
+@pytest.fixture
+async def desk(plant: Plant) -> AsyncIterator[Desk]:
+    ours, theirs = socket.socketpair()
+    near, far = await Wire.over(ours), await Wire.over(theirs)
+    core = CoreLine(near, SystemClock())
+    view = View(NAME, "0.1.0", core, plant.store, core.next_due, "", plant.clock)
+    names = ("quick-check", CAMPAIGN)
+    parts = Parts(core, plant.store, NAME, names, Rehearsals(TOLD, names), (CAMPAIGN,))
+    app = create_app(view, version="0.1.0", door=plant.door, parts=parts)
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE, headers={"Origin": BASE}) as client:
+        made = Desk(client, far, core)
+        tasks = [asyncio.create_task(core.listen()), asyncio.create_task(made.serve())]
+        await made.says(JOB, asking(3))
+        yield made
+        near.close()
+        far.close()
+        for task in tasks:
+            task.cancel()
+
+
+async def test_only_who_measures_says_that_it_is_done(desk: Desk, plant: Plant) -> None:
+    assert (await desk.client.post(DONE)).status_code == 401
+    for role in Role:
+        may = Permission.MEASURE in ALLOWED[role]
+        for who in (plant.session(role), plant.token(role)):
+            before = len(desk.asked)
+            answer = await desk.client.post(DONE, headers=who)
+            assert (answer.status_code, len(desk.asked) - before) == ((202, 1) if may else (403, 0)), role
+    last = desk.asked[-1]
+    assert isinstance(last, DoneByHand)
+    assert (last.job, last.prompt, last.who.split("/")[0]) == (NUMBER, 3, "token:a-metrologist")
+    assert (await desk.client.post(DONE, headers=plant.session("operator") | {"X-CSRF-Token": "x"})).status_code == 403
+
+
+async def test_the_answer_is_the_core_s_and_stands_in_the_audit(desk: Desk, plant: Plant) -> None:
+    who = plant.token("operator")
+    answer = (await desk.client.post(DONE, headers=who)).json()
+    assert (answer["kind"], answer["state"], answer["prompt"], answer["ask"], answer["proposal"]) == ("campaign", "asking", 3, ASK, None)
+    record = plant.store.audit(1)[0]
+    assert (record.target, record.outcome) == (f"job {NUMBER}, prompt 3", "done 202")
+    desk.answer = ("conflict", "prompt 3 is not what this job waits for", "")
+    late = await desk.client.post(DONE, headers=who)
+    assert (late.status_code, late.headers["content-type"]) == (409, MEDIA_TYPE)
+    assert "not what this job waits for" in late.json()["detail"]
+    before = len(desk.asked)
+    for wrong in ("0", "-1", "x", "1e3", "9999999"):
+        assert (await desk.client.post(DONE.replace("/3/", f"/{wrong}/"), headers=who)).status_code == 404
+    assert len(desk.asked) == before
+
+
+async def test_what_is_to_be_done_stands_on_both_screens(desk: Desk, plant: Plant) -> None:
+    for path in ("/", "/live"):
+        looking, measuring = await desk.page(path, plant.session("viewer")), await desk.page(path, plant.session("operator"))
+        for shown in (looking, measuring):
+            assert "&lt;b&gt;hang in&lt;/b&gt;" in shown
+            assert "<b>" not in shown
+        assert re.findall(r'data-job="(\w+)" data-prompt="(\d+)"', measuring) == [(NUMBER, "3")]
+        assert "data-prompt" not in looking
+    revision = (await desk.client.get("/api/v1/status", headers=plant.session("viewer"))).json()["revision"]
+    await desk.says(JOB, replace(asking(3), check=replace(asking(3).check, prompt=4)))  # type: ignore[type-var]
+    other = (await desk.client.get("/api/v1/status", headers=plant.session("viewer"))).json()
+    assert (other["revision"] != revision, other["job"]["prompt"]) == (True, 4), "an open page is told"
+
+
+async def test_it_is_started_from_the_checklist(desk: Desk, plant: Plant) -> None:
+    who = plant.session("metrologist")
+    await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
+    shown = await desk.page(f"/new?recipe={CAMPAIGN}", who)
+    assert f'data-recipe="{CAMPAIGN}"' in shown
+    assert shown.count('type="checkbox"') == 4, "nineteen set-ups are told, not ticked off beforehand"
+    assert len(re.findall(r"<li>(Bar|Laser)", shown)) == 19
+    assert 'id="start"' not in await desk.page(f"/new?recipe={CAMPAIGN}", plant.session("viewer"))
+    sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "rate_hz": 500}, headers=who | {"Idempotency-Key": "k"})
+    assert sent.status_code == 202
+    assert desk.asked[-1] == StartJob("start", desk.asked[-1].request, f"{CAMPAIGN} at 500 Hz", "k", "user:a-metrologist")
+
+
+async def test_who_may_not_propose_starts_checks_only(desk: Desk, plant: Plant) -> None:
+    scopes = [Permission.READ, Permission.MEASURE]
+    narrow = {"Authorization": f"Bearer {plant.people.add_token('a-metrologist', 'narrow', scopes, 5.0)}"}
+    for who in (plant.session("operator"), plant.token("operator"), narrow):
+        for rate in (100, 500):
+            sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "rate_hz": rate}, headers=who)
+            assert (sent.status_code, "needs 'propose'" in sent.json()["detail"], desk.asked) == (403, True, [])
+    record = plant.store.audit(1)[0]
+    assert (record.target, record.outcome) == (f"recipe {CAMPAIGN} at 500 Hz", "refused 403")
+    await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
+    shown = await desk.page(f"/new?recipe={CAMPAIGN}", plant.session("operator"))
+    assert ('id="start"' in shown, "the right to propose tables as well" in shown) == (False, True)
+    assert 'id="start"' in await desk.page("/new?recipe=quick-check", plant.session("operator"))
+    for k, who in enumerate((plant.session("operator"), narrow), start=1):
+        assert (await desk.client.post("/api/v1/jobs", json={"recipe": "quick-check"}, headers=who)).status_code == 202
+        assert len(desk.asked) == k
+    assert (await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN}, headers=plant.token("metrologist"))).status_code == 202
+
+
+async def test_how_it_ended_is_told_with_its_proposal(desk: Desk, plant: Plant) -> None:
+    await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
+    told = (await desk.client.get(f"/api/v1/jobs/{NUMBER}", headers=plant.token("viewer"))).json()
+    assert (told["state"], told["solution"], told["proposal"], told["prompt"]) == ("done: proposed", 7, 1, 0)
+    shown = await desk.page("/live", plant.session("viewer"))
+    assert "proposal 1 waits" in shown
+    assert 'href="/proposal?id=1"' in shown
