@@ -24,7 +24,7 @@ import structlog
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.audit.chain import Event
 from abbe.service.campaigns.builtin_recipes import parted
-from abbe.service.channel.messages import PROTOCOL, Begin, NeedsTold, RulesTold, ScheduleTold
+from abbe.service.channel.messages import PROTOCOL, Begin, RulesTold
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.campaigns import CampaignJobs
 from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
@@ -126,7 +126,7 @@ class Service:
             recipes,
             self._listening.getsockname()[1],
             setup.behind_tls,
-            tuple(ScheduleTold(**asdict(schedule) | {"needs": NeedsTold(**asdict(schedule.needs))}) for schedule in setup.schedules),
+            tuple(setup.schedules),
             RulesTold(**asdict(setup.rules)),
             setup.told,
             self._jobs.full.names,

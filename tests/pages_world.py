@@ -28,6 +28,7 @@ from abbe.service.compensation.candidates import Promise, candidate_of
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.domain.schedule import Schedule
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.identification.solve import Solved, solve_runs
@@ -35,7 +36,6 @@ from abbe.service.identification.solve_report import solution_doc
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler import record
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.site import Site
 from abbe.service.storage.base import utc_text

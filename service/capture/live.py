@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.drivers.api import BarBatch, Point
+from abbe.service.domain.bounds import WORD
+from abbe.service.domain.recorded_path import RecordedPath
 from abbe.service.runs.helix_axis import about_axis, helix_axis
 
 F1 = NDArray[np.float64]
@@ -30,20 +32,6 @@ ANGLES = 512
 """Places of a path at which its angle is told; in between the browser interpolates."""
 SYNC, INVALID_BITS = 0b1000, 0b10101
 UM_PER_NM = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class LookedAt:
-    """A path that is being recorded. ``angle_deg``: about the axis of the test, at even parts of the path's length, not wrapped."""
-
-    number: int
-    run: str
-    test: str
-    radius_mm: float
-    feed_mm_min: float
-    rate_hz: int
-    duration_s: float
-    angle_deg: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +51,7 @@ class LiveFeed:
     """The path that is being recorded now, and what it has read lately. Make it before the event loop runs or inside of it."""
 
     def __init__(self) -> None:
-        self.path: LookedAt | None = None
+        self.path: RecordedPath | None = None
         self.active = asyncio.Event()
         """Set while a path is recorded."""
         self._number = 0
@@ -77,9 +65,18 @@ class LiveFeed:
         self._first_seq = None
         self._batches.clear()
         angles, length_mm = angles_along(points_mm, setup)
-        told = tuple(round(float(a), 2) for a in angles)
+        angle_deg = tuple(round(float(a), 2) for a in angles)
         duration_s = length_mm / feed_mm_min * 60.0
-        self.path = LookedAt(self._number, run, test, float(setup["radius_mm"]), feed_mm_min, rate_hz, duration_s, told)
+        self.path = RecordedPath(
+            number=self._number,
+            run=run[:WORD],
+            test=test[:WORD],
+            radius_mm=float(setup["radius_mm"]),
+            feed_mm_min=feed_mm_min,
+            rate_hz=rate_hz,
+            duration_s=duration_s,
+            angle_deg=angle_deg,
+        )
         self.active.set()
 
     def end(self) -> None:

@@ -8,11 +8,17 @@ table: the one in force is named by its push and CRC, and which one comes instea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import date
 from typing import Annotated, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from abbe.service.domain.bounds import Number, Text, Word
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.job_state import JobState
+from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken
 
 T = TypeVar("T")
@@ -28,109 +34,8 @@ PAGE_MEMORY_MB = 1024
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
-Word = Annotated[str, Field(max_length=200)]
-Text = Annotated[str, Field(max_length=4000)]
-Number = Annotated[int, Field(ge=0, le=2**62)]
 How = Literal["stop", "abort", "pause", "resume"]
 Outcome = Literal["done", "unknown", "busy", "forbidden", "conflict"]
-
-
-@dataclass(frozen=True, slots=True)
-class DeviceSeen:
-    """A device of the machine file, and when it was last heard of."""
-
-    role: Word
-    url: Text
-    state: Literal["not used yet", "in use", "answered", "fault"]
-    at_utc: datetime | None
-    text: Text
-
-
-@dataclass(frozen=True, slots=True)
-class CheckNow:
-    """The check that runs. ``state`` as `abbe.service.sequences.control` has it; ``step`` of ``steps`` and points read: of the test in
-    hand.
-
-    ``prompt``: number of what a person is asked to do, ``ask``: what that is; 0: nothing.
-    """
-
-    job: Word
-    schedule: Word
-    recipe: Word
-    since_utc: datetime
-    state: Word
-    stage: Word
-    message: Text
-    done: float
-    total: float
-    eta_s: float | None
-    step: Number
-    steps: Number
-    points: Number
-    prompt: Number
-    ask: Word
-
-
-@dataclass(frozen=True, slots=True)
-class DueSlot:
-    """What comes next of one schedule."""
-
-    schedule: Word
-    cron: Word
-    timezone: Word
-    recipe: Word
-    every_h: float
-    first_utc: datetime
-    slot_utc: datetime
-
-
-@dataclass(frozen=True, slots=True)
-class JobSeen:
-    """A job of this run of the service. ``state``: running, asking, paused, …, or how it ended; ``who``: empty for what nobody has ordered.
-
-    ``prompt``, ``ask``: as in `CheckNow`; ``solution``, ``proposal``: numbers of what a campaign has left in the store.
-    """
-
-    id: Word
-    kind: Literal["check", "campaign", "investigation", "push", "rollback"]
-    recipe: Word
-    schedule: Word
-    who: Word
-    state: Word
-    text: Text
-    begun_utc: datetime
-    ended_utc: datetime | None
-    verification: Number | None
-    prompt: Number = 0
-    ask: Word = ""
-    solution: Number | None = None
-    proposal: Number | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class NeedsTold:
-    """What has to be so before a check starts, as the machine file says it."""
-
-    idle: bool
-    warm_min: float
-    air: bool
-    operator: Literal["any", "present", "absent"]
-
-
-@dataclass(frozen=True, slots=True)
-class ScheduleTold:
-    """One line of the timetable, as the machine file says it."""
-
-    name: Word
-    cron: Word
-    timezone: Word
-    recipe: Word
-    grace_s: float
-    every_h: float
-    first_utc: datetime
-    catch_up: Literal["skip", "once"]
-    needs: NeedsTold
-    on_alarm: Literal["none", "propose"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +75,7 @@ class Begin:
     recipes: Annotated[tuple[Word, ...], Field(max_length=200)]
     port: Annotated[int, Field(ge=0, le=65535)]
     behind_tls: bool
-    schedules: Annotated[tuple[ScheduleTold, ...], Field(max_length=200)]
+    schedules: Annotated[tuple[Schedule, ...], Field(max_length=200)]
     rules: RulesTold
     plan: MachineTold | None
     campaigns: Annotated[tuple[Word, ...], Field(max_length=200)]
@@ -185,8 +90,8 @@ class Moment:
     __pydantic_config__ = _STRICT
     kind: Literal["moment"]
     changes: Number
-    check: CheckNow | None
-    devices: Annotated[tuple[DeviceSeen, ...], Field(max_length=50)]
+    check: RunningCheck | None
+    devices: Annotated[tuple[DeviceStatus, ...], Field(max_length=50)]
     due: Annotated[tuple[DueSlot, ...], Field(max_length=200)]
     mqtt_connected: bool
     mqtt_dropped: Number
@@ -201,23 +106,16 @@ class Jobs:
 
     __pydantic_config__ = _STRICT
     kind: Literal["jobs"]
-    jobs: Annotated[tuple[JobSeen, ...], Field(max_length=MOST_JOBS)]
+    jobs: Annotated[tuple[JobState, ...], Field(max_length=MOST_JOBS)]
 
 
 @dataclass(frozen=True, slots=True)
 class LivePath:
-    """A path is being recorded; ``angle_deg`` at even parts of its length, not wrapped. Number 0: none is."""
+    """A path is being recorded; number 0: none is any more."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["path"]
-    number: Number
-    run: Word
-    test: Word
-    radius_mm: float
-    feed_mm_min: float
-    rate_hz: Number
-    duration_s: float
-    angle_deg: Annotated[tuple[float, ...], Field(max_length=1000)]
+    path: RecordedPath
 
 
 @dataclass(frozen=True, slots=True)

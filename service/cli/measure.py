@@ -96,11 +96,11 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
     from datetime import datetime
 
     from abbe.service.clock import SystemClock
+    from abbe.service.domain.schedule import Schedule
     from abbe.service.errors import MeasurementFault
     from abbe.service.jobs.check import judged
     from abbe.service.runs.columns import load_run
     from abbe.service.scheduler.record import Occasion, found
-    from abbe.service.scheduler.slots import Schedule
 
     record = store.campaign(campaign)
     started = datetime.fromisoformat(record.created_utc)

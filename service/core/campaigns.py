@@ -17,13 +17,13 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import Event
 from abbe.service.core.jobs import BY_HAND, ByHand, FullCampaigns
 from abbe.service.core.rights import person
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, Aborted, Stopped
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.jobs.guided_campaign import CampaignOutcome, is_full
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
 from abbe.service.scheduler.ports import JobWatcher, SlotState
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control, State
 
 log = structlog.get_logger("abbe.campaign")

@@ -18,10 +18,12 @@ from typing import Protocol
 import structlog
 
 from abbe.service.campaigns.builtin_recipes import parted
-from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, JobSeen, Outcome, StartJob, SteerJob
+from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
-from abbe.service.scheduler.ports import FollowUp, JobKind, SlotState
-from abbe.service.scheduler.slots import Schedule
+from abbe.service.domain.bounds import TEXT, WORD
+from abbe.service.domain.job_state import JobKind, JobState
+from abbe.service.domain.schedule import Schedule
+from abbe.service.scheduler.ports import FollowUp, SlotState
 from abbe.service.sequences.control import Control, State
 
 log = structlog.get_logger("abbe.jobs")
@@ -30,8 +32,6 @@ MOST_KEYS = 1000
 BY_HAND = "by hand"
 AGAIN = "asked for before, with this key"
 """Text of the answer to what was done before."""
-WORD, TEXT = 200, 4000
-"""So long is what the channel takes."""
 ASKING = "asking"
 """State of a job that waits until a person has done something by hand."""
 
@@ -84,7 +84,7 @@ class MachineClaim(Protocol):
 
 @dataclass
 class _Job:
-    seen: JobSeen
+    seen: JobState
     control: Control = field(default_factory=Control)
     task: asyncio.Task[str] | None = None
 
@@ -153,7 +153,18 @@ class JobRegistry:
     def _new(self, schedule: Schedule, who: str, kind: JobKind = "check") -> _Job:
         number = secrets.token_hex(6)
         by_hand = "" if who else schedule.name
-        job = _Job(JobSeen(number, kind, schedule.recipe[:WORD], by_hand[:WORD], who, State.READY, "", self._clock.utc(), None, None))
+        job = _Job(
+            JobState(
+                id=number,
+                kind=kind,
+                recipe=schedule.recipe[:WORD],
+                schedule=by_hand[:WORD],
+                who=who,
+                state=State.READY,
+                text="",
+                begun_utc=self._clock.utc(),
+            )
+        )
         self._jobs[number] = job
         while len(self._jobs) > MOST_JOBS:
             self._jobs.popitem(last=False)
@@ -182,15 +193,15 @@ class JobRegistry:
     # ---- what is seen -----------------------------------------------------------------------------------------------
 
     @property
-    def running(self) -> JobSeen | None:
+    def running(self) -> JobState | None:
         """The job that runs, with the state of its measurement."""
         return None if self._now is None else self._look(self._now)
 
-    def seen(self) -> tuple[JobSeen, ...]:
+    def seen(self) -> tuple[JobState, ...]:
         """The latest jobs, newest first."""
         return tuple(self._look(job) for job in reversed(self._jobs.values()))
 
-    def _look(self, job: _Job) -> JobSeen:
+    def _look(self, job: _Job) -> JobState:
         if job.seen.ended_utc is not None:
             return job.seen
         control, now, prompt = job.control, job.control.situation, job.control.prompts.now

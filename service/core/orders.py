@@ -28,13 +28,14 @@ from abbe.service.compensation.proposal_states import standing
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.compensation.rollback import Ordered
 from abbe.service.core.jobs import BY_HAND, JobRegistry, JobRequest
+from abbe.service.domain.job_state import JobKind
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, Aborted, NotStored, Stopped, TableRefused
 from abbe.service.events import Progress
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
-from abbe.service.scheduler.ports import Doc, JobKind, JobWatcher, SlotState
+from abbe.service.scheduler.ports import Doc, JobWatcher, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.tables.push_outcome import STOPPED, PushOutcome, in_force, last_push, ordered, put_right

@@ -13,6 +13,7 @@ from abbe.service.core.campaigns import MeasureCampaign
 from abbe.service.core.orders import Hands
 from abbe.service.core.push_recovery import Recover
 from abbe.service.devices.urls import control_of
+from abbe.service.domain.schedule import Schedule
 from abbe.service.mqtt.broker import Broker
 from abbe.service.mqtt.topics import Topics
 from abbe.service.plant.opcua.setup import OpcUaSetup
@@ -20,7 +21,6 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.alarm_manager import Duties
 from abbe.service.scheduler.ports import Check, Readiness
 from abbe.service.scheduler.ready import AlwaysReady
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.scheduler.windows import Window
 from abbe.service.tables.in_force import LookAtTable

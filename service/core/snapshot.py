@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from abbe.service.channel.messages import CheckNow, DeviceSeen, DueSlot, Moment
+from abbe.service.channel.messages import Moment
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.scheduler.slots import Schedule
+from abbe.service.domain.bounds import TEXT, WORD
+from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.web.core_link.board import Board
 
 AGAIN = timedelta(minutes=1)
 """The timetable is looked at no more often than this, unless a slot has come: it changes only then."""
-WORD, TEXT = 200, 4000
 
 
 class SnapshotSource:
@@ -42,7 +44,7 @@ class SnapshotSource:
     def now(self, web_restarts: int) -> Moment:
         """How things stand."""
         board = self._board
-        devices = tuple(DeviceSeen(d.role[:WORD], d.url[:TEXT], d.state, d.at_utc, d.text[:TEXT]) for d in board.devices)
+        devices = tuple(replace(d, role=d.role[:WORD], url=d.url[:TEXT], text=d.text[:TEXT]) for d in board.devices)
         attention = tuple(text[:TEXT] for text in board.attention)
         return Moment(
             "moment",
@@ -57,28 +59,21 @@ class SnapshotSource:
             web_restarts,
         )
 
-    def _check(self) -> CheckNow | None:
-        job, running = self._board.job, self._book.running
-        if job is None:
+    def _check(self) -> RunningCheck | None:
+        check, job = self._board.job, self._book.running
+        if check is None:
             return None
-        number, state = (running.id, running.state) if running is not None else ("", "running")
-        eta_s = job.eta_s if job.eta_s is not None and math.isfinite(job.eta_s) else None
-        return CheckNow(
-            number,
-            job.schedule[:WORD],
-            job.recipe[:WORD],
-            job.since_utc,
-            state,
-            job.stage[:WORD],
-            job.message[:TEXT],
-            job.done if math.isfinite(job.done) else 0.0,
-            job.total if math.isfinite(job.total) else 0.0,
-            eta_s,
-            job.step,
-            job.steps,
-            job.points,
-            0 if running is None else running.prompt,
-            "" if running is None else running.ask,
+        if job is not None:
+            check = replace(check, id=job.id, state=job.state, prompt=job.prompt, ask=job.ask)
+        return replace(
+            check,
+            schedule=check.schedule[:WORD],
+            recipe=check.recipe[:WORD],
+            stage=check.stage[:WORD],
+            message=check.message[:TEXT],
+            done=check.done if math.isfinite(check.done) else 0.0,
+            total=check.total if math.isfinite(check.total) else 0.0,
+            eta_s=check.eta_s if check.eta_s is not None and math.isfinite(check.eta_s) else None,
         )
 
     def _slots(self) -> tuple[DueSlot, ...]:
@@ -86,10 +81,7 @@ class SnapshotSource:
         come = any(due.slot_utc <= now for due in self._due)
         if self._looked is None or come or not self._looked <= now < self._looked + AGAIN:
             self._looked = now
-            self._due = tuple(
-                DueSlot(s.name[:WORD], s.cron[:WORD], s.timezone, s.recipe[:WORD], s.every_h, s.first_utc, slot)
-                for s, slot in self._next_due()[:200]
-            )
+            self._due = tuple(DueSlot(schedule=schedule, slot_utc=slot) for schedule, slot in self._next_due()[:200])
         return self._due
 
 

@@ -8,11 +8,11 @@ from contextlib import suppress
 from datetime import datetime
 
 from abbe.service.clock import Clock
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.events import Progress
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.scheduler.ports import Doc
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.verification.verified_by import VerifiedBy
 from abbe.service.web.core_link.board import Board
 

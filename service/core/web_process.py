@@ -12,7 +12,6 @@ import subprocess
 from base64 import b64encode
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 
 import structlog
@@ -41,6 +40,7 @@ from abbe.service.children import python_words
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Orders
+from abbe.service.domain.recorded_path import RecordedPath
 from abbe.service.errors import AbbeError, ChannelBroken
 
 # Shows the web process what the running path reads, twenty times a second, and never waits for it.
@@ -48,8 +48,7 @@ from abbe.service.errors import AbbeError, ChannelBroken
 
 FRAME_S = 0.05
 """Between two messages: 20 Hz, about 50 samples each at 1 kHz."""
-NO_PATH = LivePath("path", 0, "", "", 0.0, 0.0, 0, 0.0, ())
-WORD = 200
+NO_PATH = LivePath("path", RecordedPath())
 
 
 async def show_live(wire: Wire, live: LiveFeed, clock: Clock) -> None:
@@ -73,7 +72,7 @@ def _told(wire: Wire, live: LiveFeed, told: int) -> int:
     path = live.path
     if path is None or path.number == told:
         return told
-    wire.send(LivePath("path", **asdict(path) | {"run": path.run[:WORD], "test": path.test[:WORD]}))
+    wire.send(LivePath("path", path))
     return path.number
 
 

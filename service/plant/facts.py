@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Protocol
 
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.running_check import RunningCheck
+
 
 @dataclass(frozen=True, slots=True)
 class Unit:
@@ -63,19 +66,6 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Running:
-    """The check that runs now."""
-
-    schedule: str
-    recipe: str
-    since_utc: datetime
-    stage: str
-    message: str
-    percent: float | None
-    eta_s: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class Alarm:
     """Something a person should look at."""
 
@@ -108,27 +98,17 @@ class Verified:
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceState:
-    """A device, and when it was last heard of."""
-
-    role: str
-    state: str
-    text: str
-    at_utc: datetime | None
-
-
-@dataclass(frozen=True, slots=True)
 class Facts:
     """Everything at one moment; checks and alarms newest first. ``table``: None when the journal does not know."""
 
     machine: str
     version: str
     now_utc: datetime
-    running: Running | None
+    running: RunningCheck | None
     next_utc: datetime | None
     checks: tuple[Check, ...]
     alarms: tuple[Alarm, ...]
-    devices: tuple[DeviceState, ...]
+    devices: tuple[DeviceStatus, ...]
     table: TableInForce | None = None
     verified: Verified = Verified("unknown", "", True)
 

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Protocol
 
-from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, PlantFigure, Running, TableInForce, Verified
+from abbe.service.plant.facts import Alarm, Check, Facts, PlantFigure, TableInForce, Verified
 from abbe.service.storage.records import PushEntryRecord, SlotRecord
 
 SHOWN_ALARMS = 20
@@ -61,11 +61,11 @@ class Gatherer:
             machine=status.machine,
             version=status.version,
             now_utc=status.now_utc,
-            running=_running(status.job),
+            running=status.job,
             next_utc=min((due.due_utc for due in status.next_due), default=None),
             checks=tuple(_check(one) for one in status.last if not one.push or one.verdict == "pass"),  # else of a table not in force
             alarms=tuple(alarms[:SHOWN_ALARMS]),
-            devices=tuple(DeviceState(device.role, device.state, device.text, device.at_utc) for device in status.devices),
+            devices=tuple(status.devices),
             table=self._slow[1],
             verified=_verified(status.verified),
         )
@@ -73,13 +73,6 @@ class Gatherer:
     def _read(self, archive: Archive, machine: str) -> tuple[tuple[Alarm, ...], TableInForce | None]:
         slots = archive.slots_not_run(machine, SHOWN_ALARMS)
         return tuple(_slot_alarm(slot) for slot in slots), table_in_force(archive.last_push(machine, self._control))
-
-
-def _running(job: Any) -> Running | None:
-    if job is None:
-        return None
-    percent = 100.0 * job.done / job.total if job.total > 0 else None
-    return Running(job.schedule, job.recipe, job.since_utc, job.stage, job.message, percent, job.eta_s)
 
 
 def _verified(one: Any) -> Verified:

@@ -13,6 +13,7 @@ from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.audit.chain import Event
 from abbe.service.clock import Clock
 from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved
+from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.jobs.investigate import Note
@@ -20,7 +21,6 @@ from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FAILURES
 from abbe.service.scheduler.ports import Doc, FollowUp, JobWatcher, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
-from abbe.service.scheduler.slots import Needs, Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.records import AlarmEntryRecord

@@ -10,10 +10,10 @@ from typing import Protocol
 import structlog
 
 from abbe.service.clock import Clock
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.events import Progress
 from abbe.service.scheduler.ports import Doc
-from abbe.service.scheduler.slots import Schedule
 
 log = structlog.get_logger("abbe.station")
 

@@ -9,11 +9,11 @@ import structlog
 
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError
 from abbe.service.events import Progress
 from abbe.service.scheduler import record
 from abbe.service.scheduler.ports import AfterCheck, Check, Doc, JobWatcher, Shelf, SlotState
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control
 
 log = structlog.get_logger("abbe.check")

@@ -15,10 +15,11 @@ from typing import Protocol
 import structlog
 
 from abbe.service.clock import Clock
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import outcomes
 from abbe.service.scheduler.ports import Carry, Doc, Errands, FollowUp, Readiness, SlotLedger, SlotState, carried_alone
 from abbe.service.scheduler.ready import AlwaysReady
-from abbe.service.scheduler.slots import Schedule, next_slot, previous_slot, slots_after
+from abbe.service.scheduler.slots import next_slot, previous_slot, slots_after
 from abbe.service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
 from abbe.service.scheduler.windows import Window, covering
 

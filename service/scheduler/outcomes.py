@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from abbe.service.scheduler.slots import Schedule
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.waiting import Hindrance, Waiting
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal, NamedTuple, Protocol, Self
 
+from abbe.service.domain.job_state import JobKind
+from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress, ProgressSink
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control
 
 Verdict = Literal["pass", "fail", "cannot tell"]
-JobKind = Literal["check", "campaign", "investigation", "push", "rollback"]
 Doc = dict[str, Any]
 
 

@@ -11,8 +11,8 @@ from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
 from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.errors import AbbeError
-from abbe.service.scheduler.slots import Needs, Schedule
 from abbe.service.scheduler.windows import Window, covering
 from abbe.service.sequences.interlocks import MOVING, PATH, PROGRAM, SPINDLE, somebody_at_work, tripped
 

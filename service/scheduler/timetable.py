@@ -7,7 +7,8 @@ from datetime import UTC, time
 
 from abbe.service.config_schema import MachineFile
 from abbe.service.config_timetable import ScheduleEntry, WindowEntry
-from abbe.service.scheduler.slots import FIRST_UTC, Needs, Schedule, checked
+from abbe.service.domain.schedule import FIRST_UTC, Needs, Schedule
+from abbe.service.scheduler.slots import checked
 from abbe.service.scheduler.windows import Window
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from abbe.service.scheduler.slots import Schedule
+from abbe.service.domain.schedule import Schedule
 
 
 class Hindrance(NamedTuple):

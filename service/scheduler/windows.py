@@ -8,7 +8,8 @@ from datetime import datetime, time, timedelta
 from functools import lru_cache
 from zoneinfo import ZoneInfo
 
-from abbe.service.scheduler.slots import Schedule, next_slot, previous_slot
+from abbe.service.domain.schedule import Schedule
+from abbe.service.scheduler.slots import next_slot, previous_slot
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 

@@ -7,6 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.running_check import RunningCheck
+
 
 class _Answer(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -57,36 +60,6 @@ class Verification(_Answer):
     push: int = 0
 
 
-class Device(_Answer):
-    """A device of the machine file, and when we last heard of it. It is not polled between checks."""
-
-    role: str
-    url: str
-    state: Literal["not used yet", "in use", "answered", "fault"]
-    at_utc: datetime | None = None
-    text: str = ""
-
-
-class Job(_Answer):
-    """The check that runs now. ``prompt``: number of what a person is asked to do, ``ask``: what that is; 0: nothing."""
-
-    schedule: str
-    recipe: str
-    since_utc: datetime
-    id: str = ""
-    state: str = "running"
-    stage: str = ""
-    message: str = ""
-    done: float = 0.0
-    total: float = 0.0
-    eta_s: float | None = None
-    step: int = 0
-    steps: int = 0
-    points: int = 0
-    prompt: int = 0
-    ask: str = ""
-
-
 class Due(_Answer):
     """What comes next of one schedule."""
 
@@ -132,8 +105,8 @@ class Status(_Answer):
     version: str
     now_utc: datetime
     revision: str
-    job: Job | None
-    devices: list[Device]
+    job: RunningCheck | None
+    devices: list[DeviceStatus]
     next_due: list[Due]
     mqtt: Mqtt
     alarms: Annotated[list[Alarm], Field(default_factory=list)]

@@ -9,25 +9,28 @@ from typing import Protocol
 from zoneinfo import ZoneInfo
 
 from abbe.service.clock import Clock
-from abbe.service.scheduler.slots import Schedule, cron_in_words
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.schedule import Schedule
+from abbe.service.scheduler.slots import cron_in_words
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.verification.alarm_states import folded, is_open
 from abbe.service.verification.alarms import alarm_doc
 from abbe.service.verification.verified_by import VerifiedBy, strange_table, verified_by
 from abbe.service.web import words
-from abbe.service.web.schemas import Alarm, Device, Due, Job, Mqtt, Status, Verification, Verified
+from abbe.service.web.schemas import Alarm, Due, Mqtt, Status, Verification, Verified
 
 
 class PageStatus(Protocol):
     """How things stand now. All of it raises CoreSilent while nobody knows."""
 
     @property
-    def devices(self) -> list[Device]:
+    def devices(self) -> list[DeviceStatus]:
         """The devices, and when they were last heard of."""
         ...
 
     @property
-    def job(self) -> Job | None:
+    def job(self) -> RunningCheck | None:
         """The check that runs."""
         ...
 

@@ -23,6 +23,7 @@ from abbe.service.compensation.proposal_states import standing
 from abbe.service.config import load_machine
 from abbe.service.config_timetable import AlarmSection
 from abbe.service.devices.session import open_session
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.check import CheckResult, run_check
@@ -31,7 +32,6 @@ from abbe.service.scheduler.alarm_manager import AlarmManager, Telling
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching

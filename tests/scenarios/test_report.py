@@ -25,12 +25,12 @@ from abbe.service.cli import run
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
+from abbe.service.domain.schedule import Schedule
 from abbe.service.jobs.check import CheckResult
 from abbe.service.push.operations import Verdict
 from abbe.service.rendering.numbers import with_uncertainty
 from abbe.service.runs.columns import load_run
 from abbe.service.scheduler import record
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base

@@ -15,12 +15,12 @@ from typing import Any
 import aiomqtt
 
 from abbe.service.core.setup import ServiceSetup
+from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.broker import parse
 from abbe.service.mqtt.topics import Topics
 from abbe.service.plant.opcua.setup import OpcUaSetup
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control, State
 from abbe.service.serve import serve
 

@@ -20,13 +20,13 @@ from abbe.service.compensation.recover import recover
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress
 from abbe.service.jobs.at_start import recover_at_start
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.topics import Topics
 from abbe.service.push.operations import Verdict
 from abbe.service.scheduler import alarm_manager
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan

@@ -15,8 +15,8 @@ import pytest
 from playwright.sync_api import Page, sync_playwright
 
 from abbe.drivers.errors import LinkDown
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from tests.system.serve_bench import free_port, require, service
 from tests.system.serve_check import Result

@@ -7,8 +7,9 @@ from dataclasses import asdict
 from fastapi import FastAPI
 
 from abbe.service.campaigns.builtin_recipes import RECIPES
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import Unusable
-from abbe.service.scheduler.slots import Schedule, cron_in_words, next_slot
+from abbe.service.scheduler.slots import cron_in_words, next_slot
 from abbe.service.users.roles import Permission
 from abbe.service.web.api import shapes as s
 from abbe.service.web.api.sources import Cursor, Doc, Filter, Limit, Number, Sources, finite, read_as

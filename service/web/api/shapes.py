@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.runs.machine_object import MachineObject
-from abbe.service.web.schemas import Device, Verification, Verified
+from abbe.service.web.schemas import Verification, Verified
 
 
 class Answer(BaseModel):
@@ -40,7 +41,7 @@ class Devices(Answer):
     """Devices of this service's machine. They are not asked for this answer."""
 
     machine: str
-    devices: list[Device]
+    devices: list[DeviceStatus]
 
 
 class Recipe(Answer):

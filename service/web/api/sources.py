@@ -16,13 +16,13 @@ from pydantic import BaseModel, ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
 from abbe.service.clock import Clock
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import NotStored, StoreError, Unusable
 from abbe.service.report.report_parts import Rules
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.web.core_link.logtail import LogTail
-from abbe.service.web.schemas import Device
 
 log = structlog.get_logger("abbe.api")
 M = TypeVar("M", bound=BaseModel)
@@ -62,7 +62,7 @@ class Sources:
     machine: str
     clock: Clock
     schedules: Sequence[Schedule] = ()
-    devices: Callable[[], Sequence[Device]] = tuple
+    devices: Callable[[], Sequence[DeviceStatus]] = tuple
     rules: Rules = field(default_factory=Rules)
     tail: LogTail | None = None
     control: str = ""

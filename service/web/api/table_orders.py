@@ -6,6 +6,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
 from abbe.service.channel.messages import Answer
+from abbe.service.domain.job_state import JobState
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.once import REPLAYED, Key
 from abbe.service.web.api.shapes_tables import PushBody, RollbackBody
@@ -14,7 +15,6 @@ from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.jobs import ACCEPTED, REFUSALS, answered
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.schemas_jobs import JobState
 
 LONGEST_BODY = 4096
 RESPONSES = ACCEPTED | REFUSALS

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime
 
 from abbe.service.clock import Clock
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress
 from abbe.service.scheduler.ports import Doc
-from abbe.service.scheduler.slots import Schedule
-from abbe.service.web.schemas import Device, Job
 
 
 class Board:
@@ -25,9 +27,9 @@ class Board:
 
     def __init__(self, devices: Mapping[str, str], clock: Clock) -> None:
         self._clock = clock
-        self._before: list[Device] = []
-        self.devices = [Device(role=role, url=url, state="not used yet") for role, url in devices.items()]
-        self.job: Job | None = None
+        self._before: list[DeviceStatus] = []
+        self.devices = [DeviceStatus(role=role, url=url, state="not used yet") for role, url in devices.items()]
+        self.job: RunningCheck | None = None
         self.mqtt_connected = False
         self.mqtt_dropped = 0
         self.attention: list[str] = []
@@ -36,9 +38,9 @@ class Board:
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
         """Note that a check begins."""
         self.changes += 1
-        self.job = Job(schedule=schedule.name, recipe=schedule.recipe, since_utc=at_utc)
+        self.job = RunningCheck(schedule=schedule.name, recipe=schedule.recipe, since_utc=at_utc)
         self._before = self.devices
-        self.devices = [device.model_copy(update={"state": "in use", "at_utc": at_utc, "text": ""}) for device in self.devices]
+        self.devices = [replace(device, state="in use", at_utc=at_utc, text="") for device in self.devices]
 
     def job_progress(self, progress: Progress) -> None:
         """Note how far it is."""
@@ -46,7 +48,7 @@ class Board:
             now = {name: getattr(progress, name) for name in ("stage", "message", "done", "total", "eta_s")}
             if progress.place is not None:
                 now |= {name: getattr(progress.place, name) for name in ("step", "steps", "points")}
-            self.job = self.job.model_copy(update=now)
+            self.job = replace(self.job, **now)
 
     def job_ended(self, doc: Doc | None) -> None:
         """Note how it ended. A check that was stopped or failed says nothing about the devices it does not name."""
@@ -57,12 +59,12 @@ class Board:
             self.devices = [self._blamed(device, cause) for device in self._before]
         else:
             now = self._clock.utc()
-            self.devices = [device.model_copy(update={"state": "answered", "at_utc": now, "text": ""}) for device in self.devices]
+            self.devices = [replace(device, state="answered", at_utc=now, text="") for device in self.devices]
 
-    def _blamed(self, device: Device, cause: Doc | None) -> Device:
+    def _blamed(self, device: DeviceStatus, cause: Doc | None) -> DeviceStatus:
         if cause is None or cause["device"] not in {device.role, device.url}:
             return device
-        return device.model_copy(update={"state": "fault", "at_utc": self._clock.utc(), "text": cause["what"]})
+        return replace(device, state="fault", at_utc=self._clock.utc(), text=cause["what"])
 
     def changed(self) -> None:
         """Note that something else has changed, such as what needs a person."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from datetime import datetime
 from itertools import count
 
@@ -15,7 +14,6 @@ from abbe.service.channel.messages import (
     DoneByHand,
     How,
     Jobs,
-    JobSeen,
     LivePath,
     LiveSamples,
     Moment,
@@ -27,10 +25,12 @@ from abbe.service.channel.messages import (
 )
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import Clock
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.job_state import JobState
+from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import CoreSilent
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.web.core_link.sample_board import MOST_EACH, MOST_LISTENERS, SampleBoard
-from abbe.service.web.schemas import Device, Job
 
 SILENT_S = 5.0
 """The core speaks once a second. After this its last word is not shown as if it were true."""
@@ -53,7 +53,7 @@ class CoreLine:
     def __init__(self, wire: Wire, clock: Clock) -> None:
         self._wire, self._clock = wire, clock
         self._moment: Moment | None = None
-        self._jobs: tuple[JobSeen, ...] = ()
+        self._jobs: tuple[JobState, ...] = ()
         self._heard_s = 0.0
         self._numbers = count(1)
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
@@ -80,7 +80,7 @@ class CoreLine:
                 case Jobs(jobs=jobs):
                     self._jobs = jobs
                 case LivePath():
-                    self.samples.hear_path(message)
+                    self.samples.hear_path(message.path)
                 case LiveSamples():
                     self.samples.hear_samples(message)
                 case Answer():
@@ -114,15 +114,14 @@ class CoreLine:
         return self._moment
 
     @property
-    def devices(self) -> list[Device]:
+    def devices(self) -> list[DeviceStatus]:
         """The devices, and when they were last heard of."""
-        return [Device.model_validate(asdict(device)) for device in self.moment().devices]
+        return list(self.moment().devices)
 
     @property
-    def job(self) -> Job | None:
+    def job(self) -> RunningCheck | None:
         """The check that runs."""
-        check = self.moment().check
-        return None if check is None else Job(id=check.job, **{k: v for k, v in asdict(check).items() if k != "job"})
+        return self.moment().check
 
     @property
     def changes(self) -> int:
@@ -146,12 +145,9 @@ class CoreLine:
 
     def next_due(self) -> list[tuple[Schedule, datetime]]:
         """What comes next of each schedule, soonest first."""
-        return [
-            (Schedule(due.schedule, due.cron, due.timezone, due.recipe, every_h=due.every_h, first_utc=due.first_utc), due.slot_utc)
-            for due in self.moment().due
-        ]
+        return [(due.schedule, due.slot_utc) for due in self.moment().due]
 
-    def jobs(self) -> tuple[JobSeen, ...]:
+    def jobs(self) -> tuple[JobState, ...]:
         """The latest jobs, newest first. Raises as `moment` does."""
         self.moment()
         return self._jobs

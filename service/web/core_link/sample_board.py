@@ -15,7 +15,8 @@ from contextlib import contextmanager
 
 from pydantic import TypeAdapter
 
-from abbe.service.channel.messages import LivePath, LiveSamples
+from abbe.service.channel.messages import LiveSamples
+from abbe.service.domain.recorded_path import RecordedPath
 from abbe.service.errors import ChannelBroken
 
 VERSION = 1
@@ -27,20 +28,20 @@ QUEUE = 40
 """So many frames wait for one browser; then the oldest go. The disk has had them all."""
 MOST_LISTENERS, MOST_EACH = 32, 12
 """So many listen at once, and so many of one account: nobody can keep all others out."""
-_PATH = TypeAdapter(LivePath)
+_PATH = TypeAdapter(RecordedPath)
 
 
 class SampleBoard:
     """The path that is recorded now and its latest frames."""
 
     def __init__(self) -> None:
-        self._path: LivePath | None = None
+        self._path: RecordedPath | None = None
         self._frames: deque[bytes] = deque(maxlen=KEPT_FRAMES)
         self._listeners: dict[asyncio.Queue[bytes | None], str] = {}
         self.dropped = 0
         """Frames that some browser was too slow for."""
 
-    def hear_path(self, path: LivePath) -> None:
+    def hear_path(self, path: RecordedPath) -> None:
         """The core begins a path, or (number 0) has none any more."""
         self._path = path if path.number else None
         if path.number:
@@ -106,5 +107,5 @@ class SampleBoard:
             self._listeners.pop(queue, None)
 
 
-def _text(path: LivePath | None) -> str:
-    return '{"number":0}' if path is None else _PATH.dump_json(path, exclude={"kind"}).decode()
+def _text(path: RecordedPath | None) -> str:
+    return '{"number":0}' if path is None else _PATH.dump_json(path).decode()

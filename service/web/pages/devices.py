@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from datetime import date
 
 from abbe.service.compensation.proved_levels import KIND
+from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.secrets import mask_secrets
 from abbe.service.sequences.incident_account import Trouble, troubles
 from abbe.service.storage.records import CampaignRecord
 from abbe.service.storage.store import Store
-from abbe.service.web.schemas import Device
 
 CAMPAIGNS = 10
 """So many of the latest campaigns are looked through for incidents."""
@@ -40,7 +40,7 @@ class Certificate:
 class DeviceLine:
     """One device. ``url``: without passwords; ``certificate``: None for what is no instrument; ``firmware``: empty where nobody knows."""
 
-    device: Device
+    device: DeviceStatus
     url: str
     certificate: Certificate | None
     firmware: str = ""
@@ -55,7 +55,9 @@ class DeviceScreen:
     campaigns: int
 
 
-def device_screen(store: Store, machine: str, devices: Sequence[Device], until: Mapping[str, date] | None, today: date) -> DeviceScreen:
+def device_screen(
+    store: Store, machine: str, devices: Sequence[DeviceStatus], until: Mapping[str, date] | None, today: date
+) -> DeviceScreen:
     """The devices of a machine file, and what its latest campaigns noted of their links."""
     own = {record.id for record in store.machines() if record.name == machine}
     campaigns = latest_of(store, own)

@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
-from abbe.service.channel.messages import JobSeen
+from abbe.service.domain.job_state import JobState
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.frame import current
@@ -24,7 +24,7 @@ SCRIPT_WORDS = (
 
 
 def add_live_page(
-    app: FastAPI, env: Environment, door: Authenticator, source: PageSource, jobs: Callable[[], Sequence[JobSeen]] = tuple
+    app: FastAPI, env: Environment, door: Authenticator, source: PageSource, jobs: Callable[[], Sequence[JobState]] = tuple
 ) -> None:
     """Add the screen to the application. ``jobs``: those since the service began, newest first; how the last one ended is told."""
     desk = PageContext(env, door, source)

@@ -19,7 +19,6 @@ from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError, ChannelBroken
 from abbe.service.plant.gather import Gatherer
 from abbe.service.report.report_parts import Rules
-from abbe.service.scheduler.slots import Needs, Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
@@ -151,8 +150,9 @@ async def _serve(wire: Wire, begin: Begin, store: ServiceStore, listening: socke
         core, store, begin.machine, begin.recipes, Rehearsals(begin.plan, begin.recipes, rules=begin.rules), begin.campaigns, begin.control
     )
     plant = Gatherer(view.status, store, begin.control)
-    schedules = tuple(Schedule(**asdict(told) | {"needs": Needs(**asdict(told.needs))}) for told in begin.schedules)
-    api = Sources(store, begin.machine, clock, schedules, lambda: core.devices, Rules(**asdict(begin.rules)), keep_log(), begin.control)
+    api = Sources(
+        store, begin.machine, clock, begin.schedules, lambda: core.devices, Rules(**asdict(begin.rules)), keep_log(), begin.control
+    )
     app = create_app(view, version=begin.version, hosts=begin.hosts, door=door, parts=parts, plant=plant, api=api)
     server = make_server(app, begin.certificate, begin.key)
     app.state.end = lambda: setattr(server, "should_exit", True)

@@ -10,8 +10,8 @@ from dataclasses import replace
 from abbe.service.clock import SystemClock
 from abbe.service.devices.machine_lock import alone
 from abbe.service.devices.session import DeviceUrls
+from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.scheduler.ready import Ready, look_at
-from abbe.service.scheduler.slots import Needs, Schedule
 
 SCHEDULE = Schedule("nightly", "0 2 * * *", "UTC", "quick-check", needs=Needs(idle=True, air=True))
 

@@ -17,8 +17,8 @@ from abbe.service.capture.ingest import chunk_of
 from abbe.service.capture.records import CHUNK
 from abbe.service.capture.scan import scan
 from abbe.service.capture.settings import segment_path
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from tests.service.capture.capture_bench import abandon, batch, new_run, segment_bytes
 from tests.service.core.fakes import Result

@@ -9,9 +9,9 @@ from datetime import UTC, datetime, timedelta
 from itertools import count
 from typing import Any
 
+from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress
 from abbe.service.scheduler.ports import OpenSlot
-from abbe.service.scheduler.slots import Schedule
 
 
 class FakeClock:

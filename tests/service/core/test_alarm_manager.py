@@ -15,11 +15,13 @@ from typing import Any, cast
 import pytest
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import How, JobSeen, SteerJob
+from abbe.service.channel.messages import How, SteerJob
 from abbe.service.compensation import push_approved
 from abbe.service.compensation.push_approved import Approved, PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.devices.machine_lock import ENVIRONMENT
+from abbe.service.domain.job_state import JobState
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.at_start import push_is_open
@@ -29,7 +31,6 @@ from abbe.service.push.book import StoreBook
 from abbe.service.push.states import PushState as Push
 from abbe.service.scheduler.alarm_manager import AlarmManager, Duties, Telling
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
@@ -102,7 +103,7 @@ class Bench:
                 await asyncio.sleep(0.001)
         return found
 
-    def jobs(self, state: str = "") -> list[JobSeen]:
+    def jobs(self, state: str = "") -> list[JobState]:
         return [job for job in self.book.seen() if job.state.startswith(state)]
 
     async def steer(self, how: How, who: str = "user:bob") -> tuple[str, str]:

@@ -14,6 +14,7 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
@@ -21,7 +22,6 @@ from abbe.service.scheduler import record
 from abbe.service.scheduler.alarm_manager import AlarmManager, Duties, Telling
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.retrying_store import StoreShelf
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.base import utc_text

@@ -15,9 +15,9 @@ from abbe.service.channel.messages import MOST_JOBS, Answer, How, StartJob, Stee
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, OpenEnds
 from abbe.service.core.rights import may_measure
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MachineInUse, StillActive, StoreError
 from abbe.service.scheduler.loop import Scheduler
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.users.passwords import Passwords

@@ -17,10 +17,11 @@ import pytest
 
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import Answer, DoneByHand, How, JobSeen, StartJob, SteerJob
+from abbe.service.channel.messages import Answer, DoneByHand, How, StartJob, SteerJob
 from abbe.service.core.campaigns import CampaignJobs, CampaignOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.snapshot import SnapshotSource
+from abbe.service.domain.job_state import JobState
 from abbe.service.errors import StoreError, TableMismatch
 from abbe.service.jobs.guided_campaign import CampaignOutcome
 from abbe.service.scheduler.loop import Scheduler
@@ -101,11 +102,11 @@ class Bench:
     async def steer(self, job: str, how: How) -> str:
         return (await self.book.steer(SteerJob("steer", 1, job, how, "token:bob/ci"))).outcome
 
-    async def ended(self) -> JobSeen:
+    async def ended(self) -> JobState:
         await self.until(lambda: self.book.seen()[0].ended_utc is not None)
         return self.book.seen()[0]
 
-    async def led(self) -> JobSeen:
+    async def led(self) -> JobState:
         job = (await self.start()).job
         assert [await self.done(job, 1), await self.done(job, 2)] == ["done", "done"]
         return await self.ended()
@@ -132,7 +133,7 @@ async def test_it_asks_goes_on_by_the_right_word_and_ends_with_a_proposal(bench:
     assert (job.kind, job.state, job.prompt, job.ask, job.who) == ("campaign", "asking", 1, BAR, "token:bob/ci")
     told = bench.moments.now(0).check
     assert told is not None
-    assert (told.job, told.state, told.prompt, told.ask) == (job.id, "asking", 1, BAR)
+    assert (told.id, told.state, told.prompt, told.ask) == (job.id, "asking", 1, BAR)
     for prompt, who, outcome in ((1, "user:eve", "forbidden"), (0, "token:bob/ci", "conflict"), (2, "token:bob/ci", "conflict")):
         assert await bench.done(answer.job, prompt, who) == outcome
     assert bench.book.seen()[0].prompt == 1

@@ -21,6 +21,11 @@ from abbe.service.channel.wire import FULL_B, Wire
 from abbe.service.clock import SystemClock
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.job_state import JobState
+from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreSilent
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web.core_link.core_line import QUEUE, SILENT_S, CoreLine
@@ -32,32 +37,33 @@ NOW = utc(2026, 11, 22, 6)
 MOMENT = m.Moment(
     "moment",
     3,
-    m.CheckNow(
-        "0123456789ab",
-        "weekly",
-        "quick-check",
-        NOW,
-        "running",
-        "helix",
-        "revolution 3 of 10",
-        3.0,
-        10.0,
-        42.0,
-        2,
-        7,
-        5,
-        3,
-        "hang in the bar",
+    RunningCheck(
+        id="0123456789ab",
+        schedule="weekly",
+        recipe="quick-check",
+        since_utc=NOW,
+        stage="helix",
+        message="revolution 3 of 10",
+        done=3.0,
+        total=10.0,
+        eta_s=42.0,
+        step=2,
+        steps=7,
+        points=5,
+        prompt=3,
+        ask="hang in the bar",
     ),
-    (m.DeviceSeen("laser", "modbus+tcp://127.0.0.1:5021", "in use", NOW, ""),),
-    (m.DueSlot("weekly", "0 6 * * 1", "Europe/Berlin", "quick-check", 0.0, NOW, NOW),),
+    (DeviceStatus(role="laser", url="modbus+tcp://127.0.0.1:5021", state="in use", at_utc=NOW),),
+    (DueSlot(schedule=Schedule("weekly", "0 6 * * 1", "Europe/Berlin", "quick-check", needs=Needs(idle=True)), slot_utc=NOW),),
     True,
     2,
     ("DRV-002: refused",),
     77_000_000,
     1,
 )
-JOB = m.JobSeen("0123456789ab", "check", "quick-check", "", "user:bob", "paused", "door", NOW, None, None)
+JOB = JobState(
+    id="0123456789ab", kind="check", recipe="quick-check", schedule="", who="user:bob", state="paused", text="door", begun_utc=NOW
+)
 CORE = [
     m.Begin(
         "begin",
@@ -81,7 +87,19 @@ CORE = [
     ),
     MOMENT,
     m.Jobs("jobs", (JOB, replace(JOB, ended_utc=NOW, verification=7))),
-    m.LivePath("path", 3, "helix1", "ballbar_helix", 150.0, 2000.0, 1000, 84.2, (0.0, 90.5)),
+    m.LivePath(
+        "path",
+        RecordedPath(
+            number=3,
+            run="helix1",
+            test="ballbar_helix",
+            radius_mm=150.0,
+            feed_mm_min=2000.0,
+            rate_hz=1000,
+            duration_s=84.2,
+            angle_deg=(0.0, 90.5),
+        ),
+    ),
     m.LiveSamples("samples", 3, 4050, 1.7e12, "AACAPw=="),
     m.Answer("answer", 1, "busy", "the machine measures", ""),
 ]
@@ -289,7 +307,7 @@ class Nothing:
 
     asked: list[Any] = field(default_factory=list)
 
-    def seen(self) -> tuple[m.JobSeen, ...]:
+    def seen(self) -> tuple[JobState, ...]:
         return ()
 
 

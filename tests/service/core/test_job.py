@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from abbe.drivers.errors import LinkDown
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MeasurementFault
 from abbe.service.scheduler.job import CheckJob
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.sequences.control import Control
 from tests.service.core.fakes import STEP, FakeClock, FakeShelf, FakeWatcher, Result, settle, utc
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.errors import LinkDown
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.scheduler import record
 from abbe.service.scheduler.retrying_store import PAUSES_S, StoreLedger, StoreShelf
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from tests.service.core.fakes import FakeClock, Result, utc
 

@@ -35,7 +35,7 @@ async def test_a_path_its_samples_and_its_end() -> None:
         feed.begin(f"helix{number}", "ballbar_helix", SETUP, (QUARTER, 6000.0, 1000))
         path = await hear(web)
         assert isinstance(path, LivePath)
-        assert (path.number, path.run, path.rate_hz) == (number, f"helix{number}", 1000)
+        assert (path.path.number, path.path.run, path.path.rate_hz) == (number, f"helix{number}", 1000)
         before_ms = clock.utc().timestamp() * 1e3
         feed.take(batch(7, [1000, -2000], host_s=clock.monotonic_s()))
         told = await hear(web)
@@ -46,7 +46,7 @@ async def test_a_path_its_samples_and_its_end() -> None:
         feed.end()
         ended = await hear(web)
         assert isinstance(ended, LivePath)
-        assert ended.number == 0
+        assert ended.path.number == 0
     showing.cancel()
     await asyncio.gather(showing, return_exceptions=True)
     core.close()

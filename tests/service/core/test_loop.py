@@ -9,8 +9,9 @@ from datetime import datetime, timedelta
 
 import pytest
 
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.loop import MAX_BACKLOG, Scheduler
-from abbe.service.scheduler.slots import Schedule, slots_between
+from abbe.service.scheduler.slots import slots_between
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
 Job = Callable[[Schedule, datetime], Awaitable[str]]

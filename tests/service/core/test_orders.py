@@ -17,11 +17,12 @@ import pytest
 
 from abbe.drivers.cnc.tables import crc32
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import Answer, JobSeen, RollBack, StartJob
+from abbe.service.channel.messages import Answer, RollBack, StartJob
 from abbe.service.compensation.ordered_rollback import BackOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders
 from abbe.service.core.rights import may
+from abbe.service.domain.job_state import JobState
 from abbe.service.errors import StoreError
 from abbe.service.push.states import PushState, S
 from abbe.service.scheduler.loop import Scheduler
@@ -88,7 +89,7 @@ class Bench:
         assert answer.request == 7
         return answer
 
-    async def ended(self) -> JobSeen:
+    async def ended(self) -> JobState:
         """The newest job, once it has ended."""
         self.may_end.set()
         async with asyncio.timeout(within(10)):

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import ConfigError
-from abbe.service.scheduler.slots import Schedule, checked, cron_in_words, next_slot, previous_slot, slots_after, slots_between
+from abbe.service.scheduler.slots import checked, cron_in_words, next_slot, previous_slot, slots_after, slots_between
 
 ZONES = ["Europe/Berlin", "America/New_York", "Australia/Lord_Howe", "UTC"]
 CRONS = ["0 6 * * 1", "30 2 * * *", "0,30 2 * * *", "*/30 * * * *", "15 1-3 * * *", "0 0 1 * *", "45 1 * * *"]

@@ -12,9 +12,10 @@ import pytest
 
 from abbe.drivers.api import ControllerStatus
 from abbe.drivers.errors import LinkDown
+from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ready import Ready, SeenDevices
-from abbe.service.scheduler.slots import Needs, Schedule, cron_in_words, next_slot, previous_slot, slots_between
+from abbe.service.scheduler.slots import cron_in_words, next_slot, previous_slot, slots_between
 from abbe.service.scheduler.windows import Window
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from abbe.service.cli import run
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from tests.service.core.fakes import Result, utc
 

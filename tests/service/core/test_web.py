@@ -12,9 +12,9 @@ import httpx
 import pytest
 
 from abbe.drivers.errors import LinkDown
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.scheduler import record
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web import words
 from abbe.service.web.app import create_app

@@ -7,12 +7,16 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.running_check import RunningCheck
 from abbe.service.errors import StoreError
-from abbe.service.plant.facts import Alarm, Check, DeviceState, Facts, PlantFigure, Running, TableInForce
+from abbe.service.plant.facts import Alarm, Check, Facts, PlantFigure, TableInForce
 from tests.patience import within
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
-RUNNING = Running("weekly", "quick-check", NOON, "helix", "revolution 3 of 10", 30.0, 42.0)
+RUNNING = RunningCheck(
+    schedule="weekly", recipe="quick-check", since_utc=NOON, stage="helix", message="revolution 3 of 10", done=30.0, total=100.0, eta_s=42.0
+)
 
 
 def check(number: int, verdict: str = "pass", **figures: float | None) -> Check:
@@ -22,7 +26,10 @@ def check(number: int, verdict: str = "pass", **figures: float | None) -> Check:
 
 
 def facts(**changes: Any) -> Facts:
-    devices = (DeviceState("laser", "answered", "", NOON), DeviceState("cnc", "fault", "refused\x07by peer", None))
+    devices = (
+        DeviceStatus(role="laser", url="", state="answered", at_utc=NOON),
+        DeviceStatus(role="cnc", url="", state="fault", text="refused\x07by peer"),
+    )
     known = Facts(
         machine="mill-7",
         version="0.1.0",

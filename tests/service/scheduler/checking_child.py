@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
 from abbe.service.clock import SystemClock
+from abbe.service.domain.schedule import Schedule
 from abbe.service.events import ProgressSink
 from abbe.service.scheduler.heartbeat import Station
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 
 QUICK = Schedule("quick", "*/1 * * * *", "UTC", "quick-check")

@@ -18,9 +18,9 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import Event
 from abbe.service.cli import run
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, row, stands, state_of
 from abbe.service.scheduler.heartbeat import SILENT_AFTER, Station
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.owner import Owner, this_process
 from abbe.service.storage.records import StationRecord

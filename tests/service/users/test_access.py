@@ -12,8 +12,8 @@ import pytest
 from fastapi import FastAPI, WebSocket
 from fastapi.responses import PlainTextResponse
 
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import ConfigError
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.board import Board

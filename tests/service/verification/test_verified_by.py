@@ -18,6 +18,7 @@ import pytest
 from abbe.drivers.cnc.tables import crc32
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
+from abbe.service.domain.schedule import Schedule
 from abbe.service.plant.facts import Facts
 from abbe.service.plant.gather import Gatherer
 from abbe.service.plant.mtconnect import Agent
@@ -29,7 +30,6 @@ from abbe.service.report.report import numbered_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler import record
 from abbe.service.scheduler.fleet import MachineStatus, stands
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.verification.verified_by import STRANGE, VerifiedBy, verified_by
 from abbe.service.web.core_link.board import Board

@@ -21,13 +21,13 @@ from abbe.service.compensation.proposal_doc import digest_of_doc, doc_of, load
 from abbe.service.compensation.proposals import Gathered, make
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.domain.schedule import Schedule
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import PushState
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from abbe.service.runs.exchange import import_folder
-from abbe.service.scheduler.slots import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.tables.base_table import Base
 from abbe.service.users.passwords import Passwords

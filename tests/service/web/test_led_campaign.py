@@ -13,9 +13,10 @@ from typing import Any
 import httpx
 import pytest
 
-from abbe.service.channel.messages import Answer, DoneByHand, Jobs, JobSeen, Moment, Outcome, StartJob, from_web
+from abbe.service.channel.messages import Answer, DoneByHand, Jobs, Moment, Outcome, StartJob, from_web
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
+from abbe.service.domain.job_state import JobState
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
@@ -30,7 +31,9 @@ BASE, NUMBER = "http://127.0.0.1:8080", "0123456789ab"
 DONE = f"/api/v1/jobs/{NUMBER}/prompts/3/done"
 ASK = "Spindle at X 1.0 Y 2.0 Z 3.0. <b>hang in</b> the 150 mm bar. Done?"
 BEGUN = datetime(2026, 11, 22, tzinfo=UTC)
-JOB = JobSeen(NUMBER, "campaign", CAMPAIGN, "", "user:a", "asking", "", BEGUN, None, None, 3, ASK)
+JOB = JobState(
+    id=NUMBER, kind="campaign", recipe=CAMPAIGN, schedule="", who="user:a", state="asking", text="", begun_utc=BEGUN, prompt=3, ask=ASK
+)
 ENDED = replace(JOB, state="done: proposed", text="proposal 1 waits", ended_utc=BEGUN, prompt=0, ask="", solution=7, proposal=1)
 
 
@@ -44,7 +47,7 @@ class Desk:
     asked: list[Any] = field(default_factory=list)
     answer: tuple[Outcome, str, str] = ("done", "", NUMBER)
 
-    async def says(self, job: JobSeen, moment: Moment) -> None:
+    async def says(self, job: JobState, moment: Moment) -> None:
         self.far.send(Jobs("jobs", (job,)))
         with self.core.listener() as moments:
             assert moments is not None
@@ -65,7 +68,7 @@ class Desk:
 
 
 def asking(prompt: int) -> Moment:
-    check = replace(MOMENT.check, job=NUMBER, state="asking", prompt=prompt, ask=ASK if prompt else "")  # type: ignore[type-var]
+    check = replace(MOMENT.check, id=NUMBER, state="asking", prompt=prompt, ask=ASK if prompt else "")  # type: ignore[type-var]
     return replace(MOMENT, check=check, changes=100 + prompt)
 
 

@@ -14,7 +14,7 @@ from starlette.routing import Route
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.clock import SystemClock
-from abbe.service.scheduler.slots import Schedule
+from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People

@@ -9,11 +9,21 @@ from base64 import b64encode
 import numpy as np
 import pytest
 
-from abbe.service.channel.messages import LivePath, LiveSamples
+from abbe.service.channel.messages import LiveSamples
+from abbe.service.domain.recorded_path import RecordedPath
 from abbe.service.errors import ChannelBroken
 from abbe.service.web.core_link.sample_board import HEAD, KEPT_FRAMES, MOST_EACH, MOST_LISTENERS, QUEUE, SampleBoard
 
-PATH = LivePath("path", 3, "helix1", "ballbar_helix", 150.0, 2000.0, 1000, 84.2, (0.0, 90.0))
+PATH = RecordedPath(
+    number=3,
+    run="helix1",
+    test="ballbar_helix",
+    radius_mm=150.0,
+    feed_mm_min=2000.0,
+    rate_hz=1000,
+    duration_s=84.2,
+    angle_deg=(0.0, 90.0),
+)
 
 
 def told(first: int, *values: float, path: int = 3) -> LiveSamples:
@@ -38,7 +48,7 @@ async def test_who_comes_late_gets_what_there_is_and_then_everything() -> None:
     with board.listener() as parts:
         assert parts is not None
         board.hear_samples(told(3, 4.0))
-        board.hear_path(LivePath("path", 0, "", "", 0.0, 0.0, 0, 0.0, ()))
+        board.hear_path(RecordedPath())
         board.end()
         got = [part async for part in parts()]
     assert [json.loads(part)["number"] for part in got if isinstance(part, str)] == [3, 0]

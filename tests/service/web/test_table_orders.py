@@ -13,9 +13,10 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from abbe.service.channel.messages import Answer, Jobs, JobSeen, Outcome, PushNow, RollBack, from_web
+from abbe.service.channel.messages import Answer, Jobs, Outcome, PushNow, RollBack, from_web
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
+from abbe.service.domain.job_state import JobState
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.api.once import REPLAYED
 from abbe.service.web.api.sources import Sources
@@ -29,7 +30,16 @@ from tests.service.core.test_channel import MOMENT
 from tests.service.web.api_bench import NAME, Plant
 
 BASE, PATH = "http://127.0.0.1:8080", "/api/v1/tables/rollback"
-JOB = JobSeen("0123456789ab", "rollback", "rollback of push 1", "", "user:a", "running", "", datetime(2026, 11, 22, tzinfo=UTC), None, None)
+JOB = JobState(
+    id="0123456789ab",
+    kind="rollback",
+    recipe="rollback of push 1",
+    schedule="",
+    who="user:a",
+    state="running",
+    text="",
+    begun_utc=datetime(2026, 11, 22, tzinfo=UTC),
+)
 BODY = {"push": 1, "crc": "0BADCAFE", "reason": "worse"}
 
 

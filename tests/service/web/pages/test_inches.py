@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from abbe.service.domain.running_check import RunningCheck
 from abbe.service.identification.solution_field import stored_field
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.report_parts import Rules
@@ -29,7 +30,6 @@ from abbe.service.web.pages.live import script_words
 from abbe.service.web.pages.rehearsal import CAMPAIGN
 from abbe.service.web.pages.runs import run_document
 from abbe.service.web.pages.whatif import forecast
-from abbe.service.web.schemas import Job
 from abbe.service.web.units import INCH, METRIC
 from tests.pages_world import Served, as_user
 from tests.service.web.pages.test_rehearsal import PLANS, TOLD
@@ -230,7 +230,7 @@ def test_a_dry_run() -> None:
 @pytest.mark.usefixtures("inches")
 def test_a_live_run_gives_its_script_the_unit() -> None:
     now = datetime(2026, 11, 22, 6, tzinfo=UTC)
-    job = Job(id="0123456789ab", schedule="", recipe="quick-check", since_utc=now)
+    job = RunningCheck(id="0123456789ab", schedule="", recipe="quick-check", since_utc=now)
     moment = SimpleNamespace(job=job, next_due=[], now_utc=now)
     words = script_words("en")
     screen = environment().get_template("live.html")

@@ -6,6 +6,7 @@ import io
 import json
 import re
 import zipfile
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 
@@ -13,13 +14,13 @@ import httpx
 import pytest
 
 from abbe.service.clock import SystemClock
+from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.scheduler.fleet import FleetFigure, MachineLine
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web.app import create_app
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import HIDDEN, blanked, blanked_doc, blanked_line
 from abbe.service.web.pages.fleet import FleetLine, FleetQuery, fleet_csv, fleet_lines
-from abbe.service.web.schemas import Device
 from abbe.service.web.view import View
 from tests.pages_world import Served
 from tests.service.web.pages.test_screens import as_user
@@ -69,7 +70,7 @@ def test_the_csv_holds_si_and_no_formula() -> None:
 def test_a_certificate_says_how_long_it_holds(tmp_path: Path) -> None:
     today = date(2026, 11, 22)
     until = {"ballbar": today + timedelta(days=5), "laser": today - timedelta(days=1)}
-    devices = [Device(role=r, url=f"modbus://me:{CANARY}@h/{r}", state="answered") for r in ("cnc", "ballbar", "laser")]
+    devices = [DeviceStatus(role=r, url=f"modbus://me:{CANARY}@h/{r}", state="answered") for r in ("cnc", "ballbar", "laser")]
     with ServiceStore.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
         number = store.add_campaign(store.add_machine("m", {}), "c", {})
         told = {"link": "laser", "device": "d", "code": "DRV-003", "run": "r1", "text": "no answer"}
@@ -163,7 +164,7 @@ def test_the_bundle_holds_no_secret_and_stands_in_the_audit(running: Served) -> 
     secret = running.people.begin(running.people.get("adam"))
     hashes = [user.password for user in running.store.users()]
     running.tail._lines.extend([f"mqtt://me:{CANARY}@broker refused", f"login with password={CANARY}", f"cookie: {secret}"])
-    running.board.devices = [d.model_copy(update={"url": f"modbus://me:{CANARY}@127.0.0.1:502"}) for d in running.board.devices]
+    running.board.devices = [replace(d, url=f"modbus://me:{CANARY}@127.0.0.1:502") for d in running.board.devices]
     with as_user(running, "adam") as client:
         archive = zipfile.ZipFile(io.BytesIO(client.get("/support.zip").content))
         page = client.get("/diagnostics").text

@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import Answer, JobSeen, PushNow
+from abbe.service.channel.messages import Answer, PushNow
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders
+from abbe.service.domain.job_state import JobState
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.tables.push_outcome import PushOutcome
@@ -63,7 +64,7 @@ class Bench:
     async def ask(self, number: int, who: str = "user:anna", key: str = "") -> Answer:
         return await self.orders.push(PushNow("push", 1, number, key, who))
 
-    async def ended(self) -> JobSeen:
+    async def ended(self) -> JobState:
         async with asyncio.timeout(within(10)):
             while self.book.seen()[0].ended_utc is None:
                 self.news.clear()

@@ -1,0 +1,12 @@
+"""How long texts and how large numbers of a record may be; the channel refuses what is beyond."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+WORD, TEXT = 200, 4000
+Word = Annotated[str, Field(max_length=WORD)]
+Text = Annotated[str, Field(max_length=TEXT)]
+Number = Annotated[int, Field(ge=0, le=2**62)]
