@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
+from enum import Flag, auto
 from typing import NamedTuple, Protocol
 
 Point = tuple[float, float, float]
@@ -76,13 +77,34 @@ class LaserReading:
     refractivity: float
 
 
+class Condition(Flag):
+    """What holds at a controller. A driver maps its own status on these; their numbers mean nothing on any wire."""
+
+    ESTOP = auto()
+    DOOR_OPEN = auto()
+    ALARM = auto()
+    REMOTE = auto()
+    REFERENCED = auto()
+    DRIVES_ON = auto()
+    MOVING = auto()
+    IN_POSITION = auto()
+    FEED_HOLD = auto()
+    PATH_RUNNING = auto()
+    COMPENSATION_ON = auto()
+    NC_PROGRAM = auto()
+    SPINDLE = auto()
+
+
+NOTHING_HOLDS = Condition(0)
+
+
 @dataclass(frozen=True, slots=True)
 class ControllerStatus:
     """One coherent status block of the controller (docs/protocols/cnc.md)."""
 
     host_s: float
     ctrl_us: int
-    bits: int
+    conditions: Condition
     alarm_code: int
     motion_ack_seq: int
     motion_result: int
@@ -96,6 +118,31 @@ class ControllerStatus:
     in_position_us: int
     fifo_ack_seq: int
     fifo_result: int
+
+    @property
+    def moving(self) -> bool:
+        """Whether an axis moves."""
+        return Condition.MOVING in self.conditions
+
+    @property
+    def path_running(self) -> bool:
+        """Whether a path is being followed."""
+        return Condition.PATH_RUNNING in self.conditions
+
+    @property
+    def compensation_on(self) -> bool:
+        """Whether the table in force acts."""
+        return Condition.COMPENSATION_ON in self.conditions
+
+    @property
+    def program_runs(self) -> bool:
+        """Whether an NC program runs."""
+        return Condition.NC_PROGRAM in self.conditions
+
+    @property
+    def remote(self) -> bool:
+        """Whether the controller takes commands from us."""
+        return Condition.REMOTE in self.conditions
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from abbe.drivers.api import BarSample
+from abbe.drivers.flags import bar_is_out, overran
 
 _WRAP = 1 << 32
 _HALF = _WRAP // 2
 _LATE_WINDOW = 128
 _Runs = list[tuple[int, list[BarSample]]]
-_NO_READING = 1 << 0 | 1 << 4  # out of range, no bar: the box says itself that this is not a measurement
-_OVERRUN = 1 << 2
 _SLEW_NM_S = 100_000_000  # 100 mm/s: faster than any axis changes a bar's length, and a bar pushed in by hand stays where it is
 _JITTER = 0.05  # of a period, between the number and the clock of a sample
 _MAX_LOSS = 0.001
@@ -165,7 +164,7 @@ class SequenceTracker:
     def _give(self, missing: int, samples: Sequence[BarSample], runs: _Runs) -> None:
         if missing or not runs:
             runs.append((missing, []))
-            if samples[0].status & _OVERRUN:
+            if overran(samples[0].status):
                 self.overrun += missing
             else:
                 self.lost += missing
@@ -174,7 +173,7 @@ class SequenceTracker:
         self.accepted += len(samples)
         self._next = (last.seq + 1) % _WRAP
         self._last_us = last.device_us
-        self._last_nm = None if last.status & _NO_READING else last.reading_nm
+        self._last_nm = None if bar_is_out(last.status) else last.reading_nm
         self._stray_before = False
 
     def _misfit(self, sample: BarSample, ahead: int) -> tuple[type[SegmentEnd], str]:
@@ -183,7 +182,7 @@ class SequenceTracker:
         _, _, limit_nm, _, mask, number = self._plain_limits
         if not reason and sample.status & mask != number:
             return OtherSettings, f"sample {sample.seq} was taken with settings {sample.status >> 8} instead of {number >> 8}"
-        if not reason and abs(sample.reading_nm) > limit_nm and not sample.status & _NO_READING:
+        if not reason and abs(sample.reading_nm) > limit_nm and not bar_is_out(sample.status):
             reason = f"sample {sample.seq} reads {sample.reading_nm} nm, the stroke ends at {limit_nm} nm"
         return SequenceRestart if sample.device_us <= self._last_us else OtherPace, reason
 
@@ -212,7 +211,7 @@ class SequenceTracker:
 
     def _jumps(self, sample: BarSample) -> bool:
         return (
-            self._last_nm is not None and abs(sample.reading_nm - self._last_nm) > self._plain_limits[3] and not sample.status & _NO_READING
+            self._last_nm is not None and abs(sample.reading_nm - self._last_nm) > self._plain_limits[3] and not bar_is_out(sample.status)
         )
 
     def _weighed(self, sample: BarSample) -> tuple[BarSample, ...]:
@@ -228,7 +227,7 @@ class SequenceTracker:
             return ()
         self._held = None
         back = self._last_nm is not None and abs(sample.reading_nm - self._last_nm) <= 2 * self._plain_limits[3]
-        if back and abs(sample.reading_nm - held.reading_nm) > self._plain_limits[3] and not sample.status & _NO_READING:
+        if back and abs(sample.reading_nm - held.reading_nm) > self._plain_limits[3] and not bar_is_out(sample.status):
             self.strays += 1
             return (sample,)
         return (held, sample)

@@ -6,9 +6,8 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
-from abbe.drivers.api import ControllerStatus, Point
+from abbe.drivers.api import Condition, ControllerStatus, Point
 from abbe.drivers.cnc import registers as reg
-from abbe.drivers.cnc.registers import Bit
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
 from abbe.drivers.links.modbus_policy import ModbusOperation
@@ -95,7 +94,7 @@ class MotionCommands:
     async def _standstill(self) -> None:
         while True:
             status = await self._session.status()
-            if not status.bits & (Bit.MOVING | Bit.PATH_RUNNING):
+            if not (status.moving or status.path_running):
                 return
             await asyncio.sleep(_POLL_S)
 
@@ -133,8 +132,8 @@ class MotionCommands:
     async def _command(self, command: int, operation: str, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> int:
         async with self._commands:
             status = await self._session.status()
-            reasons = reg.interlocks(status.bits)  # an open door may show as feed hold too: the door is what people have to hear about
-            if status.bits & Bit.FEED_HOLD and not reasons and command in (reg.MOVE, reg.PATH_START):
+            reasons = reg.interlocks(status.conditions)  # an open door may show as feed hold too: people have to hear of the door
+            if Condition.FEED_HOLD in status.conditions and not reasons and command in (reg.MOVE, reg.PATH_START):
                 raise Refused(self._name, operation, "feed hold is on", "call resume or abort first, when it is safe")
             number = next_number(status.motion_ack_seq)
             try:
@@ -164,7 +163,7 @@ class MotionCommands:
             self._check(status)
             if status.motion_done_seq == number:
                 return status
-            if status.bits & Bit.FEED_HOLD:
+            if Condition.FEED_HOLD in status.conditions:
                 raise _MotionStopped(self._name, "move", "stopped by feed hold", "resume or abort when it is safe")
             if status.motion_ack_seq != number:
                 detail = f"command {number} was overtaken by {status.motion_ack_seq}"
@@ -172,12 +171,12 @@ class MotionCommands:
             await asyncio.sleep(_POLL_S)
 
     def _check(self, status: ControllerStatus) -> None:
-        if status.bits & Bit.ESTOP:
+        if Condition.ESTOP in status.conditions:
             raise DeviceFault(self._name, "move", "e-stop pressed", "release it, reset the alarm, reference if asked, start again")
-        if status.bits & Bit.ALARM or status.alarm_code:
+        if Condition.ALARM in status.conditions or status.alarm_code:
             what = reg.ALARM.get(status.alarm_code, f"code {status.alarm_code}")
             raise DeviceFault(self._name, "move", f"alarm: {what}", "clear its cause and reset it at the controller")
-        if status.bits & Bit.DOOR_OPEN:
+        if Condition.DOOR_OPEN in status.conditions:
             raise DeviceFault(self._name, "move", "door opened", "close it and start again")
 
     async def _chunk(self, points: list[tuple[int, int, int]], operation: str) -> None:

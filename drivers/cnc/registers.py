@@ -7,10 +7,9 @@ import struct
 from collections.abc import Mapping, Sequence
 from enum import IntFlag
 
-from abbe.drivers.api import CompStatus, ControllerStatus, Point
+from abbe.drivers.api import NOTHING_HOLDS, CompStatus, Condition, ControllerStatus, Point
 from abbe.drivers.links.words import Register, RegisterBlock, words_of
 
-MAP_VERSION = 1
 COUNTS_PER_MM = 100_000  # 10 nm
 FEED_PER_MM_MIN = 100  # 0.01 mm/min
 MAX_CHUNK = 19
@@ -120,16 +119,17 @@ class Bit(IntFlag):
     SPINDLE = 1 << 12
 
 
+_CONDITIONS = {bit: Condition[bit.name] for bit in Bit if bit.name is not None}
 _MUST_BE_CLEAR = {
-    Bit.ESTOP: "the e-stop is pressed",
-    Bit.DOOR_OPEN: "the door is open",
-    Bit.ALARM: "there is an alarm",
-    Bit.NC_PROGRAM: "an NC program is running",
+    Condition.ESTOP: "the e-stop is pressed",
+    Condition.DOOR_OPEN: "the door is open",
+    Condition.ALARM: "there is an alarm",
+    Condition.NC_PROGRAM: "an NC program is running",
 }
 _MUST_BE_SET = {
-    Bit.REMOTE: "not in remote mode",
-    Bit.REFERENCED: "the axes are not referenced",
-    Bit.DRIVES_ON: "the drives are off",
+    Condition.REMOTE: "not in remote mode",
+    Condition.REFERENCED: "the axes are not referenced",
+    Condition.DRIVES_ON: "the drives are off",
 }
 
 
@@ -147,16 +147,19 @@ def fingerprint(counts: Mapping[str, int]) -> str:
     )
 
 
-def interlocks(bits: int) -> list[str]:
-    """Say in words which conditions for motion are not met; empty when the machine may move.
+def conditions_of(bits: int) -> Condition:
+    """What STATUS_BITS say; bits that this map does not know are left out."""
+    found = NOTHING_HOLDS
+    for bit, condition in _CONDITIONS.items():
+        if bits & bit:
+            found |= condition
+    return found
 
-    Parameters
-    ----------
-    bits : int
-        STATUS_BITS.
-    """
-    wrong = [text for bit, text in _MUST_BE_CLEAR.items() if bits & bit]
-    return wrong + [text for bit, text in _MUST_BE_SET.items() if not bits & bit]
+
+def interlocks(conditions: Condition) -> list[str]:
+    """Say in words which conditions for motion are not met; empty when the machine may move."""
+    wrong = [text for one, text in _MUST_BE_CLEAR.items() if one in conditions]
+    return wrong + [text for one, text in _MUST_BE_SET.items() if one not in conditions]
 
 
 def decode_status(words: Sequence[int], host_s: float) -> ControllerStatus:
@@ -174,7 +177,7 @@ def decode_status(words: Sequence[int], host_s: float) -> ControllerStatus:
     return ControllerStatus(
         host_s=host_s,
         ctrl_us=counts["CTRL_TIME_US"],
-        bits=counts["STATUS_BITS"],
+        conditions=conditions_of(counts["STATUS_BITS"]),
         alarm_code=counts["ALARM_CODE"],
         motion_ack_seq=counts["MOTION_ACK_SEQ"],
         motion_result=counts["MOTION_RESULT"],

@@ -6,6 +6,7 @@ import time
 
 from abbe.drivers.api import ControllerStatus, DeviceInfo, TableFormat
 from abbe.drivers.cnc import registers as reg
+from abbe.drivers.cnc.tables import MAP_VERSION
 from abbe.drivers.errors import Rebooted, WrongDevice
 from abbe.drivers.links.identity import check_clock, check_identity
 from abbe.drivers.links.modbus_link import ModbusLink
@@ -99,7 +100,7 @@ class ControllerSession:
     async def _identity(self) -> dict[str, int]:
         counts = reg.IDENTITY.counts(await self.link.read_block(reg.IDENTITY))
         try:
-            check_identity(self.name, counts, reg.MAP_VERSION)
+            check_identity(self.name, counts, MAP_VERSION)
             self._check_map(counts)
         except WrongDevice as error:
             self.link.incidents.note(error, latched=True)

@@ -7,6 +7,7 @@ import time
 
 from abbe.drivers.api import DeviceInfo, LaserReading
 from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
+from abbe.drivers.flags import LaserFlag, beam_is_gone, is_zeroed
 from abbe.drivers.laser import registers as reg
 from abbe.drivers.links.identity import check_clock, check_identity
 from abbe.drivers.links.modbus_link import ModbusLink
@@ -176,10 +177,10 @@ class ModbusLaser:
         return counts
 
     def _check_beam(self, status: int) -> None:
-        if status & (reg.BEAM_LOST | reg.NO_REFLECTOR):
-            what = "no reflector in the beam" if status & reg.NO_REFLECTOR else "counts are lost"
+        if beam_is_gone(status):
+            what = "no reflector in the beam" if status & LaserFlag.NO_REFLECTOR else "counts are lost"
             raise DeviceFault(self.name, "read", f"beam lost ({what})", "free the beam, then clear_beam and zero, then repeat this test")
-        if not status & reg.ZEROED:
+        if not is_zeroed(status):
             raise DeviceFault(self.name, "read", "not zeroed since it was switched on or lost the beam", "zero it, then repeat this test")
 
     async def _command(self, command: int, argument: int, operation: str) -> None:

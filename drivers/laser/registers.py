@@ -44,8 +44,6 @@ COMMAND_ADDRESS = 40
 ZERO, CLEAR_BEAM, ENVIRONMENT = 1, 2, 3
 RESULT_TEXT = {1: "bad argument", 2: "refused: beam blocked"}
 
-BEAM_LOST, SIGNAL_LOW, ZEROED, COMPENSATED, NO_REFLECTOR = 1 << 0, 1 << 1, 1 << 2, 1 << 3, 1 << 4
-
 
 def decode_reading(words: Sequence[int], host_s: float) -> LaserReading:
     """Turn registers 10..27 of one request into a reading.

@@ -24,7 +24,6 @@ from abbe.service.devices.session import Session
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.laser_columns import MM_PER_COUNT
 from abbe.service.runs.recorder import Recorder
-from abbe.service.sequences.interlocks import PROGRAM
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
 from abbe.service.sequences.runner import COMPENSATED
 from abbe.service.sequences.steps import MountLaser, MoveTo, ReadLaser, TestPlan
@@ -145,7 +144,7 @@ async def _hear(session: Session, quiet_s: float) -> Heard:
         if len(heard.readings) % STATUS_EVERY == 0:
             status = await session.controller.status()
             heard.statuses.append(status)
-            running = bool(status.bits >> PROGRAM & 1)
+            running = status.program_runs
             if ran and not running and moved_us:  # before that, somebody went on from one halt to the next
                 return heard
             ran = running or (ran and bool(moved_us))

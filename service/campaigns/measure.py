@@ -26,7 +26,6 @@ from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.guard import warnings_of
 from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
-from abbe.service.sequences.interlocks import COMPENSATION_ON
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
 from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.preconditions import ExpectedTable
@@ -321,7 +320,7 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
     ctrl0_us, set_us = campaign.ctrl0_us, status.ctrl_us
     if not test.mounts:
         set_us = campaign.mounted_us.get(test.setup["setup_id"], set_us)
-    acting = bool(status.bits >> COMPENSATION_ON & 1)
+    acting = status.compensation_on
     doc: dict[str, Any] = {
         "setup": test.setup | {"t_set_s": (set_us - ctrl0_us) * 1e-6},
         "machine": site.doc,

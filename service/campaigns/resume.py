@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from abbe.drivers.errors import DriverError
+from abbe.drivers.flags import beam_is_good, is_zeroed
 from abbe.service.campaigns.campaign_run import (
     Confirm,
     Item,
@@ -25,7 +26,7 @@ from abbe.service.devices.session import Session
 from abbe.service.errors import UnsafeToMove, WorldChanged
 from abbe.service.runs.codec import decode_json
 from abbe.service.runs.columns import LASER_CHANNEL
-from abbe.service.sequences.interlocks import BEAM_BITS, MOVING, check_interlocks, check_ours
+from abbe.service.sequences.interlocks import check_interlocks, check_ours
 from abbe.service.sequences.journal import BEGUN, ENDED, HAND, RUN
 from abbe.service.sequences.preconditions import ExpectedTable, check_expected
 from abbe.service.sequences.resume_plan import anew, remounted
@@ -36,7 +37,6 @@ from abbe.service.storage.records import RUNNING, CampaignRecord, CheckpointReco
 from abbe.service.storage.store import Store
 
 COMPLETE = "complete"
-ZEROED = 1 << 2
 MOUNTS = ("MountBar", "MountLaser")
 
 
@@ -111,7 +111,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     said = [f"campaign {campaign.name!r}: same plan, same machine, same run of the controller, same table"]
     status = await session.controller.status()
     check_ours(status)
-    if status.bits >> MOVING & 1:
+    if status.moving:
         await session.controller.abort()
         said.append("the machine was still moving: it was stopped")
     check_interlocks(await session.controller.status())
@@ -224,4 +224,4 @@ async def counting(session: Session) -> bool:
         status = (await session.laser.peek()).status
     except DriverError:
         return False
-    return bool(status & ZEROED) and not status & BEAM_BITS
+    return is_zeroed(status) and beam_is_good(status)

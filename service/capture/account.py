@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
+from abbe.drivers.flags import bar_is_valid
 from abbe.service.capture.drafts import BAR, GAPS, Drafter, gap_of
 from abbe.service.capture.ingest import chunk_of
-from abbe.service.capture.ledger import FLAG_MASK, Ledger, SampleGap
+from abbe.service.capture.ledger import Ledger, SampleGap
 from abbe.service.capture.records import CHUNK, CLOSE, GAP, Record
 from abbe.service.capture.scan import Scan
 from abbe.service.runs.codec import decode_bar, decode_json
@@ -118,7 +119,7 @@ def _of_headers(held: Scan) -> Ledger:
         if record.kind == GAP:
             ledger.add_gap(gap_of(record))
         elif record.kind == CHUNK and record.channel == BAR:
-            if record.flags & FLAG_MASK:
+            if not bar_is_valid(record.flags):
                 ledger.add_samples(record.stream, decode_bar(record.payload))
             else:
                 ledger.add_span(record.stream, record.first_seq, record.first_seq + record.count - 1)

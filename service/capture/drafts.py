@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from abbe.drivers.api import BarBatch, BarSample
-from abbe.service.capture.ledger import OVERRUN_BIT, Ledger, SampleGap
+from abbe.drivers.flags import overran
+from abbe.service.capture.ledger import Ledger, SampleGap
 from abbe.service.capture.records import CHUNK, CLOSE, GAP, OPEN, Record
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_json, encode_bar, encode_json
 
@@ -112,7 +113,7 @@ class Drafter:
 
     def _gap(self, batch: BarBatch) -> Record:
         first = batch.samples[0]
-        cause = SLOW if batch.overran else BOX if first.status & OVERRUN_BIT else WIRE
+        cause = SLOW if batch.overran else BOX if overran(first.status) else WIRE
         return self.lost(cause, first.seq - 1 if first.seq else None, first.device_us)
 
     def _chunks(self, batches: list[BarBatch]) -> list[Record]:

@@ -7,11 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from abbe.drivers.api import BarSample
-
-FLAGS = {0: "out of range", 2: "samples lost before it", 4: "no bar"}
-"""Status bits that make a reading no measurement (docs/protocols/ballbar.md); the sample is kept all the same."""
-FLAG_MASK = sum(1 << bit for bit in FLAGS)
-OVERRUN_BIT = 1 << 2
+from abbe.drivers.flags import bar_is_valid, bar_reasons
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +61,10 @@ class Ledger:
         """Book samples that are stored; in one call without a gap between them."""
         self.add_span(stream, samples[0].seq, samples[-1].seq)
         for sample in samples:
-            if sample.status & FLAG_MASK:
+            if not bar_is_valid(sample.status):  # the sample is kept all the same
                 self.invalid += 1
-                for bit, reason in FLAGS.items():
-                    if sample.status >> bit & 1:
-                        self.flagged[reason] = self.flagged.get(reason, 0) + 1
+                for reason in bar_reasons(sample.status):
+                    self.flagged[reason] = self.flagged.get(reason, 0) + 1
 
     def add_span(self, stream: int, first: int, last: int) -> None:
         """Book samples that are stored without a flag, from their first and last number."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.drivers.api import BarBatch, Point
+from abbe.drivers.flags import bar_is_valid, on_path
 from abbe.service.domain.bounds import WORD
 from abbe.service.domain.recorded_path import RecordedPath
 from abbe.service.runs.helix_axis import about_axis, helix_axis
@@ -30,7 +31,6 @@ LONGEST = 4096
 """So many deviations make a stretch at most: a message of the channel is bounded, and a longer one would end the page's process."""
 ANGLES = 512
 """Places of a path at which its angle is told; in between the browser interpolates."""
-SYNC, INVALID_BITS = 0b1000, 0b10101
 UM_PER_NM = 1e-3
 
 
@@ -87,7 +87,7 @@ class LiveFeed:
     def take(self, batch: BarBatch) -> None:
         """Take a batch; in the driver's thread. Never waits, never raises."""
         if self._first_seq is None:
-            self._first_seq = next((sample.seq for sample in batch.samples if sample.status & SYNC), None)
+            self._first_seq = next((sample.seq for sample in batch.samples if on_path(sample.status)), None)
         if self._first_seq is not None:
             self._batches.append(batch)
 
@@ -103,9 +103,9 @@ class LiveFeed:
             batch = self._batches.popleft()
             host_s = batch.host_s
             for sample in batch.samples:
-                if sample.status & SYNC:
+                if on_path(sample.status):
                     numbers.append((sample.seq - first_seq) % 2**32)
-                    values.append(float("nan") if sample.status & INVALID_BITS else sample.reading_nm * UM_PER_NM)
+                    values.append(sample.reading_nm * UM_PER_NM if bar_is_valid(sample.status) else float("nan"))
         return _cut(path.number, numbers, np.array(values, dtype=np.float32), host_s)
 
 

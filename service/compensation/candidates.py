@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from abbe.drivers.api import TableFormat
-from abbe.drivers.cnc.registers import MAP_VERSION
+from abbe.drivers.cnc.tables import MAP_VERSION
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
 from abbe.service.clock import Clock

@@ -9,7 +9,7 @@ from abbe.drivers.errors import DeviceFault, Refused
 from abbe.drivers.links.shielded import run_to_end
 from abbe.models.machine import AXES
 from abbe.service.compensation.level_trial import Trial
-from abbe.service.sequences.interlocks import MOVING, tripped
+from abbe.service.sequences.interlocks import tripped
 from abbe.service.site import Site
 
 MOVE_MM, FEED_MM_MIN = 3.0, 60.0
@@ -51,7 +51,7 @@ async def _on_the_way(t: Trial, target: Point) -> str:
             await move
             return "the axis was not seen moving"
         why = await t.activate(now)
-        still = bool((await t.controller.status()).bits >> MOVING & 1)
+        still = (await t.controller.status()).moving
         await move
         if not still:  # taken or refused: nobody knows whether it still moved then
             return "the axis had arrived before the answer"
@@ -73,7 +73,7 @@ def away(site: Site, home: Point) -> Point:
 async def _moves(t: Trial, move: asyncio.Future[ControllerStatus]) -> bool:
     end_s = t.clock.monotonic_s() + MOVES_WITHIN_S
     while not move.done() and t.clock.monotonic_s() < end_s:
-        if (await t.controller.status()).bits >> MOVING & 1:
+        if (await t.controller.status()).moving:
             return True
         await t.clock.sleep(POLL_S)
     return False

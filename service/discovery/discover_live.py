@@ -20,7 +20,6 @@ from abbe.service.effects.model_book import version
 from abbe.service.errors import CampaignRefused, UnsafeToMove
 from abbe.service.events import ProgressSink
 from abbe.service.identification.table_removal import table_then
-from abbe.service.sequences.interlocks import MOVING
 from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.steps import CampaignPlan, TestPlan, Unmount
 from abbe.service.site import Site
@@ -138,7 +137,7 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
     wait_s: float = what.after_s - (1e-6 * (status.ctrl_us - old["ctrl0_us"]) - _last_s(campaign))
     if what.after_s > 0.0 and wait_s > 0.0:
         return wait_s
-    if status.bits >> MOVING & 1:  # nobody is asked to reach into it
+    if status.moving:  # nobody is asked to reach into it
         raise UnsafeToMove("the machine is moving: it may run the path of a run that was broken off", "wait until it stands, then go on")
     await check_devices(session, what.left, air=site.watching.air_c is not None)
     if what.begun is None:

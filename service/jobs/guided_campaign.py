@@ -24,7 +24,6 @@ from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.jobs.investigate import NO, InvestigationContext, made_of, promise_words
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import COMPENSATION_ON
 from abbe.service.sequences.needed import check_devices, needed_by
 from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_source
@@ -155,7 +154,7 @@ async def _check_table_acts(session: Session) -> None:
     """The same of a table in force that is switched off: nothing could be proposed from what is measured then."""
     base = await read_base(session.controller)
     status = await session.controller.status()
-    if base.tables is not None and not status.bits >> COMPENSATION_ON & 1:
+    if base.tables is not None and not status.compensation_on:
         why = f"table {base.crc:08X} does not act: the compensation is switched off"
         raise TableMismatch(why, "switch it on at the control and start again; nothing was measured")
 

@@ -9,18 +9,17 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import Condition, Controller
 from abbe.drivers.errors import DriverError, Rebooted, Refused
 from abbe.service.clock import Clock
 from abbe.service.push import operations as o
 from abbe.service.push.entries import Journal, facts
 from abbe.service.push.operations import Operation, OperationKind, Outcome, Truth
 from abbe.service.push.semantic_digest import meaning_of_bytes
-from abbe.service.sequences.interlocks import MOVING, tripped
+from abbe.service.sequences.interlocks import tripped
 
 LEASE_MS, BEAT_S = 60_000, 20.0
 """How long a lease is taken for, and how often it is renewed while the machine is measured."""
-_IN_POSITION = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +165,8 @@ class ControllerPort:
         status = await self._c.status()
         comp = await self._c.comp_status()
         trouble = tripped(status)
-        unsafe = trouble.detail if trouble else ("the axes move" if status.bits >> MOVING & 1 else "")
-        still_s = (status.ctrl_us - status.in_position_us) * 1e-6 if status.bits >> _IN_POSITION & 1 else 0.0
+        unsafe = trouble.detail if trouble else ("the axes move" if status.moving else "")
+        still_s = (status.ctrl_us - status.in_position_us) * 1e-6 if Condition.IN_POSITION in status.conditions else 0.0
         return Truth(
             comp.boot_id, comp.gen, comp.active_bank, comp.bank_crc, comp.bank_state, comp.lease_owner, comp.lease_left_ms,
             unsafe, still_s, self._clock.monotonic_s(), self._map,

@@ -12,21 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from abbe.drivers.api import BarSample
+from abbe.drivers.flags import bar_is_valid, on_path
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.clocks import Edges
 from abbe.service.storage.records import Doc
 
 Array = npt.NDArray[np.float64]
 
-SYNC_BIT = 1 << 3
-INVALID_BITS = 1 << 0 | 1 << 2 | 1 << 4
-"""Out of range, samples lost just before, no bar: the box itself says that the reading is not one."""
 DURATION_TOLERANCE = 0.01
 
 
 def sync_edges(samples: Sequence[BarSample], start: Doc) -> Edges | None:
     """What the sync line says of a run; None if no sample has it set."""
-    at = [k for k, sample in enumerate(samples) if sample.status & SYNC_BIT]
+    at = [k for k, sample in enumerate(samples) if on_path(sample.status)]
     if not at:
         return None
     first, last = at[0], at[-1]
@@ -37,7 +35,7 @@ def sync_edges(samples: Sequence[BarSample], start: Doc) -> Edges | None:
 
 def begins_seen(samples: Sequence[BarSample]) -> bool:
     """Whether the sample before the first one on the path is there: only then the path's beginning is known to the period."""
-    first = next((k for k, sample in enumerate(samples) if sample.status & SYNC_BIT), 0)
+    first = next((k for k, sample in enumerate(samples) if on_path(sample.status)), 0)
     return first > 0 and (samples[first - 1].seq + 1) % 2**32 == samples[first].seq
 
 
@@ -70,24 +68,24 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     path, rate_hz = start["path"], float(start["rate_hz"])
     feed_mm_s = path["feed_mm_min"] / 60.0
     points = np.asarray(path["points_mm"], dtype=np.float64).reshape(-1, 3)
-    on_path = [sample for sample in samples if sample.status & SYNC_BIT]
-    device_us = np.array([sample.device_us for sample in on_path], dtype=np.int64)
+    along = [sample for sample in samples if on_path(sample.status)]
+    device_us = np.array([sample.device_us for sample in along], dtype=np.int64)
     if complete and end is not None and "path_end_us" in end:
         _check_durations(device_us, end, _length_mm(points) / feed_mm_s, rate_hz)
-    along_s = _time_along_path(samples, on_path, device_us, end if complete else None, (rate_hz, rate))
+    along_s = _time_along_path(samples, along, device_us, end if complete else None, (rate_hz, rate))
     counts = _counts(points, path.get("measured"), feed_mm_s * along_s)
-    on_path, device_us, along_s = [s for s, yes in zip(on_path, counts, strict=True) if yes], device_us[counts], along_s[counts]
+    along, device_us, along_s = [s for s, yes in zip(along, counts, strict=True) if yes], device_us[counts], along_s[counts]
     position = _position(points, feed_mm_s * along_s)
     times = {"t_s": (_start_s(start, end) + along_s).tolist()}
     places = {f"{axis}_mm": position[:, index].tolist() for index, axis in enumerate("xyz")}
-    count = len(on_path)
+    count = len(along)
     constant = {"feed_mm_min": [float(path["feed_mm_min"])] * count, "direction": [int(path["direction"])] * count}
     readings = {
-        "deviation_mm": [sample.reading_nm * 1e-6 for sample in on_path],
-        "valid": [0 if sample.status & INVALID_BITS else 1 for sample in on_path],
-        "device_seq": [sample.seq for sample in on_path],
+        "deviation_mm": [sample.reading_nm * 1e-6 for sample in along],
+        "valid": [1 if bar_is_valid(sample.status) else 0 for sample in along],
+        "device_seq": [sample.seq for sample in along],
         "device_us": device_us.tolist(),
-        "status": [sample.status for sample in on_path],
+        "status": [sample.status for sample in along],
     }
     return times | places | constant | readings
 
@@ -101,17 +99,17 @@ def _start_s(start: Doc, end: Doc | None) -> float:
 
 def _time_along_path(
     samples: Sequence[BarSample],
-    on_path: Sequence[BarSample],
+    along: Sequence[BarSample],
     device_us: npt.NDArray[np.int64],
     end: Doc | None,
     rates: tuple[float, float],
 ) -> Array:
-    if not on_path:
+    if not along:
         return np.zeros(0)
     half_period_s = 0.5 / rates[0]
     since_first_s = (device_us - device_us[0]) * 1e-6 * rates[1]
-    first = samples.index(on_path[0])
-    start_was_lost = on_path[0].seq != (samples[first - 1].seq + 1) % 2**32 if first else on_path[0].seq != 0
+    first = samples.index(along[0])
+    start_was_lost = along[0].seq != (samples[first - 1].seq + 1) % 2**32 if first else along[0].seq != 0
     if start_was_lost and end is not None and end.get("path_end_us"):
         # The edge fell into a gap of the stream: the path's other edge tells the time as well.
         duration_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6

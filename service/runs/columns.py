@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from abbe.drivers.flags import bar_is_valid
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
 from abbe.service.runs.bar_columns import bar_columns, begins_seen, sync_edges
 from abbe.service.runs.clocks import RunClock, run_clock
@@ -33,9 +34,6 @@ from abbe.service.storage.records import ChunkRecord, Doc, RunRecord
 from abbe.service.storage.store import Store
 
 # Ball-bar readings at standstill become columns: one row for each point, the mean of the samples that were taken there.
-
-
-INVALID_BITS = 0b10101
 
 
 def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
@@ -62,7 +60,7 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
         "feed_mm_min": [float(one["feed_mm_min"]) for one in records],
         "direction": [int(one["direction"]) for one in records],
         "deviation_mm": [float(m) for m in means],
-        "valid": [0 if any(s & INVALID_BITS for s in one["status"]) else 1 for one in records],
+        "valid": [1 if all(bar_is_valid(s) for s in one["status"]) else 0 for one in records],
         "reading_u_mm": [_u_mm(one["reading_nm"]) for one in records],
         "samples_count": [len(one["reading_nm"]) for one in records],
         "device_us": [int(one["device_us"][0]) for one in records],

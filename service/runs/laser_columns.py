@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from abbe.drivers.flags import beam_is_gone
 from abbe.service.storage.records import Doc
 
-BEAM_LOST = 1 << 0
-NO_REFLECTOR = 1 << 4
 MM_PER_COUNT = 1e-7
 """The displacement counts tenths of a nanometre."""
 
@@ -41,7 +40,7 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
         "deviation_mm": [_deviation_mm(one, first, beam) for one in records],
         "temp_air_C": [float(one["air_temp_c"]) for one in records],
         "pressure_air_Pa": [float(one["air_pressure_pa"]) for one in records],
-        "valid": [0 if one.get("missing") or one["status"] & (BEAM_LOST | NO_REFLECTOR) else 1 for one in records],
+        "valid": [0 if one.get("missing") or beam_is_gone(one["status"]) else 1 for one in records],
         "status": [int(one["status"]) for one in records],
         "signal_permille": [int(one["signal_permille"]) for one in records],
     }

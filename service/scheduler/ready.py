@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
-from abbe.drivers.api import ControllerStatus
+from abbe.drivers.api import Condition, ControllerStatus
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
 from abbe.service.devices.machine_lock import alone
@@ -14,11 +14,13 @@ from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.errors import AbbeError
 from abbe.service.scheduler.windows import Window, covering
-from abbe.service.sequences.interlocks import MOVING, PATH, PROGRAM, SPINDLE, somebody_at_work, tripped
+from abbe.service.sequences.interlocks import somebody_at_work, tripped
 
 LOOK_S = 60.0
 """How often the controller is looked at where a schedule needs a warm machine."""
 HOUR_S = 3600.0
+WARMS = Condition.MOVING | Condition.PATH_RUNNING | Condition.NC_PROGRAM | Condition.SPINDLE
+"""What warms a machine."""
 MOVED_MM = 1e-4
 """An axis that stands elsewhere than at the last look has moved in between."""
 
@@ -102,7 +104,7 @@ class Ready:
             trouble = tripped(seen.status)
             if trouble is not None:
                 return f"the machine is not idle: {trouble.detail}"
-            if seen.status.bits >> MOVING & 1 or seen.status.bits >> PATH & 1:
+            if seen.status.moving or seen.status.path_running:
                 return "the machine is not idle: an axis moves"
         if needs.air:
             low, high = self._air_c
@@ -130,7 +132,7 @@ class Ready:
     def _note(self, status: ControllerStatus) -> None:
         before, self._position = self._position, tuple(status.position_mm)
         moved = before is not None and max(abs(a - b) for a, b in zip(before, self._position, strict=True)) > MOVED_MM
-        if moved or any(status.bits >> bit & 1 for bit in (MOVING, PATH, PROGRAM, SPINDLE)):
+        if moved or status.conditions & WARMS:
             self._active.append(self._clock.monotonic_s())
 
 

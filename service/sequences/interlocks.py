@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from abbe.drivers.api import ControllerStatus, LaserReading
+from abbe.drivers.api import Condition, ControllerStatus, LaserReading
+from abbe.drivers.flags import beam_is_gone, beam_is_good
 from abbe.service.errors import (
     AlarmOn,
     BeamLost,
@@ -18,25 +19,20 @@ from abbe.service.errors import (
     TemperatureOutside,
 )
 
-ESTOP, DOOR, ALARM, REMOTE, REFERENCED, DRIVES, MOVING, HOLD, PATH, PROGRAM, SPINDLE = 0, 1, 2, 3, 4, 5, 6, 8, 9, 11, 12
-COMPENSATION_ON = 10
 CLEAR_IT = "clear it at the machine, then start again; the run so far is kept as incomplete"
 READY = "make the machine ready, then start again"
-FORBIDDEN: tuple[tuple[int, type[Interlock], str], ...] = (
-    (ESTOP, EstopPressed, "e-stop is pressed"),
-    (DOOR, DoorOpen, "the door is open"),
-    (ALARM, AlarmOn, "the controller has an alarm"),
-    (PROGRAM, ProgramRuns, "an NC program runs"),
-    (SPINDLE, SpindleTurns, "the spindle turns"),
+FORBIDDEN: tuple[tuple[Condition, type[Interlock], str], ...] = (
+    (Condition.ESTOP, EstopPressed, "e-stop is pressed"),
+    (Condition.DOOR_OPEN, DoorOpen, "the door is open"),
+    (Condition.ALARM, AlarmOn, "the controller has an alarm"),
+    (Condition.NC_PROGRAM, ProgramRuns, "an NC program runs"),
+    (Condition.SPINDLE, SpindleTurns, "the spindle turns"),
 )
-NEEDED: tuple[tuple[int, type[Interlock], str], ...] = (
-    (REMOTE, RemoteLost, "the controller is not in remote mode"),
-    (REFERENCED, DrivesOff, "the axes are not referenced"),
-    (DRIVES, DrivesOff, "the drives are off"),
+NEEDED: tuple[tuple[Condition, type[Interlock], str], ...] = (
+    (Condition.REMOTE, RemoteLost, "the controller is not in remote mode"),
+    (Condition.REFERENCED, DrivesOff, "the axes are not referenced"),
+    (Condition.DRIVES_ON, DrivesOff, "the drives are off"),
 )
-BEAM_BITS = 0b10011
-"""Beam lost (latched), signal low now, no reflector (docs/protocols/laser.md)."""
-LOST_BITS = 0b10001
 
 AT_WORK = frozenset({"door"})
 """What a person may do who mounts something: nothing moves meanwhile."""
@@ -74,11 +70,11 @@ class Watching:
 
 def tripped(status: ControllerStatus, tolerated: frozenset[str] = frozenset()) -> Interlock | None:
     """The first condition of the controller that forbids motion; None: it may move."""
-    for bit, kind, text in FORBIDDEN:
-        if status.bits >> bit & 1 and kind.condition not in tolerated:
+    for condition, kind, text in FORBIDDEN:
+        if condition in status.conditions and kind.condition not in tolerated:
             return kind(text, CLEAR_IT)
-    for bit, kind, text in NEEDED:
-        if not status.bits >> bit & 1 and kind.condition not in tolerated:
+    for condition, kind, text in NEEDED:
+        if condition not in status.conditions and kind.condition not in tolerated:
             return kind(text, READY)
     return None
 
@@ -104,22 +100,22 @@ def check_ours(status: ControllerStatus) -> None:
     ProgramRuns, RemoteLost
         It runs its own program, or is not in remote mode.
     """
-    if status.bits >> PROGRAM & 1:
+    if status.program_runs:
         raise ProgramRuns("an NC program runs", "wait until it has ended, then start again; nothing was sent to the machine")
-    if not status.bits >> REMOTE & 1:
+    if not status.remote:
         raise RemoteLost("the controller is not in remote mode", READY)
 
 
 def somebody_at_work(status: ControllerStatus) -> bool:
     """Whether the door is open or the mode is somebody else's: what is mounted may be touched."""
-    return bool(status.bits >> DOOR & 1 or not status.bits >> REMOTE & 1)
+    return Condition.DOOR_OPEN in status.conditions or not status.remote
 
 
 def beam_trouble(reading: LaserReading) -> BeamLost | None:
     """Whether the laser's count can still be trusted: the beam was not lost, is strong enough and has a reflector."""
-    if not reading.status & BEAM_BITS:
+    if beam_is_good(reading.status):
         return None
-    what = "lost" if reading.status & LOST_BITS else f"too weak ({reading.signal_permille} permille)"
+    what = "lost" if beam_is_gone(reading.status) else f"too weak ({reading.signal_permille} permille)"
     return BeamLost(f"the laser's beam is {what}", "free the beam; the test begins again with a new zero")
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from abbe.drivers.api import BarSample, ControllerStatus
+from abbe.drivers.flags import bar_is_valid, on_path
 from abbe.models.arrays import F1
 from abbe.service.errors import RunInterrupted, StretchDiffers
 from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, RunPiece, SoFar, arc_of
@@ -29,7 +30,6 @@ STEADY_MM = 0.1
 BEHIND_S, BEHIND_MM = 0.15, 0.5
 """So far a machine at constant feed is behind its command: what speeding up and its position control take."""
 AROUND_MM = 100.0
-INVALID_BITS, SYNC = 0b10101, 0b1000
 
 
 class Way:
@@ -169,7 +169,7 @@ class SameStretch:
             The stretch was read otherwise, or could not be read.
         """
         before, self._last = self._last, sample
-        if self.off_mm is not None or not sample.status & SYNC:
+        if self.off_mm is not None or not on_path(sample.status):
             return
         if self._first_us is None:
             if before is None or (before.seq + 1) % 2**32 != sample.seq:
@@ -178,7 +178,7 @@ class SameStretch:
         at_mm = ((sample.device_us - self._first_us) * 1e-6 + self._half_s) * self._on.feed_mm_s
         if at_mm > self._on.arc_mm[-1]:
             self.judge()
-        elif at_mm >= self._on.arc_mm[0] and not sample.status & INVALID_BITS:
+        elif at_mm >= self._on.arc_mm[0] and bar_is_valid(sample.status):
             self._off.append(sample.reading_nm * 1e-6 - float(np.interp(at_mm, self._on.arc_mm, self._on.deviation_mm)))
 
     def judge(self) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 
-from abbe.drivers.api import BarBatch, Controller, ControllerStatus
+from abbe.drivers.api import BarBatch, Condition, Controller, ControllerStatus
+from abbe.drivers.flags import bar_is_out, bar_is_valid, on_path
 from abbe.service.devices.session import Session
 from abbe.service.errors import BarOutOfRange, MeasurementFault, RunInterrupted
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.guard import motion_guard
-from abbe.service.sequences.interlocks import HOLD, MOVING, PATH, check_interlocks
+from abbe.service.sequences.interlocks import check_interlocks
 from abbe.service.sequences.path_resume import Onward, SameStretch, Way
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
@@ -22,7 +23,6 @@ STAND_S = 5.0
 BAD_IN_A_ROW = 25
 OUT_S = 0.03
 """So long the bar may be out of range: long enough for a disturbed sample or two, short enough to stop in time."""
-SYNC, BAD_BITS, OUT_BITS = 0b1000, 0b10101, 0b10001
 
 
 def bar_trouble(status: int) -> BarOutOfRange:
@@ -80,13 +80,13 @@ async def follow(controller: Controller, control: Control, way: Way | None = Non
     while True:
         status = await controller.status()
         check_interlocks(status)
-        if status.bits >> HOLD & 1:
+        if Condition.FEED_HOLD in status.conditions:
             raise MeasurementFault(
                 "feed hold was pressed while the ball-bar recorded", "start the test again: readings must be at constant feed"
             )
-        if not status.bits >> PATH & 1 and status.path_end_us > status.path_start_us:
+        if not status.path_running and status.path_end_us > status.path_start_us:
             return status
-        if way is not None and status.bits >> PATH & 1:
+        if way is not None and status.path_running:
             way.see(status)
         if control.pausing or control.stopping:
             await hold(controller)
@@ -105,7 +105,7 @@ async def hold(controller: Controller) -> None:
     until_s, last = asyncio.get_running_loop().time() + STAND_S, None
     while asyncio.get_running_loop().time() < until_s:
         status = await controller.status()
-        if status.position_mm == last or not status.bits >> MOVING & 1:
+        if status.position_mm == last or not status.moving:
             return
         last = status.position_mm
         await asyncio.sleep(POLL_S)
@@ -142,18 +142,18 @@ class Pump:
                 self._look(sample.status)
                 if self._stretch is not None:
                     self._stretch.see(sample)
-            if self.finished.is_set() and batch.samples and not batch.samples[-1].status & SYNC:
+            if self.finished.is_set() and batch.samples and not on_path(batch.samples[-1].status):
                 if self._stretch is not None:
                     self._stretch.judge()
                 return
 
     def _look(self, status: int) -> None:
-        counts = bool(status & SYNC) or not self.reads.is_set()
-        self._out = self._out + 1 if counts and status & OUT_BITS else 0
-        self._bad = self._bad + 1 if counts and status & BAD_BITS else 0
+        counts = on_path(status) or not self.reads.is_set()
+        self._out = self._out + 1 if counts and bar_is_out(status) else 0
+        self._bad = self._bad + 1 if counts and not bar_is_valid(status) else 0
         if self._out >= self._out_limit:
             raise bar_trouble(status)
         if self._bad >= BAD_IN_A_ROW:
             raise MeasurementFault(f"the ball-bar's box loses samples (status {status:#06x})", "lower the rate, look at its cable")
-        if not status & OUT_BITS:
+        if not bar_is_out(status):
             self.reads.set()

@@ -9,16 +9,17 @@ from typing import Any
 
 from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point
 from abbe.drivers.errors import Refused
+from abbe.drivers.flags import bar_is_out, bar_is_valid
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.guard import motion_guard
-from abbe.service.sequences.interlocks import AT_WORK, PAUSED, PROGRAM, REMOTE, Watching, check_interlocks, check_ours
+from abbe.service.sequences.interlocks import AT_WORK, PAUSED, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.path_resume import Onward, Way
-from abbe.service.sequences.paths import BAD_BITS, OUT_BITS, bar_trouble, follow_path, record_path
+from abbe.service.sequences.paths import bar_trouble, follow_path, record_path
 from abbe.service.sequences.preconditions import ExpectedTable
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
 from abbe.service.sequences.steps import (
@@ -61,9 +62,9 @@ async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, he
             if len(samples) >= step.samples:
                 break
     taken = samples[: step.samples]
-    bad = [s for s in taken if s.status & BAD_BITS]
+    bad = [s for s in taken if not bar_is_valid(s.status)]
     if bad or len(taken) < step.samples:
-        if bad and bad[0].status & OUT_BITS:
+        if bad and bar_is_out(bad[0].status):
             raise bar_trouble(bad[0].status)
         what = f"status {bad[0].status:#06x}" if bad else f"{len(taken)} of {step.samples} samples came"
         raise MeasurementFault(f"the ball-bar's box loses samples ({what})", "look at its cable, then start the test again")
@@ -202,7 +203,7 @@ class Runner:
         if not self._still:
             return False
         status = await self._s.controller.status()
-        return bool(status.bits >> PROGRAM & 1 or not status.bits >> REMOTE & 1)
+        return status.program_runs or not status.remote
 
     async def _nobody_inside(self, step: Step, watch: Watch) -> None:
         """After somebody has worked inside, the first motion waits for nobody: the door is closed, or the test ends here."""

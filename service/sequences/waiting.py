@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Awaitable
 
 from abbe.drivers.errors import DriverError
+from abbe.drivers.flags import signal_is_there
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, DoorOpen, Interlock
 from abbe.service.sequences.control import Control, State
@@ -14,7 +15,6 @@ from abbe.service.sequences.journal import GOES_ON, WAITS, Journal
 from abbe.service.sequences.preconditions import ExpectedTable, check_world
 
 LOOK_S = 0.1
-NO_SIGNAL_BITS = 0b10010
 """Signal low now, no reflector: unlike a lost count these clear by themselves."""
 
 
@@ -146,5 +146,5 @@ async def suspended(
 
 async def _signal(session: Session) -> None:
     reading = await session.need_laser().peek()
-    if reading.status & NO_SIGNAL_BITS:
+    if not signal_is_there(reading.status):
         raise BeamLost("the laser's beam is still interrupted", "free the beam")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from abbe.drivers.api import BarSample
+from abbe.drivers.api import BarSample, Condition
 from abbe.drivers.ballbar import frames
 from abbe.drivers.ballbar.frames import Ack, FrameDecoder, Info
 from abbe.drivers.cnc import registers as cnc
+from abbe.drivers.flags import LaserFlag
 from abbe.drivers.laser import registers as laser
 from abbe.drivers.links.modbus_reply import tcp_mismatch
 from abbe.drivers.links.words import words_of
@@ -93,7 +94,7 @@ def test_status_layout():
     status = cnc.decode_status(words, 1.5)
     assert status.host_s == 1.5
     assert status.ctrl_us == (1 << 32) + (2 << 16) + 3
-    assert status.bits == cnc.Bit.SPINDLE | cnc.Bit.ALARM
+    assert status.conditions == Condition.SPINDLE | Condition.ALARM
     assert (status.alarm_code, status.motion_ack_seq, status.motion_result, status.motion_done_seq) == (2, 11, 3, 10)
     assert status.position_mm == (-0.00001, 0.00001, 0.65536)
     assert (status.fifo_free, status.path_points_done, status.path_start_us, status.path_end_us) == (8000, 65538, 5, 6)
@@ -111,6 +112,6 @@ def test_laser_reading_layout():
     words = (0, 9, 0, 0, 0, 50_000, 0xFFFF, 0xFFFF, 0xFFFF, 0xFFFE, 950, 0b1100, 0xFFFB, 1, 0x8BCD, 455, 0x0029, 0x32E0)
     reading = laser.decode_reading(words, 2.0)
     assert (reading.sample_count, reading.device_us, reading.displacement_tenth_nm) == (9, 50_000, -2)
-    assert (reading.signal_permille, reading.status) == (950, laser.ZEROED | laser.COMPENSATED)
+    assert (reading.signal_permille, reading.status) == (950, LaserFlag.ZEROED | LaserFlag.COMPENSATED)
     assert (reading.air_temp_c, reading.air_pressure_pa, reading.humidity_percent) == (-0.05, 101325.0, 45.5)
     assert reading.refractivity == 0x002932E0 / 1e10

@@ -68,9 +68,9 @@ def test_impossible_chunks_and_commands():
 
 def test_interlocks_in_words():
     ready = cnc.Bit.REMOTE | cnc.Bit.REFERENCED | cnc.Bit.DRIVES_ON
-    assert cnc.interlocks(ready | cnc.Bit.IN_POSITION | cnc.Bit.FEED_HOLD) == []
-    assert cnc.interlocks(ready | cnc.Bit.DOOR_OPEN) == ["the door is open"]
-    assert len(cnc.interlocks(cnc.Bit.ESTOP | cnc.Bit.DOOR_OPEN | cnc.Bit.ALARM | cnc.Bit.NC_PROGRAM)) == 7
+    assert cnc.interlocks(cnc.conditions_of(ready | cnc.Bit.IN_POSITION | cnc.Bit.FEED_HOLD)) == []
+    assert cnc.interlocks(cnc.conditions_of(ready | cnc.Bit.DOOR_OPEN)) == ["the door is open"]
+    assert len(cnc.interlocks(cnc.conditions_of(cnc.Bit.ESTOP | cnc.Bit.DOOR_OPEN | cnc.Bit.ALARM | cnc.Bit.NC_PROGRAM))) == 7
 
 
 GOOD = {"CANARY_I32": 0x01020304, "CANARY_F32": 0x449A5000, "MAP_VER": 1}

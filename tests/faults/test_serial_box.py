@@ -10,8 +10,8 @@ import pytest
 
 from abbe.drivers.ballbar.frames import BoxSettings
 from abbe.drivers.errors import DeviceFault, Rebooted, SettingsChanged, on_behalf_of
+from abbe.drivers.flags import LaserFlag
 from abbe.drivers.laser.driver import ModbusLaser
-from abbe.drivers.laser.registers import SIGNAL_LOW
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.urls import parse_url
 from abbe.simulators.ballbar.device import NO_BAR, OUT_OF_RANGE
@@ -182,7 +182,7 @@ async def test_a_laser_that_cannot_measure_says_so(case):
                 mirror.laser.weaken(150)
             try:
                 reading = await laser.read()
-                wrong = not reading.status & SIGNAL_LOW  # with too little light it still counts, and says so in every reading
+                wrong = not reading.status & LaserFlag.SIGNAL_LOW  # with too little light it still counts, and says so in every reading
             except DeviceFault as caught:
                 error = caught
             if what == "no-reflector":

@@ -17,8 +17,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from abbe.drivers.api import Condition
 from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.cnc.registers import Bit
 from abbe.drivers.cnc.second_decoder import read_axis_tables
 from abbe.drivers.cnc.tables import TableImage, encode
 from abbe.drivers.errors import Refused
@@ -61,7 +61,7 @@ class Behind:
         recording = asyncio.create_task(self.machine.path_rows())
         await self.cnc.start_path(feed_mm_min=FEED)
         rows = np.array(await recording)
-        await until(self.cnc, lambda s: not s.bits & Bit.PATH_RUNNING)
+        await until(self.cnc, lambda s: Condition.PATH_RUNNING not in s.conditions)
         # No table yet: what is not equal was taken in the middle of a servo period, which another process may stretch.
         same = np.abs(rows[:, 3:] - rows[:, :3]).max(axis=1) < 1e-9
         self.usable = min(self.usable, float(same.mean()))

@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from abbe.drivers.api import Condition
 from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.cnc.registers import Bit
 from abbe.drivers.cnc.second_decoder import read_axis_tables
 from abbe.drivers.cnc.tables import TableImage, crc32, encode
 from abbe.drivers.errors import DeviceFault, Refused
@@ -32,7 +32,7 @@ from tests.patience import within
 
 OWNER = 0xABBE0001
 FEED = 20_000.0
-READY = Bit.REMOTE | Bit.REFERENCED | Bit.DRIVES_ON | Bit.IN_POSITION
+READY = Condition.REMOTE | Condition.REFERENCED | Condition.DRIVES_ON | Condition.IN_POSITION
 
 
 @asynccontextmanager
@@ -107,7 +107,7 @@ async def test_it_is_one_of_ours_moves_and_runs_a_path(machine):
     async with controller(machine) as cnc:
         assert (await cnc.identify()).firmware.startswith("map 1, 3 axes, table unit 100 nm")
         status = await cnc.status()
-        assert status.bits & READY == READY
+        assert status.conditions & READY == READY
         assert status.alarm_code == 0
         target = (300.0, 100.12345, 50.0)
         assert (await cnc.move(target, feed_mm_min=FEED, timeout_s=20)).position_mm == target
@@ -118,9 +118,9 @@ async def test_it_is_one_of_ours_moves_and_runs_a_path(machine):
         await cnc.load_path(path)
         recording = asyncio.create_task(machine.path_rows())
         await cnc.start_path(feed_mm_min=3000)
-        assert (await cnc.status()).bits & Bit.PATH_RUNNING
+        assert Condition.PATH_RUNNING in (await cnc.status()).conditions
         await until(cnc, lambda s: 0 < s.path_points_done < 100)
-        await until(cnc, lambda s: not s.bits & Bit.PATH_RUNNING)
+        await until(cnc, lambda s: Condition.PATH_RUNNING not in s.conditions)
         end = await cnc.status()
         rows = await recording
         assert end.path_points_done == 100
@@ -138,20 +138,20 @@ async def test_hold_abort_door_and_emergency_stop(machine):
         await cnc.hold()
         with pytest.raises(DeviceFault, match="feed hold"):
             await move
-        await until(cnc, lambda s: s.bits & Bit.FEED_HOLD and s.bits & Bit.MOVING)
+        await until(cnc, lambda s: Condition.FEED_HOLD in s.conditions and Condition.MOVING in s.conditions)
         before = None
         async with asyncio.timeout(within(10)):  # it brakes, far from its target
             while before != (before := await machine.drives()):  # noqa: ASYNC110 - another process is asked
                 await asyncio.sleep(0.02)
         assert before[0] < 400
         await cnc.abort()
-        await until(cnc, lambda s: s.bits & READY == READY)
+        await until(cnc, lambda s: s.conditions & READY == READY)
         machine.halcmd("sets", "abbe-door-open", "1")
         with pytest.raises(Refused, match="door"):
             await cnc.move((0.0, 0.0, 0.0), feed_mm_min=FEED, timeout_s=20)
         machine.halcmd("sets", "abbe-door-open", "0")
         move = asyncio.create_task(cnc.move((500.0, 0.0, 0.0), feed_mm_min=1500, timeout_s=60))
-        await until(cnc, lambda s: s.bits & Bit.MOVING)
+        await until(cnc, lambda s: Condition.MOVING in s.conditions)
         machine.halcmd("sets", "abbe-estop-ok", "0")
         with pytest.raises(DeviceFault, match="e-stop"):
             await move
@@ -161,7 +161,7 @@ async def test_hold_abort_door_and_emergency_stop(machine):
         where = await machine.drives()
         await cnc.reset_alarm()
         await cnc.resume()
-        await until(cnc, lambda s: s.bits & READY == READY)
+        await until(cnc, lambda s: s.conditions & READY == READY)
         assert await machine.drives() == where  # it does not go on by itself
         assert (await cnc.move((10.0, 0.0, 0.0), feed_mm_min=FEED, timeout_s=20)).position_mm == (10.0, 0.0, 0.0)
 

@@ -91,4 +91,4 @@ async def test_what_the_control_cannot_reproduce_is_not_sealed(machine):
         status = await cnc.comp_status()
         assert (status.active_bank, status.bank_state) == (0, (2, 1))
         await cnc.release(OWNER)
-        await until(cnc, lambda s: not s.bits & (1 << 10))
+        await until(cnc, lambda s: not s.compensation_on)

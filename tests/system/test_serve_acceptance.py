@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from abbe.drivers.cnc.registers import Bit
 from abbe.drivers.registry import open_controller
 from abbe.service.config import load_machine
 from abbe.service.scheduler.store import ServiceStore
@@ -97,7 +96,8 @@ async def stands_still(url: str) -> None:
         first = await controller.status()
         now = first
         while now.ctrl_us - first.ctrl_us < 1_000_000:
-            assert not now.bits & (Bit.MOVING | Bit.PATH_RUNNING)
+            assert not now.moving
+            assert not now.path_running
             assert now.position_mm == first.position_mm
             now = await controller.status()
     finally:

@@ -86,15 +86,15 @@ def _told(run: RunRecord) -> str:
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
     """Where every ball-bar sample ended: stored, flagged, or in which gap."""
+    from abbe.drivers.flags import BAR_REASONS
     from abbe.service.capture.account import ledger_of, streams_told
-    from abbe.service.capture.ledger import FLAGS
 
     streams = streams_told(run.end_doc)
     ledger = ledger_of(chunks, streams)
     if not ledger.stored and not ledger.gaps:
         return {}
     sums = ledger.doc()
-    flags = ", ".join(f"{reason} {sums['flags'][reason]}" for reason in FLAGS.values() if reason in sums["flags"])
+    flags = ", ".join(f"{reason} {sums['flags'][reason]}" for reason in BAR_REASONS if reason in sums["flags"])
     told = {"samples": f"{sums['stored_valid']} valid, {sums['stored_flagged']} flagged" + (f" ({flags})" if flags else "")}
     told["missing"] = f"{sums['in_gaps']} in {sums['gaps']} gaps" + (f", {sums['unaccounted']} unaccounted" if sums["unaccounted"] else "")
     if (count := len(ledger.ends())) > 1:

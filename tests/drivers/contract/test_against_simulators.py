@@ -13,10 +13,10 @@ from itertools import pairwise
 
 import pytest
 
+from abbe.drivers.api import Condition
 from abbe.drivers.ballbar.driver import BarCounters, SerialBallBar
 from abbe.drivers.cnc import second_decoder, tables
 from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.cnc.registers import Bit
 from abbe.drivers.cnc.tables import TableImage
 from abbe.drivers.errors import DeviceFault, LinkDown, Rebooted, Refused
 from abbe.drivers.fixture.driver import RemoteFixture
@@ -97,7 +97,7 @@ async def test_identify_all(world):
 async def test_move_and_refusals(world):
     status = await world.cnc.move(CENTRE, feed_mm_min=6000.0, timeout_s=20.0)
     assert status.position_mm == CENTRE
-    assert status.bits & Bit.IN_POSITION
+    assert Condition.IN_POSITION in status.conditions
     with pytest.raises(Refused, match="strokes"):
         await world.cnc.move((10_000.0, 0.0, 0.0), feed_mm_min=6000.0, timeout_s=5.0)
     await world.tell("door", on=True)
@@ -111,17 +111,17 @@ async def test_hold_abort_and_cancel_during_a_move(world):
     await world.cnc.move(CENTRE, feed_mm_min=6000.0, timeout_s=20.0)
     far = (500.0, 250.0, 200.0)
     task = asyncio.create_task(world.cnc.move(far, feed_mm_min=60.0, timeout_s=60.0))
-    await until(world, lambda status: status.bits & Bit.MOVING)
+    await until(world, lambda status: Condition.MOVING in status.conditions)
     await world.cnc.hold()
     with pytest.raises(DeviceFault, match="feed hold"):
         await task
     await world.cnc.abort()
     task = asyncio.create_task(world.cnc.move(far, feed_mm_min=60.0, timeout_s=60.0))
-    await until(world, lambda status: status.bits & Bit.MOVING)
+    await until(world, lambda status: Condition.MOVING in status.conditions)
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
-    first = await until(world, lambda status: status.bits & Bit.FEED_HOLD)
+    first = await until(world, lambda status: Condition.FEED_HOLD in status.conditions)
     later = await until(world, lambda status: status.ctrl_us > first.ctrl_us + 1_000_000)
     assert later.position_mm[0] < far[0]
     await world.cnc.abort()
@@ -131,7 +131,7 @@ async def test_hold_abort_and_cancel_during_a_move(world):
 async def test_estop_during_a_move(world):
     await world.cnc.move(CENTRE, feed_mm_min=6000.0, timeout_s=20.0)
     task = asyncio.create_task(world.cnc.move((500.0, 250.0, 200.0), feed_mm_min=60.0, timeout_s=60.0))
-    await until(world, lambda status: status.bits & Bit.MOVING)
+    await until(world, lambda status: Condition.MOVING in status.conditions)
     await world.tell("estop", on=True)
     with pytest.raises(DeviceFault, match="e-stop"):
         await task

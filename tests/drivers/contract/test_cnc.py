@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from abbe.drivers.cnc.registers import Bit
+from abbe.drivers.cnc.registers import Bit, conditions_of
 from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
 from abbe.drivers.registry import open_controller
 from tests.drivers.contract.cnc_peer import READY, TARGET, hang_up, honest, move, silent
@@ -17,7 +17,7 @@ from tests.drivers.contract.cnc_peer import READY, TARGET, hang_up, honest, move
 async def test_identify_and_status(controller):
     assert (await controller.identify()).boot_id == 100
     status = await controller.status()
-    assert status.bits == READY
+    assert status.conditions == conditions_of(READY)
     assert status.fifo_free == 8192
 
 

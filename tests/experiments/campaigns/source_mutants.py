@@ -69,7 +69,7 @@ MUTANTS = (
     Mutant("way back against an e-stop: looked at only before the activation", BACK, NOT_SAFE + "    if truth.states", "    if truth.states", (SINGLE,)),
     Mutant("way back against an e-stop: not looked at before the activation", BACK, NOT_SAFE + "    return", "    return", ("tests/push/test_sweep.py::test_no_single_fault_violates_anything",)),
     Mutant("interlocks do not reach the push", ADAPTER, "unsafe = trouble.detail if trouble else", 'unsafe = "" if trouble else', (AROUND + "::test_moving_axes_and_an_open_door_reach_the_push_as_not_safe",)),
-    Mutant("moving axes do not reach the push", ADAPTER, '"the axes move" if status.bits >> MOVING & 1 else ""', '""', (AROUND + "::test_moving_axes_and_an_open_door_reach_the_push_as_not_safe",)),
+    Mutant("moving axes do not reach the push", ADAPTER, '"the axes move" if status.moving else ""', '""', (AROUND + "::test_moving_axes_and_an_open_door_reach_the_push_as_not_safe",)),
     Mutant("approval an hour longer in the push", MACHINE, "truth.now_s >= known.approved_until_s", "truth.now_s >= known.approved_until_s + 3600.0", (AROUND + "::test_who_orders_a_push_approves_it_for_an_hour_and_not_for_longer",)),
     Mutant("approval an hour longer than its text says", "service/compensation/pushing.py", "self.clock.monotonic_s() + APPROVED_S)", "self.clock.monotonic_s() + APPROVED_S + 3600.0)", (AROUND + "::test_who_orders_a_push_approves_it_for_an_hour_and_not_for_longer",)),
     Mutant("approval of a proposal an hour longer", "service/compensation/proposal_checks.py", "elif now_s >= _utc_s(row.expiry):", "elif now_s >= _utc_s(row.expiry) + 3600.0:", (PROPOSALS + "::test_an_approval_ends_and_binds_who_and_what",)),

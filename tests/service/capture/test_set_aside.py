@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 
 from abbe.service.capture import recovery
-from abbe.service.capture import recovery as locks
 from abbe.service.capture.account import DAMAGED, TORN
 from abbe.service.capture.drafts import Drafter
 from abbe.service.capture.ingest import chunk_of
@@ -172,8 +171,8 @@ def test_bad_segments_stop_neither_the_others_nor_the_machine(store: Store, fold
 
 def test_only_one_recovers_at_a_time(store: Store, folder: Path, monkeypatch) -> None:  # noqa: F811
     run_id = crashed(store, folder)
-    monkeypatch.setattr(locks, "WAIT_S", 0.1)
-    monkeypatch.setattr(recovery, "held_alone", lambda path: locks.held_alone(path, 0.1))
+    held_alone = recovery.held_alone
+    monkeypatch.setattr(recovery, "held_alone", lambda path: held_alone(path, 0.1))
     other = os.open(folder / "recovery.lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(other, fcntl.LOCK_EX)
     (told,) = recover_segments(store, PLAIN)

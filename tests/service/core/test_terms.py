@@ -10,18 +10,18 @@ from datetime import datetime, time, timedelta
 
 import pytest
 
-from abbe.drivers.api import ControllerStatus
+from abbe.drivers.api import Condition, ControllerStatus
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ready import Ready, SeenDevices
 from abbe.service.scheduler.slots import cron_in_words, next_slot, previous_slot, slots_between
 from abbe.service.scheduler.windows import Window
+from tests.pretended_status import READY, controller_status
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
 HOURLY = Schedule("hourly", "0 * * * *", "UTC", "r")
 ONCE = replace(HOURLY, catch_up="once")
-READY_BITS = 0b111000  # remote, referenced, drives on
 HOUR_S = 3600.0
 
 
@@ -154,8 +154,8 @@ def test_a_weekly_window_over_midnight(at: datetime, inside: bool) -> None:
     assert window.covers(at) == inside
 
 
-def status(bits: int = READY_BITS, x: float = 0.0) -> ControllerStatus:
-    return ControllerStatus(0.0, 0, bits, 0, 0, 0, 0, (x, 0.0, 0.0), 0, 0, 0, 0, 100, 0, 0, 0)
+def status(conditions: Condition = READY, x: float = 0.0) -> ControllerStatus:
+    return controller_status(conditions, position_mm=(x, 0.0, 0.0))
 
 
 SHIFT = Window("shift", "UTC", days=frozenset({"mon"}), start=time(6), end=time(14))
@@ -170,11 +170,11 @@ MONDAY_8, MONDAY_20 = utc(2026, 6, 1, 8), utc(2026, 6, 1, 20)
         (Needs(operator="present"), MONDAY_20, None, "no operator is there"),
         (Needs(operator="absent"), MONDAY_8, None, "an operator is there"),
         (Needs(operator="absent"), MONDAY_20, SeenDevices(status()), ""),
-        (Needs(operator="absent"), MONDAY_20, SeenDevices(status(READY_BITS | 1 << 1)), "somebody is at the machine"),
+        (Needs(operator="absent"), MONDAY_20, SeenDevices(status(READY | Condition.DOOR_OPEN)), "somebody is at the machine"),
         (Needs(idle=True), MONDAY_8, SeenDevices(status()), ""),
-        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY_BITS | 1 << 11)), "not idle: an NC program runs"),
-        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY_BITS | 1 << 12)), "not idle: the spindle turns"),
-        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY_BITS | 1 << 6)), "not idle: an axis moves"),
+        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY | Condition.NC_PROGRAM)), "not idle: an NC program runs"),
+        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY | Condition.SPINDLE)), "not idle: the spindle turns"),
+        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY | Condition.MOVING)), "not idle: an axis moves"),
         (Needs(idle=True), MONDAY_8, None, "the devices cannot be asked"),
         (Needs(air=True), MONDAY_8, SeenDevices(status(), 20.0), ""),
         (Needs(air=True), MONDAY_8, SeenDevices(status(), 25.5), "the air has 25.5 C, allowed are 18..24 C"),
@@ -203,7 +203,9 @@ async def test_a_machine_is_warm_when_it_was_seen_at_work() -> None:
         minute += 1
         if 10 <= minute < 20:
             raise LinkDown("tcp://127.0.0.1:5021", "read", "gone", "")
-        return SeenDevices(status(READY_BITS | (minute % 2) << 12, x=float(minute % 4)) if minute <= 30 else status(x=30.0 % 4))
+        return SeenDevices(
+            status(READY | Condition.SPINDLE if minute % 2 else READY, x=float(minute % 4)) if minute <= 30 else status(x=30.0 % 4)
+        )
 
     schedule = replace(HOURLY, needs=Needs(warm_min=15.0))
     ready = Ready(look, [schedule], (18.0, 24.0), (), clock)

@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from abbe.drivers.api import ControllerStatus
+from abbe.drivers.api import Condition, ControllerStatus
 from abbe.service.devices.clock_notes import noted
 from abbe.service.devices.session import Session
 from abbe.service.errors import DoorOpen
-from abbe.service.sequences.interlocks import AT_WORK, DOOR, DRIVES, REFERENCED, REMOTE, Watching
+from abbe.service.sequences.interlocks import AT_WORK, Watching
 from abbe.service.sequences.watch import NOTHING, Watch
+from tests.pretended_status import READY, controller_status
 
-READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
 PERIOD_S = 60.0
 
 
@@ -24,11 +24,11 @@ class Asked:
     """A controller that counts who asks."""
 
     def __init__(self) -> None:
-        self.times, self.bits, self.age_s = 0, READY, 0.0
+        self.times, self.conditions, self.age_s = 0, READY, 0.0
 
     async def status(self) -> ControllerStatus:
         self.times += 1
-        now = ControllerStatus(0.0, self.times, self.bits, 0, 0, 0, 0, (0.0, 0.0, 0.0), 0, 0, 0, 0, 100, 0, 0, 0)
+        now = controller_status(self.conditions, ctrl_us=self.times)
         return replace(now, host_s=time.monotonic() - self.age_s)
 
 
@@ -55,7 +55,7 @@ async def test_what_somebody_was_just_told_is_not_asked_again() -> None:
 
 async def test_what_somebody_was_just_told_ends_the_test_all_the_same() -> None:
     asked, controller, watch = place()
-    asked.bits |= 1 << DOOR
+    asked.conditions |= Condition.DOOR_OPEN
     await controller.status()
     with pytest.raises(DoorOpen):
         await watch.controller()
@@ -66,7 +66,7 @@ async def test_what_is_a_period_old_is_asked_again() -> None:
     asked, controller, watch = place()
     asked.age_s = PERIOD_S
     await controller.status()
-    asked.age_s, asked.bits = 0.0, READY | 1 << DOOR
+    asked.age_s, asked.conditions = 0.0, READY | Condition.DOOR_OPEN
     with pytest.raises(DoorOpen):
         await watch.controller()
     assert asked.times == 2
@@ -75,9 +75,9 @@ async def test_what_is_a_period_old_is_asked_again() -> None:
 async def test_a_door_that_was_open_while_it_might_be_is_asked_about_again() -> None:
     asked, controller, watch = place()
     watch.tolerated = AT_WORK
-    asked.bits |= 1 << DOOR
+    asked.conditions |= Condition.DOOR_OPEN
     await controller.status()
-    watch.tolerated, asked.bits = NOTHING, READY
+    watch.tolerated, asked.conditions = NOTHING, READY
     await one_look(watch)
     assert asked.times == 2
 

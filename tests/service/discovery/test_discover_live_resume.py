@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+from abbe.drivers.api import Condition
 from abbe.models.discovery.answer import Discovery, NextTest
 from abbe.service import cli
 from abbe.service.campaign_data import campaign_checks
@@ -29,13 +30,11 @@ from abbe.service.discovery.discover_live import rounds
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns
-from abbe.service.sequences.interlocks import DRIVES, MOVING, REFERENCED, REMOTE
 from abbe.service.storage.owner import Owner
 from abbe.service.storage.records import NewVersion
 from abbe.service.storage.store import Store
+from tests.pretended_status import READY, controller_status
 from tests.service.discovery.discovery_bench import MACHINE, Search, circle, write_case
-
-READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
 
 WRITES = ("add_campaign", "start_run", "append_chunk", "finish_run", "add_discovery", "add_discovery_step")
 OLD = ("r01", "r02", "r03", "r04")
@@ -105,7 +104,7 @@ class Bench:
         self.accepting: list[bool] = []
         self.search = Asks()
         self.boot, self.writes = BOOT, 0
-        self.now_s, self.bits = 7000.0, READY
+        self.now_s, self.conditions = 7000.0, READY
         self.left: int | None = None
         self._folder, self._patch = folder, monkeypatch
         self._file()
@@ -143,7 +142,7 @@ class Bench:
         self.accepting.append(accept_table)
 
         async def status() -> Any:
-            return SimpleNamespace(ctrl_us=round(1e6 * self.now_s) + 1_000_000 * len(self.measured), bits=self.bits)
+            return controller_status(self.conditions, ctrl_us=round(1e6 * self.now_s) + 1_000_000 * len(self.measured))
 
         async def comp_status() -> Any:
             return SimpleNamespace(boot_id=self.boot, bank_crc=(1, 2), active_bank=0)
@@ -334,7 +333,7 @@ def test_a_late_repeat_waits_until_it_is_late(bench: Bench, capsys: Any) -> None
 
 
 def test_nobody_is_asked_to_reach_into_a_machine_that_runs_a_path_to_its_end(bench: Bench, capsys: Any) -> None:
-    bench.bits = READY | 1 << MOVING
+    bench.conditions = READY | Condition.MOVING
     assert bench.live() == 2
     assert "error SEQ-002: the machine is moving" in capsys.readouterr().err
     assert bench.measured == []

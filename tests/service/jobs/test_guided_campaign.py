@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from abbe.drivers.api import Condition
 from abbe.service.campaigns.campaign_run import plan_hash
 from abbe.service.cli.administration.serve import _campaigns
 from abbe.service.cli.measure import _plan
@@ -28,6 +29,7 @@ from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes.recipe import Helix, Linear
 from abbe.service.sequences.recipes.recipe_file import recipe_text
 from abbe.service.sequences.steps import CampaignPlan
+from tests.pretended_status import controller_status
 from tests.service.core.fakes import settle
 from tests.service.web.pages.test_rehearsal import MACHINE
 
@@ -107,13 +109,19 @@ async def test_a_stop_while_a_push_is_taken_back_begins_no_campaign(monkeypatch:
 
 
 @pytest.mark.parametrize(
-    ("tables", "bits", "refused"), [(None, 0, False), ("some", 0, True), ("some", 1 << 10, False), ("some", 1 << 9, True)]
+    ("tables", "conditions", "refused"),
+    [
+        (None, Condition(0), False),
+        ("some", Condition(0), True),
+        ("some", Condition.COMPENSATION_ON, False),
+        ("some", Condition.PATH_RUNNING, True),
+    ],
 )
 async def test_a_table_that_is_switched_off_is_told_before_anything_is_mounted(
-    tables: str | None, bits: int, refused: bool, monkeypatch: pytest.MonkeyPatch
+    tables: str | None, conditions: Condition, refused: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def status() -> Any:
-        return SimpleNamespace(bits=bits)
+        return controller_status(conditions)
 
     async def base(_: object) -> Any:
         return SimpleNamespace(tables=tables, crc=0x5A)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from abbe.drivers.api import ControllerStatus, LaserReading
+from abbe.drivers.api import Condition, LaserReading
 from abbe.models.machine import Machine
 from abbe.service.campaigns import listen
 from abbe.service.campaigns.listen import Heard, row_times, wanted
@@ -12,6 +12,7 @@ from abbe.service.runs.observations import run_data
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
 from abbe.service.sequences.recipes.recipe import Diagonal, FaceDiagonal, Linear
 from abbe.service.sequences.steps import MountLaser
+from tests.pretended_status import controller_status
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 COMPENSATED = 1 << 3
@@ -52,7 +53,7 @@ def world(recipe, lost):
         for k, (s, v, d) in enumerate(zip(t, y, delay[0], strict=True))
     ]
     status = [
-        ControllerStatus(5.0 + s + d, int((s + 100.0) * 1e6), 0, 0, 0, 0, 0, tuple(start + v * beam), 0, 0, 0, 0, 100, 0, 0, 0)
+        controller_status(Condition(0), host_s=5.0 + s + d, ctrl_us=int((s + 100.0) * 1e6), position_mm=tuple(start + v * beam))
         for s, v, d in zip(t, y, delay[1], strict=True)
     ]
     return plan, Heard(laser, status[::3])

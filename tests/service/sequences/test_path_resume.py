@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abbe.drivers.api import BarSample, ControllerStatus
+from abbe.drivers.api import BarSample, Condition, ControllerStatus
 from abbe.service.errors import RunInterrupted, StretchDiffers
 from abbe.service.runs.pieces import RunPiece, SoFar, arc_of
 from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, Onward, SameStretch, Way, rest_of_path
@@ -18,6 +18,7 @@ from abbe.service.sequences.recipes.recipe import Circle
 from abbe.service.sequences.resume_plan import rest_of, way_back
 from abbe.service.sequences.steps import MountBar, RecordPath
 from tests.faults.sequencer_world import MACHINE
+from tests.pretended_status import controller_status
 
 FEED = 1200.0
 FEED_MM_S = FEED / 60.0
@@ -28,7 +29,7 @@ ARC = arc_of(POINTS)
 
 def status_at(position_mm: tuple[float, float, float], start_us: int, now_us: int) -> ControllerStatus:
     """A status while a path runs."""
-    return ControllerStatus(0.0, now_us, 0, 0, 0, 0, 0, position_mm, 0, 0, start_us, 0, 100, 0, 0, 0)
+    return controller_status(Condition(0), ctrl_us=now_us, position_mm=position_mm, path_start_us=start_us)
 
 
 def path(measured: tuple[int, int] | None = None) -> RecordPath:

@@ -6,18 +6,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from abbe.drivers.api import BarBatch, BarSample
+from abbe.drivers.api import BarBatch, BarSample, Condition
 from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.service.campaigns.measure import OpenCampaign, measure_test
 from abbe.service.campaigns.progress import Meter
 from abbe.service.devices.session import Session
 from abbe.service.errors import MeasurementFault
 from abbe.service.sequences.guard import UNDELIVERED, motion_guard, warnings_of
-from abbe.service.sequences.interlocks import DRIVES, PATH, REFERENCED, REMOTE
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import MountBar, MountLaser, RecordPath, TestPlan, Unmount
+from tests.pretended_status import READY, controller_status
 
-READY = 1 << REMOTE | 1 << REFERENCED | 1 << DRIVES
 RUNS_ON = RecordPath(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 100.0, 100, 1)
 PLAN = TestPlan("h", "ballbar_helix", "identify", {"setup_id": "H"}, (RUNS_ON, Unmount()))
 
@@ -29,8 +28,13 @@ class FakeController:
         self.events, self.deaf = events, deaf
 
     async def status(self):
-        return SimpleNamespace(
-            bits=READY | 1 << PATH, path_points_done=0, path_start_us=5, path_end_us=0, ctrl_us=7, position_mm=RUNS_ON.points_mm[0]
+        return controller_status(
+            READY | Condition.PATH_RUNNING,
+            path_points_done=0,
+            path_start_us=5,
+            path_end_us=0,
+            ctrl_us=7,
+            position_mm=RUNS_ON.points_mm[0],
         )
 
     async def comp_status(self):
@@ -234,7 +238,7 @@ class PatientController(FakeController):
 
     async def status(self):
         self.now_us += 60_000_000
-        return SimpleNamespace(bits=READY, ctrl_us=self.now_us)
+        return controller_status(READY, ctrl_us=self.now_us)
 
 
 class KeepingStore(FakeStore):
