@@ -36,6 +36,7 @@ BAR_REASONS = tuple(reason for _, reason in _BAR_REASONS)
 """Why a reading of the ball-bar is none: everything that the box can say."""
 _BEAM_GONE = int(LaserFlag.BEAM_LOST | LaserFlag.NO_REFLECTOR)
 _BEAM_BAD = _BEAM_GONE | int(LaserFlag.SIGNAL_LOW)
+_COMPENSATED = int(LaserFlag.COMPENSATED)
 _NO_SIGNAL = int(LaserFlag.SIGNAL_LOW | LaserFlag.NO_REFLECTOR)
 
 
@@ -82,3 +83,8 @@ def signal_is_there(status: int) -> bool:
 def is_zeroed(status: int) -> bool:
     """Whether the laser's count begins at a zero that was asked for."""
     return bool(status & _ZEROED)
+
+
+def air_is_compensated(status: int) -> bool:
+    """Whether the laser corrects its reading for the air."""
+    return bool(status & _COMPENSATED)

@@ -184,7 +184,7 @@ class RunInterrupted(AbbeError):
     code = "SEQ-006"
 
 
-class WorldChanged(AbbeError):
+class PreconditionsChanged(AbbeError):
     """A campaign cannot be gone on with: the controller, its table, the recipe or the machine is not what it was."""
 
     code = "SEQ-007"

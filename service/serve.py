@@ -24,13 +24,12 @@ import structlog
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.audit.chain import Event
 from abbe.service.campaigns.builtin_recipes import parted
-from abbe.service.channel.messages import PROTOCOL, Begin, RulesTold
+from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.core.campaigns import CampaignJobs
 from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import Ground, Hands, Orders
-from abbe.service.core.push_recovery import OpenEnds
+from abbe.service.core.orders import Ground, Hands, Orders, full_campaigns
+from abbe.service.core.push_recovery import PushRecovery
 from abbe.service.core.rights import may, may_measure
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.core.snapshot import SnapshotSource
@@ -43,8 +42,8 @@ from abbe.service.jobs.at_start import push_is_open
 from abbe.service.mqtt.outbox import StoreOutbox
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.plant.gather import Gatherer
-from abbe.service.scheduler.alarm_manager import AlarmManager, Telling
-from abbe.service.scheduler.heartbeat import Station
+from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
+from abbe.service.scheduler.heartbeat import Heartbeat
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
@@ -85,26 +84,28 @@ class Service:
         self._listening = listening
         self.board = Board(setup.devices, clock)
         self._publisher = self._make_publisher()
-        self._station = Station(setup.machine, version("abbe"), store, lambda: self._scheduler.next_due(), clock, self.board.attention)
-        watchers: list[JobWatcher] = [BoardWatch(self.board, self._changed), self._station]
+        self._presence = Heartbeat(setup.machine, version("abbe"), store, lambda: self._scheduler.next_due(), clock, self.board.attention)
+        watchers: list[JobWatcher] = [BoardWatch(self.board, self._changed), self._presence]
         if self._publisher is not None:
             watchers.append(StateTeller(self._publisher, clock))
         topics = (setup.topics.verification, setup.topics.alarm) if self._publisher is not None else None
         self._shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
         book = AuditBook(store, setup.store_url)
-        desk = self._make_desk(book, watchers)
-        job = CheckJob(setup.machine, setup.check(store), self._shelf, watchers, clock, desk.checked if desk is not None else None)
+        alarms = self._make_alarms(book, watchers)
+        job = CheckJob(setup.machine, setup.check(store), self._shelf, watchers, clock, alarms.checked if alarms is not None else None)
         recipes = tuple(dict.fromkeys([*setup.recipes, *(parted(schedule.recipe)[0] for schedule in setup.schedules)]))
         self._jobs = JobRegistry(job.run, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed)
+        ground = Ground(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, watchers, setup.control)
         if setup.campaign is not None:
-            campaigns = CampaignJobs(setup.machine, setup.campaigns, setup.campaign(store), book, watchers)
-            self._jobs.full = campaigns.full(lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE))
-        terms = LoopTerms(setup.maintenance, setup.ready(clock), errands=desk, carry=self._jobs.errand)
+            self._jobs.full = full_campaigns(
+                ground, setup.campaigns, setup.campaign(store), lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE)
+            )
+        terms = LoopTerms(setup.maintenance, setup.ready(clock), errands=alarms, carry=self._jobs.errand)
         self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._jobs, self._shelf, clock, terms)
-        moments = SnapshotSource(self.board, self._jobs, self._scheduler.next_due, clock)
-        orders = self._make_orders(book, watchers)
+        snapshots = SnapshotSource(self.board, self._jobs, self._scheduler.next_due, clock)
+        orders = Orders(store, clock, self._jobs, ground, Hands() if setup.hands is None else setup.hands(store))
         begin = self._begin((*recipes, *self._jobs.full.names))
-        self._web = WebProcess(begin, listening, moments.now, self._jobs, clock, setup.live, orders)
+        self._web = WebProcess(begin, listening, snapshots.now, self._jobs, clock, setup.live, orders)
         self._opcua = self._make_opcua()
         doc = {"host": setup.host, "port": listening.getsockname()[1]}
         book.write(Event(this_account(), "abbe serve", setup.machine, "begun", doc))
@@ -127,7 +128,7 @@ class Service:
             self._listening.getsockname()[1],
             setup.behind_tls,
             tuple(setup.schedules),
-            RulesTold(**asdict(setup.rules)),
+            RulesSummary(**asdict(setup.rules)),
             setup.told,
             self._jobs.full.names,
             setup.page_memory_mb,
@@ -154,17 +155,12 @@ class Service:
         view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock, setup.control)
         return OpcUaServer(setup.opcua, Gatherer(view.status, self._store, setup.control), self._clock, setup.machine, version("abbe"))
 
-    def _make_desk(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmManager | None:
+    def _make_alarms(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmManager | None:
         setup = self._setup
         if setup.duties is None:
             return None
-        telling = Telling(setup.topics.alarm if self._publisher is not None else None, self._posted, book, watchers)
-        return AlarmManager(self._store, self._clock, setup.machine, setup.schedules, setup.duties(self._store), telling)
-
-    def _make_orders(self, book: AuditBook, watchers: list[JobWatcher]) -> Orders:
-        setup, store = self._setup, self._store
-        ground = Ground(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, watchers, setup.control)
-        return Orders(store, self._clock, self._jobs, ground, Hands() if setup.hands is None else setup.hands(store))
+        channels = AlarmChannels(setup.topics.alarm if self._publisher is not None else None, self._posted, book, watchers)
+        return AlarmManager(self._store, self._clock, setup.machine, setup.schedules, setup.duties(self._store), channels)
 
     def _posted(self) -> None:
         if self._publisher is not None:
@@ -181,7 +177,7 @@ class Service:
             work = parts.create_task(self._once() if once else self._timetable(parts), name="scheduler")
             beat = parts.create_task(self._heartbeat(), name="heartbeat")
             opcua = parts.create_task(self._opcua.run(stop) if self._opcua is not None else stop.wait(), name="opcua")
-            station = parts.create_task(self._station.run(), name="station")
+            presence = parts.create_task(self._presence.run(), name="presence")
             stopped = parts.create_task(stop.wait(), name="stop")
             try:
                 await asyncio.wait({work, stopped}, return_when=asyncio.FIRST_COMPLETED)
@@ -197,7 +193,7 @@ class Service:
             self._ask_to_end()
             await asyncio.wait({mqtt}, timeout=GOODBYE_S)
             mqtt.cancel()  # a broker that accepts connections and then says nothing would hold us up
-            for task in (beat, stopped, opcua, station):
+            for task in (beat, stopped, opcua, presence):
                 task.cancel()
         return passed
 
@@ -219,7 +215,7 @@ class Service:
             if self._setup.recover is not None:
                 recover, told = self._setup.recover(self._store), self.board.attention
                 is_open = partial(push_is_open, self._store, self._setup.machine, self._setup.control)
-                ends = OpenEnds(recover, is_open, self._scheduler, self._shelf, told, self._clock, self._attention_changed)
+                ends = PushRecovery(recover, is_open, self._scheduler, self._shelf, told, self._clock, self._attention_changed)
                 tasks.create_task(ends.run(), name="recovery")
             if self._setup.table is not None:
                 look, told = self._setup.table(self._store), self.board.attention
@@ -231,7 +227,7 @@ class Service:
 
     def _attention_changed(self) -> None:
         self.board.changed()
-        self._station.noted()
+        self._presence.noted()
         self._changed()
 
     async def _once(self) -> bool:
@@ -305,7 +301,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
         try:
             host, port = listening.getsockname()[:2]
             scheme = "https" if setup.certificate else "http"
-            for line in setup.doubts:
+            for line in setup.warnings:
                 log.warning("machine file", text=line)
             log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
             last_words.append(partial(open_push, store, setup.machine, setup.control))

@@ -21,7 +21,7 @@ RATES_HZ = (50, 100, 200, 250, 500, 1000)
 _RATE = re.compile(r"(?P<name>.+) at (?P<rate>[1-9][0-9]{0,3}) Hz")
 
 
-class Shipped(Protocol):
+class BuiltinRecipe(Protocol):
     """A recipe that fits itself into a machine."""
 
     def __call__(self, machine: Machine, *, rate_hz: int = ...) -> CampaignPlan:
@@ -29,7 +29,7 @@ class Shipped(Protocol):
         ...
 
 
-RECIPES: dict[str, Shipped] = {"quick-check": quick_check, "verification": verification}
+RECIPES: dict[str, BuiltinRecipe] = {"quick-check": quick_check, "verification": verification}
 
 
 def named(recipe: str, rate_hz: int) -> str:

@@ -16,9 +16,9 @@ from abbe.service.runs.pieces import SoFar
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching, check_interlocks
 from abbe.service.sequences.journal import DONE, RUN, Journal
-from abbe.service.sequences.path_resume import Onward
+from abbe.service.sequences.path_resume import PathRemainder
 from abbe.service.sequences.preconditions import ExpectedTable, check_expected
-from abbe.service.sequences.resume_plan import Attempt, Rewind, anew, end_of, remounted, rest_of
+from abbe.service.sequences.resume_plan import Attempt, ResumeTrail, anew, end_of, remounted, rest_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import CampaignPlan, TestPlan
 from abbe.service.sequences.waiting import may_suspend, paused, suspended
@@ -35,7 +35,7 @@ def _in_vain(why: SetupDisturbed | Interlock | RunInterrupted) -> SetupDisturbed
     return type(why)(f"{why.detail}; {MOST_TRIES + 1} times in a row without a new point", why.remedy)
 
 
-async def nobody(_: str) -> bool:
+async def decline(_: str) -> bool:
     """Nobody is there to say that a set-up was not touched: it is mounted anew."""
     return False
 
@@ -66,11 +66,11 @@ class Item:
     left: TestPlan
     mounting: int = 1
     offset: int = 0
-    rewind: Rewind = field(default_factory=Rewind)
+    resume_trail: ResumeTrail = field(default_factory=ResumeTrail)
     hand: int | None = None
     before: Point | None = None
     tries: int = 0
-    onward: Onward | None = None
+    remainder: PathRemainder | None = None
     kept_mm: float = 0.0
 
     @property
@@ -80,7 +80,7 @@ class Item:
 
     def attempt(self) -> Attempt:
         """What the runner is told."""
-        return Attempt(self.test.label, self.setup, self.offset, self.mounting, self.rewind, onward=self.onward)
+        return Attempt(self.test.label, self.setup, self.offset, self.mounting, self.resume_trail, remainder=self.remainder)
 
 
 def items(plan: CampaignPlan) -> tuple[Item, ...]:
@@ -103,14 +103,16 @@ def in_mounting(item: Item, mounting: int) -> Item:
 def mounted_anew(item: Item, mounting: int) -> Item:
     """The test from its beginning, mounting by itself."""
     whole = remounted(item.test, item.first, mounting)
-    return replace(item, whole=whole, left=whole, mounting=mounting, offset=0, rewind=Rewind(), hand=None, before=None, onward=None)
+    return replace(
+        item, whole=whole, left=whole, mounting=mounting, offset=0, resume_trail=ResumeTrail(), hand=None, before=None, remainder=None
+    )
 
 
 def gone_on(item: Item, hand: int | None, records: tuple[dict[str, Any], ...], so_far: SoFar | None = None) -> Item:
     """The test from its last checkpoint, in the present mounting."""
     hand = item.hand if hand is None else hand
-    left, offset, rewind, onward = rest_of(item.whole, hand, records, item.before, so_far)
-    return replace(item, left=left, offset=offset, rewind=rewind, hand=hand, onward=onward)
+    left, offset, resume_trail, remainder = rest_of(item.whole, hand, records, item.before, so_far)
+    return replace(item, left=left, offset=offset, resume_trail=resume_trail, hand=hand, remainder=remainder)
 
 
 async def read_path(session: Session, store: Store, campaign: int, test: str, mounting: int) -> SoFar | None:
@@ -151,7 +153,7 @@ class Resumed:
 
 
 @dataclass
-class Conduct:
+class CampaignRun:
     """What it takes to carry a campaign through: who may say what, what is watched, where it is written down.
 
     ``mountings``: how often each set-up was mounted; ``used``: set-ups (planned name, mounting) with a complete run; ``labels``: taken
@@ -163,7 +165,7 @@ class Conduct:
     watching: Watching
     journal: Journal
     expected: ExpectedTable
-    confirm: Confirm = nobody
+    confirm: Confirm = decline
     mountings: dict[str, int] = field(default_factory=dict)
     used: set[tuple[str, int]] = field(default_factory=set)
     labels: set[str] = field(default_factory=set)
@@ -254,11 +256,11 @@ class Conduct:
         A set-up of which nothing is kept has nothing that it could contradict; a laser run that goes on reads its last point again. Else a
         person must say so: the stretch of a path that is read twice shows a cup that was knocked along the bar, not across it.
         """
-        if item.rewind.carried:
+        if item.resume_trail.carried:
             return True
         if (item.setup, item.mounting) in self.used:
             return await self.confirm(f"Set-up {item.setup} was left mounted and has complete runs. Has nobody touched it since?")
-        return item.onward is None or await self.confirm(halfway(item))
+        return item.remainder is None or await self.confirm(halfway(item))
 
     def again_mounted(self, item: Item) -> Item:
         """The test with its set-up mounted once more."""

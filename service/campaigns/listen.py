@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from abbe.drivers.api import ControllerStatus, LaserReading, Point
+from abbe.drivers.flags import air_is_compensated
 from abbe.models.alignment.clock import ClockFit, fit_clock
 from abbe.models.alignment.dwell import DwellReading, Dwells, PlannedDwell, detect, merged, named
 from abbe.models.alignment.lag import Lag, fit_lag
@@ -25,7 +26,6 @@ from abbe.service.errors import MeasurementFault
 from abbe.service.runs.laser_columns import MM_PER_COUNT
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
-from abbe.service.sequences.runner import COMPENSATED
 from abbe.service.sequences.steps import MountLaser, MoveTo, ReadLaser, TestPlan
 
 Say = Callable[[str], None]
@@ -100,7 +100,7 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, say: S
     await laser.zero()
     say(f"{test.label}: listening, start the program")
     heard = await _hear(session, (QUIET * (LASER_DWELL_S + plan[0].settle_s)))
-    if not all(r.status >> COMPENSATED & 1 for r in heard.readings):
+    if not all(air_is_compensated(r.status) for r in heard.readings):
         raise MeasurementFault(
             f"test {test.label}: the laser's environmental compensation was switched off meanwhile", "switch it on, start the program again"
         )

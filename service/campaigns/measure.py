@@ -13,8 +13,8 @@ from typing import Any
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.campaigns.bar_link import BarBreaks, bar_ready
-from abbe.service.campaigns.campaign_run import Conduct, Confirm, Resumed, in_mounting, items, nobody, plan_hash, read_path
-from abbe.service.campaigns.progress import Meter
+from abbe.service.campaigns.campaign_run import CampaignRun, Confirm, Resumed, decline, in_mounting, items, plan_hash, read_path
+from abbe.service.campaigns.progress import ProgressMeter
 from abbe.service.capture.live import LiveFeed
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
@@ -89,7 +89,7 @@ class Manner:
     """
 
     control: Control | None = None
-    confirm: Confirm = nobody
+    confirm: Confirm = decline
     source: dict[str, Any] = field(default_factory=dict)
     resumed: Resumed | None = None
     part: bool = False
@@ -134,14 +134,14 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
     campaign = campaign or await start_campaign(session, store, site, plan.name)
     under_way = OpenCampaign(*campaign, dict(resumed.mounted_us) if resumed is not None else {})
     journal = StoreJournal(store, under_way.id)
-    conduct = await _conduct(session, store, site, plan, journal, manner, control)
-    meter = Meter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
+    campaign_run = await _campaign_run(session, store, site, plan, journal, manner, control)
+    progress_meter = ProgressMeter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
     control.now(State.RUNNING)
-    notes, told = IncidentNotes(journal, clock), asyncio.create_task(meter.tell())
-    once = _once(session, store, site, under_way, meter, manner.live)
+    notes, told = IncidentNotes(journal, clock), asyncio.create_task(progress_meter.tell())
+    once = _once(session, store, site, under_way, progress_meter, manner.live)
     try:
         async with incidents_noted(session, notes):
-            run_ids = await _all_tests(plan, [d.duration_s for d in dry], conduct, meter, resumed, once)
+            run_ids = await _all_tests(plan, [d.duration_s for d in dry], campaign_run, progress_meter, resumed, once)
     except BaseException as error:
         await _ended(journal, notes, "stopped" if isinstance(error, Stopped) else "failed", error)
         raise
@@ -165,9 +165,9 @@ async def _ended(journal: StoreJournal, notes: IncidentNotes, how: str, error: B
         error.add_note(f"and the journal's last line could not be written: {lost}")
 
 
-async def _conduct(
+async def _campaign_run(
     session: Session, store: Store, site: Site, plan: CampaignPlan, journal: StoreJournal, manner: Manner, control: Control
-) -> Conduct:
+) -> CampaignRun:
     """The journal's first line, and what the campaign is carried through with."""
     comp = await session.controller.comp_status()
     expected = ExpectedTable(comp.boot_id, comp.bank_crc[comp.active_bank])
@@ -176,13 +176,13 @@ async def _conduct(
     begun = {"plan": plan_hash(plan), "source": manner.source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
     begun["owner"] = asdict(this_process())
     await journal.add(BEGUN, **begun)
-    conduct = Conduct(session, control, site.watching, journal, expected, manner.confirm)
-    conduct.read_path = lambda test, mounting: read_path(session, store, journal.campaign, test, mounting)
+    campaign_run = CampaignRun(session, control, site.watching, journal, expected, manner.confirm)
+    campaign_run.read_path = lambda test, mounting: read_path(session, store, journal.campaign, test, mounting)
     if manner.resumed is not None:
-        conduct.mountings = dict(manner.resumed.mountings)
-        conduct.used = set(manner.resumed.used)
-        conduct.labels = {run.label for run in await asyncio.to_thread(store.runs, journal.campaign)}
-    return conduct
+        campaign_run.mountings = dict(manner.resumed.mountings)
+        campaign_run.used = set(manner.resumed.used)
+        campaign_run.labels = {run.label for run in await asyncio.to_thread(store.runs, journal.campaign)}
+    return campaign_run
 
 
 def planned_seconds(test: TestPlan) -> float:
@@ -201,8 +201,8 @@ Once = Callable[[TestPlan, Attempt, Runner], Awaitable[int]]
 async def _all_tests(
     plan: CampaignPlan,
     seconds: list[float],
-    conduct: Conduct,
-    meter: Meter,
+    campaign_run: CampaignRun,
+    progress_meter: ProgressMeter,
     resumed: Resumed | None,
     once: Callable[[TestPlan, float], Once],
 ) -> list[int]:
@@ -210,35 +210,35 @@ async def _all_tests(
     run_ids: list[int] = []
     done, start = (resumed.done, resumed.start) if resumed is not None else ({}, {})
     for item, duration_s in zip(items(plan), seconds, strict=True):
-        label, base_s = item.test.label, meter.done_s
+        label, base_s = item.test.label, progress_meter.done_s
         if label in done:
             run_ids.append(done[label])
-            meter.skip(duration_s)
+            progress_meter.skip(duration_s)
         else:
-            item = start.get(label) or in_mounting(item, conduct.mountings.get(item.setup, 1))
-            run_ids.append(await conduct.complete(item, once(item.test, base_s)))
-            meter.done_s = base_s + duration_s
-        meter.at(meter.done_s, label)
+            item = start.get(label) or in_mounting(item, campaign_run.mountings.get(item.setup, 1))
+            run_ids.append(await campaign_run.complete(item, once(item.test, base_s)))
+            progress_meter.done_s = base_s + duration_s
+        progress_meter.at(progress_meter.done_s, label)
     return run_ids
 
 
 def _once(
-    session: Session, store: Store, site: Site, under_way: OpenCampaign, meter: Meter, live: LiveFeed | None
+    session: Session, store: Store, site: Site, under_way: OpenCampaign, progress_meter: ProgressMeter, live: LiveFeed | None
 ) -> Callable[[TestPlan, float], Once]:
     """How one attempt at a test becomes one run."""
 
     def of(test: TestPlan, base_s: float) -> Once:
-        breaks = BarBreaks(session, meter.control or Control(), site.watching.suspending)
+        breaks = BarBreaks(session, progress_meter.control or Control(), site.watching.suspending)
 
         async def once(left: TestPlan, attempt: Attempt, runner: Runner) -> int:
             before_s = max(planned_seconds(test) - planned_seconds(left), 0.0)  # what an earlier attempt has done stays done
 
             def tick(seconds: float, waited_s: float) -> None:
-                meter.at(base_s + before_s + seconds, test.label, waited_s)
+                progress_meter.at(base_s + before_s + seconds, test.label, waited_s)
 
             how = How(runner, attempt, runner.journal, live)
             try:
-                return await measure_test(session, store, site, under_way, left, tick, meter.clock, how)
+                return await measure_test(session, store, site, under_way, left, tick, progress_meter.clock, how)
             except DriverError as error:
                 await breaks.wait(error, runner, runner.journal)
                 raise
@@ -261,8 +261,8 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
     """One test as one run; whatever ends it early is written into the run before it is raised again."""
     runner, attempt, journal = (how.runner, how.attempt, how.journal) if how is not None else (Runner(session), Attempt(), NoJournal())
     doc = await start_document(session, site, campaign, test, clock) | _standstills(test, attempt)
-    if attempt.onward is not None:
-        doc["path"] |= attempt.onward.doc()
+    if attempt.remainder is not None:
+        doc["path"] |= attempt.remainder.doc()
     run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, doc)
     status, reason, end = "aborted", "stopped", dict[str, Any]()
     recorder: CaptureRecorder | None = None
@@ -346,4 +346,4 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
     """How many readings at standstill a whole run has: those of its steps, and those carried over, the last of which is read again."""
     count = sum(isinstance(step, ReadLaser | ReadBar) for step in test.steps)
-    return {"standstills": count + max(0, len(attempt.rewind.carried) - 1)} if count else {}
+    return {"standstills": count + max(0, len(attempt.resume_trail.carried) - 1)} if count else {}

@@ -29,7 +29,7 @@ INSTRUMENTS = {BALLBAR: "ball-bar", LASER: "laser"}
 
 
 @dataclass(frozen=True, slots=True)
-class Doubts:
+class Plausibility:
     """What cannot work, and what can but is rarely meant; one line each."""
 
     errors: tuple[str, ...] = ()
@@ -41,7 +41,7 @@ class Doubts:
         return not self.errors and not self.warnings
 
 
-def doubts(config: MachineFile, folder: Path, today: date) -> Doubts:
+def check_plausibility(config: MachineFile, folder: Path, today: date) -> Plausibility:
     """Look at all of a machine file; nothing is connected.
 
     Parameters
@@ -53,7 +53,7 @@ def doubts(config: MachineFile, folder: Path, today: date) -> Doubts:
     """
     site = site_of(config)
     rare = [*_strokes(config), *_window(config), *certificates(site, today), *_far(site, today), *_none(site)]
-    return Doubts(tuple(unattended(config, site, folder)), tuple(rare))
+    return Plausibility(tuple(unattended(config, site, folder)), tuple(rare))
 
 
 def check_unattended(config: MachineFile, folder: Path) -> None:

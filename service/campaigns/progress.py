@@ -12,7 +12,7 @@ WAITING = (State.PAUSED, State.SUSPENDED)
 
 
 @dataclass
-class Meter:
+class ProgressMeter:
     """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA.
 
     The time in which the job waited for a person (``waited_s``) says nothing about the machine and does not count.

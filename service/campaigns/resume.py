@@ -23,7 +23,7 @@ from abbe.service.campaigns.campaign_run import (
     read_path,
 )
 from abbe.service.devices.session import Session
-from abbe.service.errors import UnsafeToMove, WorldChanged
+from abbe.service.errors import PreconditionsChanged, UnsafeToMove
 from abbe.service.runs.codec import decode_json
 from abbe.service.runs.columns import LASER_CHANNEL
 from abbe.service.sequences.interlocks import check_interlocks, check_ours
@@ -61,7 +61,7 @@ def read_journal(store: Store, campaign: CampaignRecord) -> Lines:
     found: list[CheckpointRecord] = store.checkpoints(campaign.id)
     begun = [one.doc for one in found if one.kind == BEGUN]
     if not begun:
-        raise WorldChanged(
+        raise PreconditionsChanged(
             f"campaign {campaign.name!r} has no journal",
             "it was imported, or measured by an older Abbe: measure it anew under another name",
         )
@@ -81,7 +81,7 @@ def begun_source(store: Store, name: str) -> Doc:
     """
     source: Doc = read_journal(store, store.campaign(name)).begun.get("source") or {}
     if "recipe" not in source:
-        raise WorldChanged(f"the journal of campaign {name!r} does not name its recipe", "give it: --recipe FILE.toml (or --helix)")
+        raise PreconditionsChanged(f"the journal of campaign {name!r} does not name its recipe", "give it: --recipe FILE.toml (or --helix)")
     return source
 
 
@@ -134,12 +134,14 @@ def _same_plan(store: Store, campaign: CampaignRecord, lines: Lines, site: Site,
                 f"run {run.label} of campaign {campaign.name} is being measured (process {run.owner.pid})", "wait until it has ended"
             )
     if lines.begun["plan"] != plan_hash(plan):
-        raise WorldChanged(
+        raise PreconditionsChanged(
             f"campaign {campaign.name!r} was begun with another recipe (or feed limit, or version of Abbe)",
             "go on with the recipe that it was begun with, or measure a new campaign",
         )
     if store.machine(campaign.machine_id).doc != site.doc:
-        raise WorldChanged(f"campaign {campaign.name!r} is of another machine, or its description was changed", "measure a new campaign")
+        raise PreconditionsChanged(
+            f"campaign {campaign.name!r} is of another machine, or its description was changed", "measure a new campaign"
+        )
 
 
 class _Finder:
@@ -177,19 +179,20 @@ class _Finder:
             why = "it was cleared away"
         else:
             item = await self._in_place(session, item, number, hand[-1])
-            if (setup, number) in self.used and not item.rewind.carried:
+            if (setup, number) in self.used and not item.resume_trail.carried:
                 asked = f"Set-up {setup} was left mounted and has complete runs. Has nobody touched it since?"
                 why = "" if await confirm(asked) else "nobody vouches for it, and runs of it are complete"
-            elif item.onward is not None and not await confirm(halfway(item)):
+            elif item.remainder is not None and not await confirm(halfway(item)):
                 item = gone_on(item, item.hand, ())
         if why:
             said.append(f"set-up {setup} is mounted anew for {item.test.label}: {why}")
             self.mountings[setup] = number + 1
             return mounted_anew(item, number + 1)
-        kept = len(item.rewind.carried)
+        kept = len(item.resume_trail.carried)
         how = f"goes on after point {kept}, which is read again" if kept else "begins again"
-        if item.onward is not None:
-            how = f"goes on at {item.onward.offset_mm:.0f} of {item.onward.whole_mm:.0f} mm of its path, a stretch of which is read again"
+        if item.remainder is not None:
+            at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"
+            how = f"goes on at {at} of its path, a stretch of which is read again"
         said.append(f"set-up {setup} is still mounted: {item.test.label} {how}")
         return item
 

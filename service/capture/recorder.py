@@ -42,7 +42,7 @@ Look = Callable[[BarBatch], None]
 """Is shown every batch after it was taken, in the driver's thread; must neither wait nor raise."""
 
 
-def nobody_looks(_: BarBatch) -> None:
+def ignore_batch(_: BarBatch) -> None:
     """Nobody looks on."""
 
 
@@ -77,7 +77,7 @@ class CaptureRecorder:
         self.behind = True
         self._keep, self._io = keep, io
         self._streams = 0
-        self.look: Look = nobody_looks
+        self.look: Look = ignore_batch
         """Whoever looks on; set before a stream begins."""
 
     def tap(self) -> _Tap:

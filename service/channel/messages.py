@@ -1,6 +1,6 @@
 """What core and web say to each other: everything there is. Frozen, checked at both ends, bounded in length.
 
-The core says what is so (`Begin`, `Moment`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`), the web process asks for what a person wants
+The core says what is so (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`), the web process asks for what a person wants
 (`StartJob`, `SteerJob`, `DoneByHand`, `RollBack`, `PushNow`). Nothing that it can say names a device, a register or a file, or holds a
 table: the one in force is named by its push and CRC, and which one comes instead says the push journal.
 """
@@ -39,7 +39,7 @@ Outcome = Literal["done", "unknown", "busy", "forbidden", "conflict"]
 
 
 @dataclass(frozen=True, slots=True)
-class RulesTold:
+class RulesSummary:
     """What the machine file adds to reports: limits, certificates, allowed temperature."""
 
     limits_um: dict[str, float]
@@ -48,7 +48,7 @@ class RulesTold:
 
 
 @dataclass(frozen=True, slots=True)
-class MachineTold:
+class MachineSummary:
     """The machine's nominal geometry (run-format.md 1) and its largest feed: what a dry run is calculated from."""
 
     chain: Word
@@ -76,15 +76,15 @@ class Begin:
     port: Annotated[int, Field(ge=0, le=65535)]
     behind_tls: bool
     schedules: Annotated[tuple[Schedule, ...], Field(max_length=200)]
-    rules: RulesTold
-    plan: MachineTold | None
+    rules: RulesSummary
+    plan: MachineSummary | None
     campaigns: Annotated[tuple[Word, ...], Field(max_length=200)]
     memory_mb: Annotated[int, Field(ge=1)]
     control: Text
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class Snapshot:
     """How things stand; at least once a second."""
 
     __pydantic_config__ = _STRICT
@@ -199,7 +199,7 @@ class DoneByHand:
     who: Word
 
 
-FromCore = Begin | Moment | Jobs | LivePath | LiveSamples | Answer
+FromCore = Begin | Snapshot | Jobs | LivePath | LiveSamples | Answer
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,7 @@ async def console_ask(text: str) -> None:
         raise ConfigError("standard input was closed", "start again from a terminal")
 
 
-def whoever_is_there() -> Ask:
+def person_at_console() -> Ask:
     """Who is asked at this console: the person at the terminal, or, known before anything moves, nobody."""
     from abbe.service.devices.session import no_console
 

@@ -190,11 +190,10 @@ def correct(
     """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import run_job
     from abbe.service.cli.waiting import taken_back_when_safe
-    from abbe.service.compensation.commission import check_commissioned
     from abbe.service.compensation.correct import Correction
     from abbe.service.compensation.correct import correct as work_correct
+    from abbe.service.compensation.gate import PushContext, ready
     from abbe.service.compensation.proposals import check_certificates
-    from abbe.service.compensation.proved_levels import check_level
     from abbe.service.config import load_machine
     from abbe.service.errors import TakenBack
     from abbe.service.site import site_of
@@ -212,11 +211,11 @@ def correct(
         store.campaign(campaign)
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
-                await check_commissioned(session.controller, store, site)
-                said.append(await check_level(session.controller, store, site))
+                context = PushContext(session, store, site, sink)
+                said.append(await ready(context))
                 runs = await verification_before(session, store, site, before, sink)
                 async with taken_back_when_safe(session, store, site, wait_s):
-                    return await work_correct(session, store, site, campaign, runs, progress=sink)
+                    return await work_correct(context, campaign, runs)
 
     with Store.open(loaded.database_url) as store:
         try:
@@ -254,17 +253,17 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
 
     ``accept_table``: the person at the console vouches for a table in force that this database did not push.
     """
-    from abbe.service.cli.ask import whoever_is_there
+    from abbe.service.cli.ask import person_at_console
     from abbe.service.compensation.proposals import by_whom
     from abbe.service.compensation.recovered_session import recovered_session
-    from abbe.service.devices.machine_lock import alone
+    from abbe.service.devices.machine_lock import lock_machine
 
     def told(text: str) -> None:
         typer.echo(text, err=True)
 
-    with alone(site.urls.cnc):
+    with lock_machine(site.urls.cnc):
         accept_by = by_whom() if accept_table else ""
-        async with recovered_session(store, site, ask=whoever_is_there(), accept_by=accept_by, told=told) as session:
+        async with recovered_session(store, site, ask=person_at_console(), accept_by=accept_by, told=told) as session:
             yield session
 
 

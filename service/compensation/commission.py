@@ -53,7 +53,7 @@ class Proved:
 
 
 @dataclass
-class _Bench:
+class CommissioningContext:
     """What a commissioning works with."""
 
     session: Session
@@ -97,12 +97,12 @@ async def commission(session: Session, store: Store, site: Site, *, progress: Pr
     lsb_nm = (await session.controller.table_format()).lsb_nm
     known = identity(await session.controller.identify())
     number = sum(c.name.startswith(KIND) for c in await asyncio.to_thread(store.campaigns)) + 1
-    bench = _Bench(session, store, site, BarPlaces(session, store, site, progress, f"{KIND} {number}", PLACES))
-    steps = _steps(bench, base, lsb_nm)  # and their limits, before anything is mounted
-    async with bench.bar.cleared_away():
-        proof = await _prove(bench, base, steps)
-        campaign = await asyncio.to_thread(store.campaign, f"{bench.bar.name} before")
-        solution_id = await store.write(store.add_solution, campaign.id, KIND, bench.bar.run_ids, _doc(proof) | {"identity": known})
+    context = CommissioningContext(session, store, site, BarPlaces(session, store, site, progress, f"{KIND} {number}", PLACES))
+    steps = _steps(context, base, lsb_nm)  # and their limits, before anything is mounted
+    async with context.bar.cleared_away():
+        proof = await _prove(context, base, steps)
+        campaign = await asyncio.to_thread(store.campaign, f"{context.bar.name} before")
+        solution_id = await store.write(store.add_solution, campaign.id, KIND, context.bar.run_ids, _doc(proof) | {"identity": known})
     return Proved(proof, solution_id)
 
 
@@ -117,7 +117,7 @@ class _Steps:
     each: tuple[NineTables, NineTables, NineTables]
 
 
-def _steps(bench: _Bench, base: Base, lsb_nm: int) -> _Steps:
+def _steps(context: CommissioningContext, base: Base, lsb_nm: int) -> _Steps:
     lsb_mm = lsb_nm * 1e-6
     small_mm, step_mm = (max(round(s / lsb_mm), 1) * lsb_mm for s in (FIRST_MM, STEP_MM))
     if small_mm * LARGEST_RATIO > STROKE_MM:
@@ -125,29 +125,29 @@ def _steps(bench: _Bench, base: Base, lsb_nm: int) -> _Steps:
             f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: its least step, taken for millimetres, is beyond the bar's stroke",
             "prove sign and unit with an indicator and the axis clear of everything; nothing was written",
         )
-    tables = _base_tables(bench.site, base)
-    x, y, z = (quantise(_stepped(bench, tables, (axis,), step_mm), lsb_mm) for axis in range(3))
-    small = quantise(_stepped(bench, tables, (0, 1, 2), small_mm), lsb_mm)
+    tables = _base_tables(context.site, base)
+    x, y, z = (quantise(_stepped(context, tables, (axis,), step_mm), lsb_mm) for axis in range(3))
+    small = quantise(_stepped(context, tables, (0, 1, 2), small_mm), lsb_mm)
     for one in (small, x, y, z):
-        check_limits(one, base.tables, bench.site.limits)
+        check_limits(one, base.tables, context.site.limits)
     return _Steps(lsb_nm, small_mm, small, step_mm, (x, y, z))
 
 
-async def _prove(bench: _Bench, base: Base, steps: _Steps) -> SignProof:
+async def _prove(context: CommissioningContext, base: Base, steps: _Steps) -> SignProof:
     """All passes and what follows from them; a wrong unit is stored before it is raised."""
-    before = await bench.bar.read("before")
-    first = await bench.with_table("first", steps.small, base, steps.lsb_nm)
+    before = await context.bar.read("before")
+    first = await context.with_table("first", steps.small, base, steps.lsb_nm)
     moved_mm = float(np.abs(first.deviation_mm - before.deviation_mm).max())
     if moved_mm > HARMLESS * max(steps.small_mm, FIRST_MM):
         moved = f"a step of {steps.small_mm * 1e3:g} µm moved the tool by {moved_mm * 1e3:.1f} µm"
         what = f"{moved}: the control takes the numbers for another unit"
-        campaign = await asyncio.to_thread(bench.store.campaign, f"{bench.bar.name} before")
+        campaign = await asyncio.to_thread(context.store.campaign, f"{context.bar.name} before")
         doc = {"step_mm": steps.small_mm, "faults": [what], "proved": False}
-        await bench.store.write(bench.store.add_solution, campaign.id, KIND, bench.bar.run_ids, doc)
+        await context.store.write(context.store.add_solution, campaign.id, KIND, context.bar.run_ids, doc)
         raise TableRefused(what, "the old table is in force; look up the unit of the control's table and its entry in the machine file")
-    read = [await bench.with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
-    after = await bench.bar.read("after")
-    return sign_proof(steps.step_mm, _shifts(bench.bar.directions(before), before, read, after))
+    read = [await context.with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
+    after = await context.bar.read("after")
+    return sign_proof(steps.step_mm, _shifts(context.bar.directions(before), before, read, after))
 
 
 def _base_tables(site: Site, base: Base) -> NineTables:
@@ -160,10 +160,10 @@ def _base_tables(site: Site, base: Base) -> NineTables:
     return NineTables(grids, both, both)
 
 
-def _stepped(bench: _Bench, tables: NineTables, axes: tuple[int, ...], step_mm: float) -> NineTables:
+def _stepped(context: CommissioningContext, tables: NineTables, axes: tuple[int, ...], step_mm: float) -> NineTables:
     """The tables with a step for some axes, in force wherever the bar reads."""
     for axis in axes:
-        centre, reach = bench.bar.centre_mm[axis], bench.bar.radius_mm + 1.0
+        centre, reach = context.bar.centre_mm[axis], context.bar.radius_mm + 1.0
         low_mm = centre - (1.0 if axis == UPRIGHT else reach)  # the places are on the upper hemisphere
         try:
             tables = step_tables(tables, axis, step_mm, low_mm, centre + reach)

@@ -94,7 +94,7 @@ def sign_files(out: Path, form: str, config: MachineFile, seal: TableSeal, now: 
     return target
 
 
-def standing(path: Path, read: Sequence[TextFile], config: MachineFile | None, ask: SigningRequest, now: datetime) -> SealStatus:
+def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None, ask: SigningRequest, now: datetime) -> SealStatus:
     """What the files at ``path`` are worth, whose text was ``read`` already.
 
     Raises

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,8 @@ from abbe.models.compensation.sign_probe import expected_changes, probe
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.campaigns.measure import Manner, measure
-from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.commission import check_commissioned
-from abbe.service.compensation.proposal_checks import HoldReason, hold
-from abbe.service.compensation.proposal_doc import load
+from abbe.service.compensation.gate import Admission, NotAdmitted, PushContext, admit, check_promise, ready
+from abbe.service.compensation.proposal_checks import HoldReason
 from abbe.service.compensation.proposals import (
     Made,
     check_before_runs,
@@ -29,31 +27,21 @@ from abbe.service.compensation.proposals import (
     make,
     solved_again,
 )
-from abbe.service.compensation.proved_levels import check_level
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
-from abbe.service.compensation.recover import recover
-from abbe.service.devices.session import Session
-from abbe.service.errors import AbbeError, TableRefused, TakenBack
-from abbe.service.events import Progress, ProgressSink
+from abbe.service.errors import AbbeError, TakenBack
+from abbe.service.events import Progress
 from abbe.service.identification.solve import Solved, helix_misfit
 from abbe.service.identification.table_removal import less, taken
 from abbe.service.push.operations import Verdict
 from abbe.service.sequences.check import paced
-from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Suspending
-from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.recipes.campaigns import verification
-from abbe.service.site import Site
-from abbe.service.storage.store import Store
-from abbe.service.tables.nine_tables import check_limits
 from abbe.service.verification.verify import VerificationDecision, VerificationFigures, check_before, decide, figure_rows, figures
 
 UNSEEN = "DRIFT: no ball-bar run that the solution has not seen shows whether the machine still is what was measured"
 VERIFY, SIGN = "verify-after-push-", "sign-check"
 PLACES = 12
 """Of the ball-bar, before and after a new table comes into force."""
-MIN_GAIN = 0.1
-"""A table is pushed only if the identified model promises at least this relative improvement (reliability.md 3.3)."""
 
 
 @dataclass(frozen=True)
@@ -79,34 +67,13 @@ class Correction:
     proposal: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class _CorrectionContext:
-    """What a correction works with."""
-
-    session: Session
-    store: Store
-    site: Site
-    rate_hz: int
-    progress: ProgressSink
-    clock: Clock
-    attended: bool = True
-    control: Control = field(default_factory=Control)
-
-
-async def correct(
-    session: Session,
-    store: Store,
-    site: Site,
-    campaign: str | int,
-    before: list[dict[str, Any]],
-    *,
-    rate_hz: int = 100,
-    progress: ProgressSink,
-) -> Correction:
+async def correct(context: PushContext, campaign: str | int, before: list[dict[str, Any]]) -> Correction:
     """Correct a machine from a measured identification campaign.
 
     Parameters
     ----------
+    context : PushContext
+        Devices, store and machine.
     campaign : str or int
         Identification campaign in the store.
     before : list of dict
@@ -121,46 +88,27 @@ async def correct(
     StillActive
         An unverified table could not be taken back yet.
     """
-    await recover(session.controller, store, site)
-    await _check_can_verify(session, site, rate_hz)
-    await check_level(session.controller, store, site)
-    await check_commissioned(session.controller, store, site)
-    gathered = await gather(session.controller, store, site, campaign)
+    store, site = context.store, context.site
+    await ready(context)
+    gathered = await gather(context.session.controller, store, site, campaign)
     check_same_table(gathered.base, before)
     check_temperature(site, gathered.runs)
     figures(before)  # before anything is written: runs that are no verification are refused now
-    made = await make(store, site, gathered, progress=progress)
-    check_promise(made.proposed.predicted)
-    check_limits(made.proposed.tables, gathered.base.tables, site.limits)  # says where, and which key of the machine file to look at
-    return await _push(_CorrectionContext(session, store, site, rate_hz, progress, SystemClock()), made, before)
+    made = await make(store, site, gathered, progress=context.progress, agree=lambda promised: check_promise(promised, site.limits))
+    return await _push(context, await admit(context, made.number), made, before)
 
 
-async def push(  # noqa: PLR0913 - one argument for each thing it needs
-    session: Session,
-    store: Store,
-    site: Site,
-    number: int,
-    before: list[dict[str, Any]],
-    *,
-    rate_hz: int = 100,
-    progress: ProgressSink,
-    clock: Clock | None = None,
-    attended: bool = True,
-    control: Control | None = None,
-) -> Correction:
+async def push(context: PushContext, number: int, before: list[dict[str, Any]]) -> Correction:
     """Push a stored proposal: everything that was checked when it was made is checked again, then as `correct`.
 
     Parameters
     ----------
+    context : PushContext
+        Devices, store and machine; who stops it, and whether a person attends.
     number : int
         Of the proposal.
     before : list of dict
         Verification runs measured with the present table, as ``abbe-run/1``.
-    attended : bool
-        A person orders it. Else the limits of unattended pushes hold as well, and a person's approval is needed in any case.
-    control : Control, optional
-        Who may stop or pause it; default: nobody. While a table is in force that nobody has verified it cannot be paused, and a stop takes
-        the old table back.
 
     Raises
     ------
@@ -171,68 +119,23 @@ async def push(  # noqa: PLR0913 - one argument for each thing it needs
     Stopped, Aborted
         Asked for; the old table is in force.
     """
-    await recover(session.controller, store, site)
-    await _check_can_verify(session, site, rate_hz)
-    clock = clock or SystemClock()
-    proposed = await asyncio.to_thread(load, store, number)
-    against = (await hold(session.controller, store, site, number, proposed, clock, attended=attended)).reasons()
-    if against:
-        raise TableRefused("; ".join(against), "nothing was written")
-    progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
-    made = Made(number, proposed, await solved_again(store, site, proposed.campaign, proposed.base_tables))
-    control = control or Control()
-    await control.gate()
-    return await _push(_CorrectionContext(session, store, site, rate_hz, progress, clock, attended, control), made, before)
+    admission = await admit(context, number)
+    proposed = admission.held.proposed
+    context.progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
+    made = Made(number, proposed, await solved_again(context.store, context.site, proposed.campaign, proposed.base_tables))
+    await context.control.gate()
+    return await _push(context, admission, made, before)
 
 
-async def reasons_now(session: Session, store: Store, site: Site, number: int, clock: Clock | None = None) -> list[str]:
-    """What speaks against pushing a proposal now, before anything is measured for it. Nothing is written.
-
-    Raises
-    ------
-    StoreError
-        There is no such proposal, or its row was changed.
-    """
-    proposed = await asyncio.to_thread(load, store, number)
-    return (await hold(session.controller, store, site, number, proposed, clock or SystemClock())).reasons()
-
-
-async def _check_can_verify(session: Session, site: Site, rate_hz: int) -> None:
-    """No table is written that could not be measured afterwards; errors as of `check_devices`."""
-    await check_devices(session, verification(site.machine, rate_hz=rate_hz), air=site.watching.air_c is not None)
-
-
-def check_promise(predicted: Predicted) -> None:
-    """Refuse what is not worth writing.
-
-    Raises
-    ------
-    TableRefused
-        The model promises less than `MIN_GAIN`, or less than twice its own uncertainty.
-    """
-    gain = predicted.before_mm - predicted.after_mm
-    if gain < MIN_GAIN * predicted.before_mm or gain < 2.0 * predicted.u_model_mm:
-        raise TableRefused(
-            f"the tables promise {predicted.before_mm * 1e3:.1f} → {predicted.after_mm * 1e3:.1f} µm rms "
-            f"(model uncertainty {predicted.u_model_mm * 1e3:.1f} µm): not enough to write",
-            "the present table is as good as these runs can tell; nothing was written",
-        )
-
-
-async def _push(bench: _CorrectionContext, made: Made, before: list[dict[str, Any]]) -> Correction:
-    """Hold the proposal against now, push it, verify it. Any interlock ends it: nothing waits while an unverified table is in force."""
-    session, store, proposed = bench.session, bench.store, made.proposed
-    site = replace(bench.site, watching=replace(bench.site.watching, suspending=Suspending()))
-    bench = replace(bench, site=site)
-    await check_level(session.controller, store, site, attended=bench.attended)
-    held = await hold(session.controller, store, site, made.number, proposed, bench.clock, attended=bench.attended)
-    against = held.reasons()
-    if against:
-        raise TableRefused("; ".join(against), "nothing was written")
+async def _push(context: PushContext, admission: Admission, made: Made, before: list[dict[str, Any]]) -> Correction:
+    """Push an admitted proposal and verify it. Any interlock ends it: nothing waits while an unverified table is in force."""
+    session, store, proposed, held = context.session, context.store, made.proposed, admission.held
+    site = replace(context.site, watching=replace(context.site.watching, suspending=Suspending()))
+    context = replace(context, site=site)
     check_same_table(held.base, before)
     evidence = proposed.candidate.evidence
     newest_s = evidence.ended_s if evidence.last_s is None else evidence.last_s
-    check_before_runs(site, held.base, before, newest_s, bench.clock.utc().timestamp())
+    check_before_runs(site, held.base, before, newest_s, context.clock.utc().timestamp())
     old = figures(before)
     check_before(old)
     helix = next((r for r in before if r["test"] == "ballbar_helix"), None)
@@ -240,10 +143,10 @@ async def _push(bench: _CorrectionContext, made: Made, before: list[dict[str, An
     bar = None
     if session.ballbar is not None and session.fixture is not None:
         number = sum(c.name.startswith(SIGN) for c in await asyncio.to_thread(store.campaigns)) + 1
-        bar = BarPlaces(session, store, site, bench.progress, f"{SIGN} {number}", PLACES, bench.control)
+        bar = BarPlaces(session, store, site, context.progress, f"{SIGN} {number}", PLACES, context.control)
     p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
     doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
-    work = _Correcting(bench, held, misfit_mm, bar, old)
+    work = _Correcting(context, held, misfit_mm, bar, old)
     wanted = WantedTable(proposed.tables, held.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
     pushed, after, decision = await _push_and_verify(work, wanted)
     bank = pushed.bank if decision.keep else pushed.previous_bank
@@ -266,7 +169,7 @@ def _as_solved(run: dict[str, Any], solved: Solved, table: NineTables | None) ->
 class _Correcting:
     """Answers the push machine's questions about one proposal: are there reasons against it, goes the tool where it says, is it better?"""
 
-    bench: _CorrectionContext
+    context: PushContext
     held: HoldReason
     drift_mm: float | None
     bar: BarPlaces | None
@@ -281,7 +184,7 @@ class _Correcting:
         """Everything against it; asked again by the machine of the push, with what the controller says of itself by then."""
         drift = [] if self.drift_mm is not None else [UNSEEN]
         # Decisions are read anew: a person may have rejected it while the ball-bar was read.
-        number, store = self.held.number, self.bench.store
+        number, store = self.held.number, self.context.store
         now = replace(self.held, rejections=tuple(store.rejections(number)), approvals=tuple(store.approvals(number)))
         return [*now.reasons(self.drift_mm), *drift]
 
@@ -296,13 +199,13 @@ class _Correcting:
         return Verdict(found.agrees, found.text + ("" if all(found.seen) else "; that rests on the commissioning"))
 
     async def verify(self) -> Verdict:
-        bench = self.bench
-        number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(bench.store.campaigns)) + 1
+        context = self.context
+        number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(context.store.campaigns)) + 1
         name = f"{VERIFY}{number}"
-        plan = paced(verification(bench.site.machine, rate_hz=bench.rate_hz, name=name), bench.site.max_feed_mm_min)
-        manner = Manner(control=bench.control, part=True)
-        ids = await measure(bench.session, bench.store, bench.site, plan, progress=bench.progress, manner=manner)
-        self.after = figures(await load_runs(bench.store, ids))
+        plan = paced(verification(context.site.machine, rate_hz=context.rate_hz, name=name), context.site.max_feed_mm_min)
+        manner = Manner(control=context.control, part=True)
+        ids = await measure(context.session, context.store, context.site, plan, progress=context.progress, manner=manner)
+        self.after = figures(await load_runs(context.store, ids))
         self.decision = decide(self.before, self.after, self.pushing.crc if self.pushing is not None else None)
         self.verified_as = name
         return Verdict(self.decision.keep, self.decision.text)
@@ -310,27 +213,27 @@ class _Correcting:
 
 async def _push_and_verify(work: _Correcting, wanted: WantedTable) -> tuple[PushResult, VerificationFigures, VerificationDecision]:
     """Push, prove the sign, measure again, keep or go back. Whatever stops it takes the old table back."""
-    bench = work.bench
-    against = work.reasons()
-    if against:
-        raise TableRefused("; ".join(against), "nothing was written")
-    await check_commissioned(bench.session.controller, bench.store, bench.site)
-    questions = Questions(work.reasons, work.held.by, work.probe, work.verify, work.held.approval(bench.clock))
-    work.pushing = pushing = Pushing(bench.session.controller, bench.store, bench.site, attended=bench.attended, control=bench.control)
+    context = work.context
+    if against := work.reasons():
+        raise NotAdmitted(against)
+    questions = Questions(work.reasons, work.held.by, work.probe, work.verify, work.held.approval(context.clock))
+    work.pushing = pushing = Pushing(
+        context.session.controller, context.store, context.site, attended=context.attended, control=context.control
+    )
     if work.bar is None:
-        await bench.control.gate()
+        await context.control.gate()
         pushed = await pushing.bring(wanted, questions)
     else:
         async with work.bar.cleared_away():
             work.read_before = await work.bar.read("before")
-            await bench.control.gate()
-            bench.progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
+            await context.control.gate()
+            context.progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
             pushed = await pushing.bring(wanted, questions)
     if work.after is None or work.decision is None:
         raise TakenBack(f"the table was taken back: {pushed.why}", "look at the control's convention: abbe comp commission")
     decision = work.decision if pushed.kept == work.decision.keep else VerificationDecision(pushed.kept, pushed.why)
     try:
-        await _store_verification(bench, work.verified_as, pushed, work.after, decision)
+        await _store_verification(context, work.verified_as, pushed, work.after, decision)
     except AbbeError as error:  # what the control does is decided and done; only the note of it is missing
         error.add_note(f"the table is {'kept and in force' if decision.keep else 'taken back'}: {decision.text}")
         raise
@@ -338,9 +241,9 @@ async def _push_and_verify(work: _Correcting, wanted: WantedTable) -> tuple[Push
 
 
 async def _store_verification(
-    bench: _CorrectionContext, name: str, pushed: PushResult, after: VerificationFigures, decision: VerificationDecision
+    context: PushContext, name: str, pushed: PushResult, after: VerificationFigures, decision: VerificationDecision
 ) -> None:
-    store, site = bench.store, bench.site
+    store, site = context.store, context.site
     rows = {k: {"value": v, "u": u} for k, (v, u) in figure_rows(after).items()}
     machine_id = await store.write(store.add_machine, site.name, site.doc)
     doc = {"text": decision.text, "push": pushed.push_id, "figures": rows}

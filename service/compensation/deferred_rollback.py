@@ -8,7 +8,7 @@ from abbe.drivers.api import Controller
 from abbe.service.clock import Clock
 from abbe.service.compensation.recover import READY, finish_push
 from abbe.service.errors import StillActive
-from abbe.service.push.adapter import ControllerPort, nobody
+from abbe.service.push.adapter import ControllerPort, no_actors
 from abbe.service.push.book import StoreBook
 from abbe.service.push.operations import Done, Doubt, Operation, OperationKind, Outcome, Truth
 from abbe.service.push.states import TERMINAL, PushState
@@ -53,7 +53,7 @@ async def finish_when_safe(controller: Controller, store: Store, site: Site, *, 
     book = await StoreBook.last(store, site.name, clock, site.control)
     if book is None or (await book.entries())[-1].state in TERMINAL - {PushState.OPERATOR}:
         return None
-    port = ControllerPort(controller, nobody(), clock)
+    port = ControllerPort(controller, no_actors(), clock)
     end_s = clock.monotonic_s() + limit_s
     told, remind_s = "", 0.0
     while True:

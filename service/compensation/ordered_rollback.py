@@ -10,12 +10,13 @@ from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
 from abbe.service.compensation.deferred_rollback import LIMIT_S, finish_when_safe
 from abbe.service.compensation.rollback import Ordered, rollback
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import STOPPED, PushOutcome
+from abbe.service.tables.push_outcome import STOPPED
 from abbe.service.tables.table_history import offered
 
 
@@ -28,39 +29,39 @@ class BackOrder:
     ordered: Ordered
 
 
-async def bring_back(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> PushOutcome:
+async def ordered_rollback(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> JobOutcome:
     """Take the table back. What is returned is what was heard; which table is in force says the journal (`push_outcome.ordered`).
 
     A refusal is an outcome, not an error: another process has the machine, the controller holds what the journal does not know, or the
     journal moved on since the order was given.
     """
     try:
-        with alone(site.urls.cnc):
+        with lock_machine(site.urls.cnc):
             async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
                 return await _heard(session.controller, store, site, order, clock)
     except MachineInUse as busy:
-        return PushOutcome("refused", f"{busy}; nothing was written")
+        return JobOutcome("refused", f"{busy}; nothing was written")
     except (AbbeError, DriverError, OSError) as error:
-        return PushOutcome("failed", _told(error))
+        return JobOutcome("failed", _told(error))
 
 
-async def _heard(controller: Controller, store: Store, site: Site, order: BackOrder, clock: Clock) -> PushOutcome:
+async def _heard(controller: Controller, store: Store, site: Site, order: BackOrder, clock: Clock) -> JobOutcome:
     control = order.ordered.control
     try:
         await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
         back = await rollback(controller, store, site, ordered=order.ordered)
     except (TableRefused, TableMismatch) as no:
-        return PushOutcome("refused", _told(no))
+        return JobOutcome("refused", _told(no))
     except StillActive as open_:
         return await _finished(controller, store, site, order, open_, clock)
     except MachineInUse:
         raise
     except (AbbeError, DriverError, OSError) as error:
-        return PushOutcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
+        return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
     if back is None:
-        return PushOutcome("refused", "the table from before is in force already; nothing was written")
+        return JobOutcome("refused", "the table from before is in force already; nothing was written")
     told = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
-    return PushOutcome("kept", f"{told}; the machine is unverified now: run a quick check")
+    return JobOutcome("kept", f"{told}; the machine is unverified now: run a quick check")
 
 
 def check_unchanged(store: Store, machine: str, order: BackOrder, control: str = "") -> None:
@@ -79,14 +80,14 @@ def check_unchanged(store: Store, machine: str, order: BackOrder, control: str =
         )
 
 
-async def _finished(controller: Controller, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock) -> PushOutcome:
+async def _finished(controller: Controller, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock) -> JobOutcome:
     """The rollback broke off, and the way back from it is not open now: go it as soon as it is."""
     finish = finish_when_safe(controller, store, site, limit_s=LIMIT_S, clock=clock, say=lambda _: None)
     try:
         done = await order.ordered.control.unless_stopped(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return PushOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back before the next check")
-    return PushOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+        return JobOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back before the next check")
+    return JobOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
 
 
 def _told(error: BaseException) -> str:

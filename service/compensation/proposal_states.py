@@ -26,14 +26,14 @@ class ProposalStatus:
     text: str
 
 
-def standing(store: Store, number: int, proposed: Proposed, now_s: float) -> ProposalStatus:
+def proposal_status(store: Store, number: int, proposed: Proposed, now_s: float) -> ProposalStatus:
     """Where a stored proposal stands."""
     entries = read_entries(store, proposed.candidate.machine)
     docs = {t.id: t.doc for t in store.tables()}
-    return standing_of(number, proposed, store.approvals(number), entries, docs, now_s, store.rejections(number))
+    return status_of_proposal(number, proposed, store.approvals(number), entries, docs, now_s, store.rejections(number))
 
 
-def standing_of(
+def status_of_proposal(
     number: int,
     proposed: Proposed,
     approvals: list[ApprovalRecord],
@@ -94,6 +94,6 @@ def check_waiting(store: Store, number: int, proposed: Proposed, now_s: float) -
     TableRefused
         Where it stands instead.
     """
-    now = standing(store, number, proposed, now_s)
+    now = proposal_status(store, number, proposed, now_s)
     if now.word not in ("proposed", "approved", "refused"):  # what speaks against a refused one is told by `approve`
         raise TableRefused(f"proposal {number} is {now.word}: {now.text}", "propose again")

@@ -50,7 +50,7 @@ def last_proof(store: Store, site: Site) -> Doc | None:
     return dict(last[0].doc) if last else None
 
 
-async def standing(controller: Controller, store: Store, site: Site) -> LevelStatus:
+async def level_status(controller: Controller, store: Store, site: Site) -> LevelStatus:
     """Find out what counts for a push into this controller, as it is now."""
     info = await controller.identify()
     doc = await asyncio.to_thread(last_proof, store, site)
@@ -74,7 +74,7 @@ async def check_level(controller: Controller, store: Store, site: Site, *, atten
     TableRefused
         This controller allows no such push.
     """
-    found = await standing(controller, store, site)
+    found = await level_status(controller, store, site)
     no = objection(found.level, attended=attended)
     if no:
         raise TableRefused(no, "nothing was written")

@@ -6,7 +6,6 @@ push is long enough ago, and the table has not walked away. The verification bef
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,17 +13,15 @@ from typing import Any
 from abbe.drivers.errors import DriverError
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.clock import Clock
-from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.correct import push
 from abbe.service.compensation.deferred_rollback import finish_when_safe
-from abbe.service.compensation.proposal_checks import hold
+from abbe.service.compensation.gate import PushContext, admit
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import standing
+from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.compensation.proposals import load_runs
-from abbe.service.compensation.proved_levels import check_level
 from abbe.service.compensation.recovered_session import recovered_session
-from abbe.service.devices.machine_lock import alone
-from abbe.service.devices.session import Session
+from abbe.service.devices.machine_lock import lock_machine
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
 from abbe.service.events import ProgressSink
 from abbe.service.sequences.check import paced
@@ -33,7 +30,7 @@ from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.records import AlarmEntryRecord
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import STOPPED, PushOutcome
+from abbe.service.tables.push_outcome import STOPPED
 from abbe.service.verification.alarm_states import NO_ALARM, AlarmKind
 
 WAIT_S = 600.0
@@ -62,15 +59,6 @@ class PushOrder:
     control: Control
 
 
-@dataclass(frozen=True, slots=True)
-class _PushContext:
-    session: Session
-    site: Site
-    store: Store
-    clock: Clock
-    rate_hz: int
-
-
 def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord], now_s: float) -> Approved | None:
     """The proposal that was approved last, if the service has not tried it yet with this approval; None: nothing waits.
 
@@ -83,7 +71,7 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
         return None
     approval, number = max(given)
     try:
-        word = standing(store, number, load(store, number), now_s).word
+        word = proposal_status(store, number, load(store, number), now_s).word
     except StoreError:  # a row that was changed: it is told where it is looked at, and never pushed
         return None
     if word == "approved" and approval not in tried:
@@ -91,7 +79,7 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
     return None
 
 
-async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Clock, rate_hz: int = 100) -> PushOutcome:
+async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Clock, rate_hz: int = 100) -> JobOutcome:
     """Verify with the table in force, push, prove, verify again; keep or go back. A refusal is an outcome, not an error.
 
     What is returned is what was heard; which table is in force says the journal (`push_outcome.by_journal`).
@@ -101,67 +89,57 @@ async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Cl
     MachineInUse
         Another process has the machine: nothing was begun, and the try does not count.
     """
-    with alone(site.urls.cnc):
+    with lock_machine(site.urls.cnc):
         try:
             async with recovered_session(store, site) as session:
                 await order.begun()
-                return await _heard(_PushContext(session, site, store, clock, rate_hz), order)
+                context = PushContext(session, store, site, order.progress, clock, rate_hz, attended=False, control=order.control)
+                return await _heard(context, order)
         except MachineInUse:
             raise
         except (AbbeError, DriverError, OSError) as error:  # the devices, before anything of it was begun
             await order.begun()
-            return PushOutcome("failed", _told(error))
+            return JobOutcome("failed", _told(error))
 
 
-async def _heard(bench: _PushContext, order: PushOrder) -> PushOutcome:
+async def _heard(context: PushContext, order: PushOrder) -> JobOutcome:
     try:
-        return await _pushed(bench, order)
+        return await _pushed(context, order)
     except TakenBack as back:
-        return PushOutcome("rolled back", _told(back))
+        return JobOutcome("rolled back", _told(back))
     except TableRefused as no:
-        return PushOutcome("refused", _told(no))
+        return JobOutcome("refused", _told(no))
     except StillActive as open_:
-        return await _back(bench, order, open_)
+        return await _back(context, order, open_)
     except (AbbeError, DriverError, OSError) as error:
-        return PushOutcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _told(error))
+        return JobOutcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _told(error))
 
 
-async def _pushed(bench: _PushContext, order: PushOrder) -> PushOutcome:
-    session, store, site, control = bench.session, bench.store, bench.site, order.control
-    control.now(State.RUNNING)
-    await check_commissioned(session.controller, store, site)
-    await check_level(session.controller, store, site, attended=False)
-    proposed = await asyncio.to_thread(load, store, order.proposal)
-    against = (await hold(session.controller, store, site, order.proposal, proposed, bench.clock, attended=False)).reasons()
-    if against:
-        raise TableRefused("; ".join(against), "nothing was written")
-    before = await _before(bench, order)
-    done = await push(
-        session, store, site, order.proposal, before,
-        rate_hz=bench.rate_hz, progress=order.progress, clock=bench.clock, attended=False, control=control,
-    )  # fmt: skip
-    return PushOutcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
+async def _pushed(context: PushContext, order: PushOrder) -> JobOutcome:
+    context.control.now(State.RUNNING)
+    await admit(context, order.proposal)  # before anything is measured for it
+    done = await push(context, order.proposal, await _before(context, order))
+    return JobOutcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
 
 
-async def _before(bench: _PushContext, order: PushOrder) -> list[dict[str, Any]]:
-    site = bench.site
-    name = f"verify-before proposal {order.proposal} {bench.clock.utc():%Y-%m-%d %H:%M:%S}"
-    plan = paced(verification(site.machine, rate_hz=bench.rate_hz, name=name), site.max_feed_mm_min)
+async def _before(context: PushContext, order: PushOrder) -> list[dict[str, Any]]:
+    site = context.site
+    name = f"verify-before proposal {order.proposal} {context.clock.utc():%Y-%m-%d %H:%M:%S}"
+    plan = paced(verification(site.machine, rate_hz=context.rate_hz, name=name), site.max_feed_mm_min)
     manner = Manner(control=order.control, part=True)
-    return await load_runs(
-        bench.store, await measure(bench.session, bench.store, site, plan, progress=order.progress, clock=bench.clock, manner=manner)
-    )
+    ids = await measure(context.session, context.store, site, plan, progress=order.progress, clock=context.clock, manner=manner)
+    return await load_runs(context.store, ids)
 
 
-async def _back(bench: _PushContext, order: PushOrder, error: StillActive) -> PushOutcome:
+async def _back(context: PushContext, order: PushOrder, error: StillActive) -> JobOutcome:
     """Watch the machine until the old table is back. A stop does not end that; after an abort the service goes back to it."""
     said: list[str] = []
-    finish = finish_when_safe(bench.session.controller, bench.store, bench.site, limit_s=WAIT_S, clock=bench.clock, say=said.append)
+    finish = finish_when_safe(context.session.controller, context.store, context.site, limit_s=WAIT_S, clock=context.clock, say=said.append)
     try:
         done = await order.control.unless_aborted(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return PushOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back as soon as it can be")
-    return PushOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+        return JobOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back as soon as it can be")
+    return JobOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
 
 
 def _told(error: BaseException) -> str:

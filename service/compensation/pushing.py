@@ -18,7 +18,7 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.proved_levels import standing
+from abbe.service.compensation.proved_levels import level_status
 from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push import execute
 from abbe.service.push.adapter import ControllerPort, PushActors
@@ -28,7 +28,7 @@ from abbe.service.push.entries import Doc, Journal, facts
 from abbe.service.push.execute import Ended
 from abbe.service.push.operations import Approval, Verdict
 from abbe.service.push.order import OperationOrder
-from abbe.service.push.semantic_digest import meaning_of_tables
+from abbe.service.push.semantic_digest import semantic_digest_of_tables
 from abbe.service.push.states import PushState
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
@@ -174,7 +174,7 @@ class Pushing:
         if len(image) > 2 * form.bank_registers:
             raise TableRefused(f"the tables need {len(image) // 2} registers, a bank has {form.bank_registers}", "use a coarser grid")
         self.crc = crc32(image)
-        level = self.level if self.level is not None else (await standing(self.controller, self.store, self.site)).level
+        level = self.level if self.level is not None else (await level_status(self.controller, self.store, self.site)).level
         machine_id = await self.store.write(self.store.add_machine, self.site.name, self.site.doc)
         table_id = await self.store.write(self.store.add_table, machine_id, wanted.solution_id, image, crc32(image), wanted.doc)
         return OperationOrder(
@@ -346,7 +346,7 @@ def _image(wanted: WantedTable | WantedAgain) -> tuple[bytes, str]:
     if isinstance(wanted, WantedAgain):
         return wanted.image, wanted.meaning
     number = secrets.randbits(31) if wanted.image_id is None else wanted.image_id
-    return encode(table_image(wanted.tables, wanted.lsb_nm, number)), meaning_of_tables(wanted.tables)
+    return encode(table_image(wanted.tables, wanted.lsb_nm, number)), semantic_digest_of_tables(wanted.tables)
 
 
 def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:

@@ -12,7 +12,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.pushing import pushes_here
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
 from abbe.service.push import execute
-from abbe.service.push.adapter import ControllerPort, nobody
+from abbe.service.push.adapter import ControllerPort, no_actors
 from abbe.service.push.book import StoreBook
 from abbe.service.push.entries import WORD, Journal, facts
 from abbe.service.push.staging import LAID_ASIDE
@@ -94,7 +94,7 @@ async def _ended(controller: Controller, store: Store, site: Site, clock: Clock)
     if before is PushState.OPERATOR:
         raise operator_needed(journal)
     _refuse_if_under_way(store, site, journal)
-    ended = await run_to_end(execute.recover(ControllerPort(controller, nobody(), clock), book))
+    ended = await run_to_end(execute.recover(ControllerPort(controller, no_actors(), clock), book))
     return _told(ended, before)
 
 
@@ -140,7 +140,7 @@ async def accept(controller: Controller, store: Store, site: Site, by: str = "a 
     if book is not None and journal[-1].state not in TERMINAL and await is_own(controller, site, journal):
         _refuse_if_under_way(store, site, journal)
         before = await controller.comp_status()
-        ended = await run_to_end(execute.recover(ControllerPort(controller, nobody(), clock), book))
+        ended = await run_to_end(execute.recover(ControllerPort(controller, no_actors(), clock), book))
         journal, now = ended.journal, await controller.comp_status()
         if ended.settled and journal[-1].state is not PushState.OPERATOR:
             changed = before.active_bank != now.active_bank

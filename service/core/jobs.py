@@ -35,15 +35,15 @@ AGAIN = "asked for before, with this key"
 ASKING = "asking"
 """State of a job that waits until a person has done something by hand."""
 
-Run = Callable[[Schedule, datetime, Control], Awaitable[tuple[str, int]]]
-"""``await run(schedule, slot, control)``: how the check ended, and the number of its verification."""
+Run = Callable[[Schedule, datetime, Control], Awaitable[SlotState]]
+"""``await run(schedule, slot, control)``: how the check ended."""
 
 
-ByHand = Callable[[datetime, Control], Awaitable[tuple[str, int | None]]]
-"""``await work(begun, control)``: what a person wants done; the same of it."""
+ByHand = Callable[[datetime, Control], Awaitable[SlotState]]
+"""``await work(begun, control)``: what a person wants done, and how it ended."""
 
 
-async def nobody(_: str) -> bool:
+async def deny(_: str) -> bool:
     """Nobody may."""
     return False
 
@@ -57,7 +57,7 @@ class FullCampaigns:
 
     names: tuple[str, ...] = ()
     of: Callable[[str, str], ByHand | None] = lambda recipe, who: None
-    may: Callable[[str], Awaitable[bool]] = nobody
+    may: Callable[[str], Awaitable[bool]] = deny
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class MachineClaim(Protocol):
 class _Job:
     seen: JobState
     control: Control = field(default_factory=Control)
-    task: asyncio.Task[str] | None = None
+    task: asyncio.Task[SlotState] | None = None
 
 
 class JobRegistry:
@@ -134,21 +134,17 @@ class JobRegistry:
 
     # ---- what runs --------------------------------------------------------------------------------------------------
 
-    async def __call__(self, schedule: Schedule, slot_utc: datetime) -> str:
+    async def __call__(self, schedule: Schedule, slot_utc: datetime) -> SlotState:
         """Run the check of a slot; return the slot's state. This is the scheduler's job."""
         job = self._new(schedule, "")
         return await self._carry_out(job, lambda: self._run(schedule, slot_utc, job.control))
 
-    async def errand(self, errand: FollowUp) -> str:
+    async def errand(self, errand: FollowUp) -> SlotState:
         """Do what no slot asks for, as a job; return how it ended."""
         job = self._new(errand.schedule, "", errand.kind)
         work = errand.work
         assert work is not None
-
-        async def run() -> tuple[str, None]:
-            return await work(job.control), None
-
-        return await self._carry_out(job, run)
+        return await self._carry_out(job, lambda: work(job.control))
 
     def _new(self, schedule: Schedule, who: str, kind: JobKind = "check") -> _Job:
         number = secrets.token_hex(6)
@@ -170,21 +166,27 @@ class JobRegistry:
             self._jobs.popitem(last=False)
         return job
 
-    async def _carry_out(self, job: _Job, run: Callable[[], Awaitable[tuple[str, int | None]]]) -> str:
-        state, number = "interrupted", None
+    async def _carry_out(self, job: _Job, run: Callable[[], Awaitable[SlotState]]) -> SlotState:
+        end = SlotState("interrupted")
         self._now = job
         self._changed()
         try:
-            state, number = await run()
+            end = await run()
         finally:
             self._now = None
-            end = state if isinstance(state, SlotState) else SlotState(state)
-            seen = replace(job.seen, state=str(end), text=end.reason[:TEXT], ended_utc=self._clock.utc(), verification=number)
-            job.seen = replace(seen, solution=end.solution, proposal=end.proposal)
+            job.seen = replace(
+                job.seen,
+                state=str(end),
+                text=end.reason[:TEXT],
+                ended_utc=self._clock.utc(),
+                verification=end.verification,
+                solution=end.solution,
+                proposal=end.proposal,
+            )
             self._changed()
-        return state
+        return end
 
-    async def _by_hand(self, job: _Job, work: ByHand, place: MachineClaim) -> str:
+    async def _by_hand(self, job: _Job, work: ByHand, place: MachineClaim) -> SlotState:
         try:
             return await self._carry_out(job, lambda: work(job.seen.begun_utc, job.control))
         finally:
@@ -224,42 +226,42 @@ class JobRegistry:
         campaign = self.full.of(asked.recipe, asked.who)
         if campaign is not None and not await self.full.may(asked.who):
             return _answer(asked.request, "forbidden", f"{asked.who} may not propose tables here, and {asked.recipe} ends with a proposal")
-        wish = JobRequest(asked.request, asked.who, asked.key, asked.recipe)
-        again = self.again(wish)
+        requested = JobRequest(asked.request, asked.who, asked.key, asked.recipe)
+        again = self.again(requested)
         if again is not None:
             return again
         schedule = Schedule(BY_HAND, "", "UTC", asked.recipe)
         if campaign is not None:
-            return self.begin(wish, schedule, campaign, "campaign")
+            return self.begin(requested, schedule, campaign, "campaign")
         if parted(asked.recipe)[0] not in self._recipes:
             there = ", ".join((*self._recipes, *self.full.names))
             return _answer(asked.request, "unknown", f"there is no recipe {asked.recipe!r} here; there are: {there}")
-        return self.begin(wish, schedule, lambda begun, control: self._run(schedule, begun, control))
+        return self.begin(requested, schedule, lambda begun, control: self._run(schedule, begun, control))
 
-    def again(self, wish: JobRequest) -> Answer | None:
+    def again(self, requested: JobRequest) -> Answer | None:
         """The answer to what was asked for with this key before; None: it was not."""
-        known = self._keys.get((wish.who, wish.key)) if wish.key else None
+        known = self._keys.get((requested.who, requested.key)) if requested.key else None
         if known is None:
             return None
-        if known[1] != wish.what:
-            return _answer(wish.request, "conflict", "this key was used for another request", known[0])
-        return _answer(wish.request, "done", AGAIN, known[0])
+        if known[1] != requested.what:
+            return _answer(requested.request, "conflict", "this key was used for another request", known[0])
+        return _answer(requested.request, "done", AGAIN, known[0])
 
-    def begin(self, wish: JobRequest, schedule: Schedule, work: ByHand, kind: JobKind = "check") -> Answer:
+    def begin(self, requested: JobRequest, schedule: Schedule, work: ByHand, kind: JobKind = "check") -> Answer:
         """Begin a job that a person wants, now, if nothing else has the machine. Whether he may is for the caller to ask."""
         if self.place is None or self._tasks is None:
-            return _answer(wish.request, "busy", "the service starts, ends, or runs its timetable once; it takes no jobs")
+            return _answer(requested.request, "busy", "the service starts, ends, or runs its timetable once; it takes no jobs")
         other = self.place.take(f"{BY_HAND}: {schedule.recipe}")
         if other:
-            return _answer(wish.request, "busy", f"the machine measures: {other}")
-        job = self._new(schedule, wish.who, kind)
-        if wish.key:
-            self._keys[wish.who, wish.key] = (job.seen.id, wish.what)
+            return _answer(requested.request, "busy", f"the machine measures: {other}")
+        job = self._new(schedule, requested.who, kind)
+        if requested.key:
+            self._keys[requested.who, requested.key] = (job.seen.id, requested.what)
             while len(self._keys) > MOST_KEYS:
                 self._keys.popitem(last=False)
         job.task = self._tasks.create_task(self._by_hand(job, work, self.place), name=f"job {job.seen.id}")
-        log.info("job started", job=job.seen.id, kind=kind, recipe=schedule.recipe, who=wish.who)
-        return _answer(wish.request, "done", "", job.seen.id)
+        log.info("job started", job=job.seen.id, kind=kind, recipe=schedule.recipe, who=requested.who)
+        return _answer(requested.request, "done", "", job.seen.id)
 
     async def steer(self, asked: SteerJob) -> Answer:
         """Stop, abort, pause or go on with the job that runs."""

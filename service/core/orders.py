@@ -1,8 +1,8 @@
-"""What a person orders of tables: that the one in force gives way to the one before, or that an approved one is pushed now. A job as a
-check is, with the machine to itself.
+"""What a person orders: a full campaign, that the table in force gives way to the one before, or that an approved one is pushed now.
+Each is a job as a check is, with the machine to itself.
 
-Rights are decided here. How it ended is the word of the push journal, whatever somebody heard; who ordered it and why stands in the audit
-before anything is written, and how it ended after it.
+Rights are decided here. Who ordered it and why stands in the audit before anything is done, and how it ended after it. How a push ended is
+the word of the push journal, whatever somebody heard.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import secrets
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from typing import Final, Literal
 
 import structlog
@@ -24,56 +23,58 @@ from abbe.service.channel.messages import Outcome as Word
 from abbe.service.clock import Clock
 from abbe.service.compensation.ordered_rollback import BackOrder
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import standing
+from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.compensation.rollback import Ordered
-from abbe.service.core.jobs import BY_HAND, JobRegistry, JobRequest
-from abbe.service.domain.job_state import JobKind
+from abbe.service.core.jobs import BY_HAND, ByHand, FullCampaigns, JobRegistry, JobRequest
+from abbe.service.core.rights import person
+from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.schedule import Schedule
-from abbe.service.errors import AbbeError, Aborted, NotStored, Stopped, TableRefused
-from abbe.service.events import Progress
-from abbe.service.scheduler import record
-from abbe.service.scheduler.job import FAILURES
+from abbe.service.errors import AbbeError, NotStored, TableRefused
+from abbe.service.events import ProgressSink
+from abbe.service.jobs.guided_campaign import is_full
+from abbe.service.scheduler.job import Job, carry_out, failure
 from abbe.service.scheduler.ports import Doc, JobWatcher, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
-from abbe.service.tables.push_outcome import STOPPED, PushOutcome, in_force, last_push, ordered, put_right
+from abbe.service.tables.push_outcome import STOPPED, in_force, last_push, ordered, put_right
 from abbe.service.tables.table_history import offered
 
 log = structlog.get_logger("abbe.orders")
 
+CAMPAIGN: Final = "campaign"
 ROLLBACK: Final = "rollback"
 PUSH: Final = "push"
-LAST_WORDS_S = 1.0
-"""A service that ends has five seconds for everything."""
 NO_PAUSE = "a table is being changed: stop it, or let it end"
 
-BringBack = Callable[[BackOrder], Awaitable[PushOutcome]]
+OrderedRollback = Callable[[BackOrder], Awaitable[JobOutcome]]
 """``await bring_back(order)``: does it, and says what was heard of it."""
-Push = Callable[[PushOrder], Awaitable[PushOutcome]]
+Push = Callable[[PushOrder], Awaitable[JobOutcome]]
 """``await push(order)``: pushes what is approved, and says what was heard of it."""
 BY_ITSELF = "this service pushes what is approved by itself ([alarm] push), or has no controller"
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignOrder:
+    """What is wanted: the recipe, who proposes, who hears how far it is, and who may pause and stop it."""
+
+    recipe: str
+    by: str
+    progress: ProgressSink
+    control: Control
+
+
+MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
+"""``await measure(order)``: measures, solves, proposes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hands:
     """What can be ordered: a rollback, a push of what is approved. None: that is not ordered here."""
 
-    bring_back: BringBack | None = None
+    ordered_rollback: OrderedRollback | None = None
     push: Push | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _OrderTask:
-    """An order on its way: what it is, who gave it, of what, and what of it is recorded; what is done, and what the journal says of it."""
-
-    kind: JobKind
-    who: str
-    target: str
-    doc: Doc
-    do: Callable[[Control], Awaitable[PushOutcome]]
-    look: Callable[[], PushOutcome | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +90,105 @@ class Ground:
     control: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """An order: what it is, who gave it, of what, what of it is recorded, and what is done."""
+
+    kind: JobKind
+    who: str
+    target: str
+    doc: Doc
+    do: Callable[[ProgressSink, Control], Awaitable[JobOutcome]]
+
+
+class _OrderJob(Job[JobOutcome]):
+    """An order on its way, with its records in the audit."""
+
+    def __init__(self, order: _Order, audit: AuditBook) -> None:
+        self._order, self._audit, self.name = order, audit, order.kind
+
+    async def begin(self) -> None:
+        await self.record("begun", "")
+
+    async def do(self, progress: ProgressSink, control: Control) -> JobOutcome:
+        control.now(State.RUNNING)
+        control.hurry = NO_PAUSE if self.name == ROLLBACK else ""  # a push measures first, and that can be held
+        return await self._order.do(progress, control)
+
+    async def failed(self, error: Exception) -> JobOutcome:
+        return failure(error)
+
+    async def end(self, outcome: JobOutcome) -> SlotState:
+        log.warning("an order has ended", kind=self.name, who=self._order.who, word=outcome.word, text=outcome.text)
+        try:
+            await self.record(outcome.word, outcome.text)
+        except AbbeError as error:  # what was done is in the store; a service that ends here would do nothing more
+            log.error("not in the audit", cause=error.detail)
+        return SlotState.of(outcome)
+
+    async def last_words(self) -> None:
+        await self.record(STOPPED, "stopped with the service; what is complete stays")
+
+    async def record(self, outcome: str, text: str) -> None:
+        """Write a line of the audit."""
+        order = self._order
+        event = Event(order.who, order.kind, order.target, outcome, order.doc | ({"text": text} if text else {}))
+        await asyncio.to_thread(self._audit.write, event)
+
+
+class _TableOrderJob(_OrderJob, RetryingStore):
+    """An order of a table: its end is what the push journal says. ``look``: how its push stands; None: nothing was written."""
+
+    def __init__(self, order: _Order, audit: AuditBook, store: ServiceStore, clock: Clock, look: Callable[[], JobOutcome | None]) -> None:
+        _OrderJob.__init__(self, order, audit)
+        RetryingStore.__init__(self, store, clock)
+        self._look = look
+
+    async def end(self, outcome: JobOutcome) -> SlotState:
+        return await super().end(put_right(await self._read(self._look), outcome))
+
+    async def last_words(self) -> None:
+        """Say by the journal where it stands; what is open the next start takes back."""
+        done = await asyncio.to_thread(self._look) or JobOutcome("failed", "the service ended before anything was written")
+        log.warning("an order was stopped with the service", kind=self.name, word=done.word, text=done.text)
+        await self.record(done.word, f"{done.text} (stopped with the service)")
+
+
+def full_campaigns(
+    ground: Ground, names: tuple[str, ...], measure: MeasureCampaign, may: Callable[[str], Awaitable[bool]]
+) -> FullCampaigns:
+    """What the registry of jobs needs to start full campaigns.
+
+    Parameters
+    ----------
+    ground : Ground
+        Where; its ``may`` is not asked.
+    names : tuple of str
+        What can be started.
+    measure : callable
+        Does it.
+    may : callable
+        ``await may(who)``: whether somebody may propose tables.
+    """
+
+    def of(recipe: str, who: str) -> ByHand | None:
+        if not is_full(recipe, names):
+            return None
+
+        async def do(progress: ProgressSink, control: Control) -> JobOutcome:
+            return await measure(CampaignOrder(recipe, person(who), progress, control))
+
+        async def work(begun: datetime, control: Control) -> SlotState:
+            job = _OrderJob(_Order(CAMPAIGN, who, f"{ground.machine}, {recipe}", {}, do), ground.audit)
+            return await carry_out(job, Schedule(BY_HAND, "", "UTC", recipe), begun, control, ground.watchers)
+
+        return work
+
+    return FullCampaigns(names, of, may)
+
+
 class Orders(RetryingStore):
-    """Takes orders and carries them out as jobs of the book.
+    """Takes orders of tables and carries them out as jobs.
 
     Parameters
     ----------
@@ -112,8 +210,10 @@ class Orders(RetryingStore):
 
     async def rollback(self, asked: RollBack) -> Answer:
         """Begin to take the table in force back, once for each key; not if another is in force than was seen, or none was before it."""
-        wish = JobRequest(asked.request, asked.who, asked.key, f"{ROLLBACK} of push {asked.push}, {asked.crc:08X}: {asked.reason}")
-        refused = await self._refused(wish, "order a table back", self._hands.bring_back is None and "this service has no controller")
+        requested = JobRequest(asked.request, asked.who, asked.key, f"{ROLLBACK} of push {asked.push}, {asked.crc:08X}: {asked.reason}")
+        refused = await self._refused(
+            requested, "order a table back", self._hands.ordered_rollback is None and "this service has no controller"
+        )
         if refused is not None:
             return refused
         try:
@@ -123,23 +223,23 @@ class Orders(RetryingStore):
         if (now.push, now.crc) != (asked.push, asked.crc):
             what = f"meanwhile another table is in force: {now.crc:08X} of push {now.push}; look at it first"
             return _answer(asked.request, "conflict", what)
-        return self._begun(wish, f"{ROLLBACK} of push {asked.push}", self._back(asked))
+        return self._begun(requested, f"{ROLLBACK} of push {asked.push}", self._back(asked), ROLLBACK)
 
-    def _back(self, asked: RollBack) -> _OrderTask:
-        number, bring_back = secrets.token_hex(6), self._hands.bring_back
-        assert bring_back is not None
+    def _back(self, asked: RollBack) -> _TableOrderJob:
+        number, ordered_rollback = secrets.token_hex(6), self._hands.ordered_rollback
+        assert ordered_rollback is not None
 
-        async def do(control: Control) -> PushOutcome:
-            return await bring_back(BackOrder(asked.push, asked.crc, Ordered(asked.who, asked.reason, number, control)))
+        async def do(progress: ProgressSink, control: Control) -> JobOutcome:
+            return await ordered_rollback(BackOrder(asked.push, asked.crc, Ordered(asked.who, asked.reason, number, control)))
 
         doc = {"reason": asked.reason, "order": number, "push": asked.push, "crc": f"{asked.crc:08X}"}
         target = f"{self._ground.machine}, table of push {asked.push} ({asked.crc:08X})"
-        return _OrderTask(ROLLBACK, asked.who, target, doc, do, lambda: ordered(self._store, self._ground.machine, number))
+        return self._job(_Order(ROLLBACK, asked.who, target, doc, do), lambda: ordered(self._store, self._ground.machine, number))
 
     async def push(self, asked: PushNow) -> Answer:
         """Begin to push a proposal whose approval holds, once for each key; its verification before is measured first."""
-        wish = JobRequest(asked.request, asked.who, asked.key, f"{PUSH} of proposal {asked.proposal}")
-        refused = await self._refused(wish, "order a push", self._hands.push is None and BY_ITSELF)
+        requested = JobRequest(asked.request, asked.who, asked.key, f"{PUSH} of proposal {asked.proposal}")
+        refused = await self._refused(requested, "order a push", self._hands.push is None and BY_ITSELF)
         if refused is not None:
             return refused
         try:
@@ -148,101 +248,51 @@ class Orders(RetryingStore):
             return _answer(asked.request, "unknown", error.detail)
         if against:
             return _answer(asked.request, "conflict", against)
-        return self._begun(wish, f"{PUSH} of proposal {asked.proposal}", self._approved(asked, after))
+        return self._begun(requested, f"{PUSH} of proposal {asked.proposal}", self._approved(asked, after), PUSH)
 
     def _not_approved(self, proposal: int) -> tuple[str, int]:
         """Why a proposal cannot be pushed as it stands, and the number of the last push."""
         machine, found = self._ground.machine, load(self._store, proposal)
-        now = standing(self._store, proposal, found, self._clock.utc().timestamp())
+        now = proposal_status(self._store, proposal, found, self._clock.utc().timestamp())
         after = last_push(self._store, machine)
         if found.candidate.machine != machine:
             return f"proposal {proposal} is for {found.candidate.machine}, not for {machine}", after
         return "" if now.word == "approved" else f"proposal {proposal} is {now.word}: {now.text}", after
 
-    def _approved(self, asked: PushNow, after: int) -> _OrderTask:
+    def _approved(self, asked: PushNow, after: int) -> _TableOrderJob:
         push, machine = self._hands.push, self._ground.machine
         assert push is not None
 
         async def begun() -> None:
             """The audit has it already."""
 
-        async def do(control: Control) -> PushOutcome:
-            return await push(PushOrder(asked.proposal, begun, self._progress, control))
+        async def do(progress: ProgressSink, control: Control) -> JobOutcome:
+            return await push(PushOrder(asked.proposal, begun, progress, control))
 
         doc = {"proposal": asked.proposal, "after": after}
         target = f"{machine}, proposal {asked.proposal}"
-        return _OrderTask(PUSH, asked.who, target, doc, do, lambda: in_force(self._store, machine, asked.proposal, after))
+        return self._job(_Order(PUSH, asked.who, target, doc, do), lambda: in_force(self._store, machine, asked.proposal, after))
 
-    async def _refused(self, wish: JobRequest, words: str, missing: str | Literal[False]) -> Answer | None:
+    async def _refused(self, requested: JobRequest, words: str, missing: str | Literal[False]) -> Answer | None:
         """The answer to who may not, to what was asked for before, and while something runs; None: go on."""
-        if not await self._ground.may(wish.who):
-            return _answer(wish.request, "forbidden", f"{wish.who} may not {words} here")
-        again = self._book.again(wish)
+        if not await self._ground.may(requested.who):
+            return _answer(requested.request, "forbidden", f"{requested.who} may not {words} here")
+        again = self._book.again(requested)
         if again is not None:
             return again
         if missing:
-            return _answer(wish.request, "conflict", missing)
+            return _answer(requested.request, "conflict", missing)
         running = self._book.running
         if running is not None:  # before the journal is asked: what pushes now would look like what was left open
-            return _answer(wish.request, "busy", f"the machine measures: {running.schedule or running.recipe}")
+            return _answer(requested.request, "busy", f"the machine measures: {running.schedule or running.recipe}")
         return None
 
-    def _begun(self, wish: JobRequest, name: str, task: _OrderTask) -> Answer:
+    def _job(self, order: _Order, look: Callable[[], JobOutcome | None]) -> _TableOrderJob:
+        return _TableOrderJob(order, self._ground.audit, self._store, self._clock, look)
+
+    def _begun(self, requested: JobRequest, name: str, job: _TableOrderJob, kind: JobKind) -> Answer:
         terms = Schedule(BY_HAND, "", "UTC", name)
-        return self._book.begin(wish, terms, partial(self._carried_out, task, terms), task.kind)
-
-    async def _carried_out(self, task: _OrderTask, terms: Schedule, begun: datetime, control: Control) -> tuple[str, int | None]:
-        self._begin(task, terms, begun, control)
-        try:
-            await self._record(task, "begun", "")
-            said = await control.unless_aborted(_heard(task, control))
-        except asyncio.CancelledError:
-            await self._stopped_with_the_service(task)
-            raise
-        except FAILURES as error:
-            ended = isinstance(error, Stopped | Aborted)
-            said = PushOutcome(
-                STOPPED if ended else "failed", "; ".join([record.cause_of(error)["what"], *getattr(error, "__notes__", [])])
-            )
-        finally:
-            control.now(State.ENDED)
-            for watcher in self._ground.watchers:
-                watcher.job_ended(None)
-        done = put_right(await self._read(task.look), said)
-        log.warning("an order of a table has ended", kind=task.kind, who=task.who, word=done.word, text=done.text)
-        try:
-            await self._record(task, done.word, done.text)
-        except AbbeError as error:  # what was done is in the journal; a service that ends here would do nothing more
-            log.error("not in the audit", cause=error.detail)
-        return SlotState(f"done: {done.word}", done.text), None
-
-    def _begin(self, task: _OrderTask, terms: Schedule, begun: datetime, control: Control) -> None:
-        control.now(State.RUNNING)
-        control.hurry = NO_PAUSE if task.kind == ROLLBACK else ""  # a push measures first, and that can be held
-        for watcher in self._ground.watchers:
-            watcher.job_started(terms, begun)
-
-    def _progress(self, progress: Progress) -> None:
-        for watcher in self._ground.watchers:
-            watcher.job_progress(progress)
-
-    async def _record(self, task: _OrderTask, outcome: str, text: str) -> None:
-        event = Event(task.who, task.kind, task.target, outcome, task.doc | ({"text": text} if text else {}))
-        await asyncio.to_thread(self._ground.audit.write, event)
-
-    async def _stopped_with_the_service(self, task: _OrderTask) -> None:
-        """Say by the journal where it stands, now, if the database takes it at once; what is open the next start takes back."""
-        try:
-            async with asyncio.timeout(LAST_WORDS_S):
-                done = await asyncio.to_thread(task.look) or PushOutcome("failed", "the service ended before anything was written")
-                log.warning("an order was stopped with the service", kind=task.kind, word=done.word, text=done.text)
-                await self._record(task, done.word, f"{done.text} (stopped with the service)")
-        except (AbbeError, TimeoutError) as trouble:
-            log.warning("an order was stopped with the service; the push journal says where it stands", cause=str(trouble))
-
-
-async def _heard(task: _OrderTask, control: Control) -> PushOutcome:
-    return await task.do(control)
+        return self._book.begin(requested, terms, lambda begun, control: carry_out(job, terms, begun, control, self._ground.watchers), kind)
 
 
 def _answer(request: int, outcome: Word, text: str) -> Answer:

@@ -32,7 +32,7 @@ IsOpen = Callable[[], Awaitable[bool]]
 """Whether the last push of the machine is open by its journal: also one that is under way now, or that a person has to look at."""
 
 
-class OpenEnds:
+class PushRecovery:
     """Tries until nothing is open, and begins again when something is.
 
     Parameters

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from abbe.service.capture.live import LiveFeed
-from abbe.service.channel.messages import PAGE_MEMORY_MB, MachineTold
+from abbe.service.channel.messages import PAGE_MEMORY_MB, MachineSummary
 from abbe.service.clock import Clock
-from abbe.service.core.campaigns import MeasureCampaign
-from abbe.service.core.orders import Hands
+from abbe.service.core.orders import Hands, MeasureCampaign
 from abbe.service.core.push_recovery import Recover
 from abbe.service.devices.urls import control_of
 from abbe.service.domain.schedule import Schedule
@@ -109,12 +108,12 @@ class ServiceSetup:
     duties: Callable[[ServiceStore], Duties] | None = None
     table: Callable[[ServiceStore], LookAtTable] | None = None
     live: LiveFeed | None = None
-    told: MachineTold | None = None
+    told: MachineSummary | None = None
     hands: Callable[[ServiceStore], Hands] | None = None
     page_memory_mb: int = PAGE_MEMORY_MB
     campaigns: tuple[str, ...] = ()
     campaign: Callable[[ServiceStore], MeasureCampaign] | None = None
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """What the machine file says that is possible and rarely meant: logged once the service serves."""
 
     @property

@@ -9,7 +9,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from abbe.service.channel.messages import Moment
+from abbe.service.channel.messages import Snapshot
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.domain.bounds import TEXT, WORD
@@ -41,12 +41,12 @@ class SnapshotSource:
         self._due: tuple[DueSlot, ...] = ()
         self._looked: datetime | None = None
 
-    def now(self, web_restarts: int) -> Moment:
+    def now(self, web_restarts: int) -> Snapshot:
         """How things stand."""
         board = self._board
         devices = tuple(replace(d, role=d.role[:WORD], url=d.url[:TEXT], text=d.text[:TEXT]) for d in board.devices)
         attention = tuple(text[:TEXT] for text in board.attention)
-        return Moment(
+        return Snapshot(
             "moment",
             board.changes,
             self._check(),

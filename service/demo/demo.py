@@ -17,8 +17,9 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import commission
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.correct import Correction, correct
+from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
-from abbe.service.demo.simulator_process import running_world, sealed_truth
+from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.push.limits import PushLimits
@@ -99,7 +100,7 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
     start = clock.monotonic_s()
     world_args = ["--seed", str(seed)]
     args = [*world_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]
-    async with running_world(args) as world:
+    async with running_simulators(args) as world:
         site = demo_site(world.ready)
         write_machine_file(site, folder)
         result = DemoResult(seed, speed, site, folder, clock.utc().isoformat(timespec="seconds"))
@@ -124,5 +125,5 @@ async def _job(session: Session, store: Store, result: DemoResult, progress: Pro
     before = await load_runs(store, before_ids)
     await commission_levels(session.controller, store, site)
     await commission(session, store, site, progress=progress)
-    result.correction = await correct(session, store, site, "identify", before, rate_hz=rate, progress=progress)
+    result.correction = await correct(PushContext(session, store, site, progress, rate_hz=rate), "identify", before)
     (result.folder / "active_bank.bin").write_bytes(result.correction.image)

@@ -17,9 +17,10 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import commission
 from abbe.service.compensation.correct import Correction, correct
+from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
-from abbe.service.demo.simulator_process import running_world, sealed_truth
+from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
 from abbe.service.discovery.discovery_engine import search
@@ -80,7 +81,7 @@ async def run_hidden_demo(
     """
     clock = clock or SystemClock()
     start = clock.monotonic_s()
-    async with running_world([*world_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
+    async with running_simulators([*world_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
         site = demo_site(world.ready)
         write_machine_file(site, folder)
         result = HiddenDemo(world_args, site, folder, clock.utc().isoformat(timespec="seconds"))
@@ -119,7 +120,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
     try:
         await commission(session, store, site, progress=progress)
         before = [run for run in await load_runs(store, ids) if run["run_id"] != BACK]  # the verification, as tables are judged
-        result.correction = await correct(session, store, site, CAMPAIGN, before, rate_hz=rate, progress=progress)
+        result.correction = await correct(PushContext(session, store, site, progress, rate_hz=rate), CAMPAIGN, before)
     except (TableRefused, NotObservable) as error:
         result.refused = str(error)
 

@@ -25,7 +25,7 @@ from abbe.service.compensation.commission import commission
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
-from abbe.service.demo.simulator_process import SimulatorProcess, running_world
+from abbe.service.demo.simulator_process import SimulatorProcess, running_simulators
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import AbbeError, StoreError
 from abbe.service.events import ignore_progress
@@ -71,7 +71,7 @@ async def run_served_demo(seed: int, speed: float, folder: Path, port: int, say:
     AbbeError, DriverError
         One cause, one remedy. Service and simulators are gone in any case.
     """
-    async with running_world(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
+    async with running_simulators(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
         site = demo_site(world.ready)
         machine_file = write_machine_file(site, folder)
         with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:

@@ -22,7 +22,7 @@ READY_S = 30.0
 STOP_S = 3.0
 
 
-class WorldError(AbbeError):
+class SimulatorError(AbbeError):
     """The simulator process could not be started or answered nonsense."""
 
     code = "SIM-001"
@@ -37,7 +37,7 @@ class SimulatorProcess:
 
 
 @asynccontextmanager
-async def running_world(args: list[str]) -> AsyncIterator[SimulatorProcess]:
+async def running_simulators(args: list[str]) -> AsyncIterator[SimulatorProcess]:
     """Start the simulators with these arguments; end them with the block, whatever ends it.
 
     The child also ends by itself when its standard input closes, so that not even SIGKILL of this process leaves one behind.
@@ -67,12 +67,12 @@ async def _ready(process: asyncio.subprocess.Process) -> dict[str, Any]:
         async with asyncio.timeout(READY_S):
             line = await process.stdout.readline()
     except TimeoutError:
-        raise WorldError(f"the simulators were not ready within {READY_S:g} s", "is the machine overloaded?") from None
+        raise SimulatorError(f"the simulators were not ready within {READY_S:g} s", "is the machine overloaded?") from None
     try:
         ready: dict[str, Any] = json.loads(line)
     except ValueError:
         said = (await process.stderr.read(2000)).decode(errors="replace").strip().splitlines()
-        raise WorldError(f"the simulators did not start: {said[-1] if said else 'no reason given'}", "check the scenario") from None
+        raise SimulatorError(f"the simulators did not start: {said[-1] if said else 'no reason given'}", "check the scenario") from None
     return ready
 
 
@@ -114,6 +114,6 @@ async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
             process.kill()
             await run_to_end(process.wait())
     if process.returncode != 0:
-        raise WorldError(f"the simulators' truth command failed: {err.decode(errors='replace').strip()}")
+        raise SimulatorError(f"the simulators' truth command failed: {err.decode(errors='replace').strip()}")
     truth: dict[str, Any] = json.loads(out)
     return truth

@@ -32,7 +32,7 @@ TRIES = 100
 
 
 @contextmanager
-def alone(url: str | None) -> Iterator[None]:
+def lock_machine(url: str | None) -> Iterator[None]:
     """Hold the machine behind a controller's URL for this process. It is given back when the process ends, however it ends.
 
     Processes of all accounts on one computer are kept apart, if they name the machine by the same URL; other computers are not.

@@ -36,3 +36,19 @@ class JobState:
     ask: Word = ""
     solution: Number | None = None
     proposal: Number | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class JobOutcome:
+    """How work ended, the sentence to it, and what it has left in the store.
+
+    ``word`` of a push or rollback: ``kept``: the new table is in force, and was verified; ``rolled back``: it was, and the old one
+    is again; ``refused``, ``failed``, ``stopped`` (by a person): the new one never was in force; ``open``: it may be in force, and
+    nothing has verified it. Of a campaign: ``proposed``, ``ended`` (there is no proposal that could be approved), ``failed``,
+    ``stopped``. ``waits``: another process has the machine, and nothing was begun.
+    """
+
+    word: str
+    text: str
+    solution: int | None = None
+    proposal: int | None = None

@@ -6,7 +6,7 @@ import asyncio
 
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.compensation.recovered_session import recovered_session
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.site import Site
@@ -29,7 +29,7 @@ async def recover_at_start(store: Store, site: Site) -> str | None:
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
     told = [run.text for run in runs]
     if await push_is_open(store, site.name, site.control):
-        with alone(site.urls.cnc):
+        with lock_machine(site.urls.cnc):
             async with recovered_session(store, site, DeviceUrls(cnc=site.urls.cnc), told=told.append):
                 pass
     return "; ".join(told) or None

@@ -15,7 +15,7 @@ from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.config_schema import MachineFile
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.events import ProgressSink
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control
@@ -71,7 +71,7 @@ async def run_check(
     plan = recipe_plan(recipe, site.machine)
     # With the machine: services that share a database check at the same second, and a campaign's name is there once.
     plan = CampaignPlan(f"{plan.name} {config.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
-    with alone(site.urls.cnc):
+    with lock_machine(site.urls.cnc):
         async with recovered_session(store, site) as session:
             run_ids = await measure(session, store, site, plan, progress=progress, clock=clock, manner=Manner(control=control, live=live))
     runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])

@@ -6,7 +6,7 @@ Never approves, and writes no table but what an interrupted push left to be take
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ from abbe.models.machine import Machine
 from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, USUAL_HZ, parted
 from abbe.service.campaigns.measure import Manner, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates
-from abbe.service.compensation.correct import check_promise
+from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
 from abbe.service.compensation.recovered_session import recovered_session
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import Session
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.jobs.investigate import NO, InvestigationContext, made_of, promise_words
 from abbe.service.sequences.check import paced
@@ -31,16 +32,6 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.tables.base_table import read_base
 
 SOLVING = "all is measured, and nothing moves while it is solved"
-
-
-@dataclass(frozen=True, slots=True)
-class CampaignOutcome:
-    """How it ended: "proposed", or "ended" where there is no proposal that could be approved; why; and what is in the store of it."""
-
-    word: str
-    text: str
-    solution: int | None = None
-    proposal: int | None = None
 
 
 def is_full(recipe: str, names: tuple[str, ...]) -> bool:
@@ -69,7 +60,7 @@ def _source(recipe: str, rate_hz: int, text: str | None = None) -> dict[str, Any
     return {"recipe": recipe, "helix": "", "rate_hz": rate_hz, "text": text}
 
 
-async def led_campaign(bench: InvestigationContext, source: dict[str, Any], by: str) -> CampaignOutcome:
+async def run_guided_campaign(context: InvestigationContext, source: dict[str, Any], by: str) -> JobOutcome:
     """Measure the bench's plan under its name, solve it and propose; whoever mounts at a console is asked by ``bench.control.prompts``.
 
     Parameters
@@ -88,38 +79,38 @@ async def led_campaign(bench: InvestigationContext, source: dict[str, Any], by: 
     AbbeError, DriverError, OSError, ArithmeticError, ValueError
         A device or the measurement failed; the same.
     """
-    name = bench.plan.name
-    bench.control.now(State.RUNNING)
-    await bench.control.gate()
+    name = context.plan.name
+    context.control.now(State.RUNNING)
+    await context.control.gate()
     try:
-        check_certificates(bench.site)
-        _check_not_ended(bench)
+        check_certificates(context.site)
+        _check_not_ended(context)
     except NO as no:
-        return CampaignOutcome("ended", f"no proposal: {no}")
-    await _measured(bench, source)
+        return JobOutcome("ended", f"no proposal: {no}")
+    await _measured(context, source)
     try:
-        return await _proposed(bench, by)
+        return await _proposed(context, by)
     except NO as no:
-        return CampaignOutcome("ended", f"no proposal: {no}; campaign {name!r} stays, and `abbe solve` shows what it says")
+        return JobOutcome("ended", f"no proposal: {no}; campaign {name!r} stays, and `abbe solve` shows what it says")
     except BaseException as error:
         error.add_note(f"campaign {name!r} is measured: `abbe comp propose MACHINE.toml {name!r}` solves it and proposes")
         raise
 
 
-async def _measured(bench: InvestigationContext, source: dict[str, Any]) -> None:
-    site, store, name = bench.site, bench.store, bench.plan.name
-    plan = paced(bench.plan, site.max_feed_mm_min)
-    whoever = _Whoever(bench.control)
-    manner = Manner(control=bench.control, source=source, part=True, live=bench.live)
-    with alone(site.urls.cnc):
-        async with recovered_session(store, site, ask=whoever.ask) as session:
-            whoever.session = session
+async def _measured(context: InvestigationContext, source: dict[str, Any]) -> None:
+    site, store, name = context.site, context.store, context.plan.name
+    plan = paced(context.plan, site.max_feed_mm_min)
+    prompted = _PromptedPerson(context.control)
+    manner = Manner(control=context.control, source=source, part=True, live=context.live)
+    with lock_machine(site.urls.cnc):
+        async with recovered_session(store, site, ask=prompted.ask) as session:
+            prompted.session = session
             await check_devices(session, plan, air=site.watching.air_c is not None)
-            await bench.control.gate()
+            await context.control.gate()
             await _check_table_acts(session)
             begun = await start_campaign(session, store, site, name)
             try:
-                await measure(session, store, site, plan, progress=bench.progress, clock=bench.clock, campaign=begun, manner=manner)
+                await measure(session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, manner=manner)
             except BaseException as error:
                 error.add_note(
                     f"what is complete of campaign {name!r} stays: `abbe measure MACHINE.toml --resume {name!r}` goes on, then "
@@ -128,24 +119,24 @@ async def _measured(bench: InvestigationContext, source: dict[str, Any]) -> None
                 raise
 
 
-async def _proposed(bench: InvestigationContext, by: str) -> CampaignOutcome:
-    await bench.control.gate()
-    bench.control.hurry = SOLVING
+async def _proposed(context: InvestigationContext, by: str) -> JobOutcome:
+    await context.control.gate()
+    context.control.hurry = SOLVING
 
     def agree(promised: Predicted) -> None:
-        bench.control.check()
-        check_promise(promised)
+        context.control.check()
+        check_promise(promised, context.site.limits)
 
-    made = await made_of(bench, bench.plan.name, agree, by)
+    made = await made_of(context, context.plan.name, agree, by)
     solution, against = made.proposed.solution_id, made.proposed.reasons
     if against:
-        return CampaignOutcome("ended", f"proposal {made.number} cannot be approved: {'; '.join(against)}", solution, made.number)
-    return CampaignOutcome("proposed", await asyncio.to_thread(promise_words, bench.store, made), solution, made.number)
+        return JobOutcome("ended", f"proposal {made.number} cannot be approved: {'; '.join(against)}", solution, made.number)
+    return JobOutcome("proposed", await asyncio.to_thread(promise_words, context.store, made), solution, made.number)
 
 
-def _check_not_ended(bench: InvestigationContext) -> None:
+def _check_not_ended(context: InvestigationContext) -> None:
     """No hour is measured for a table that no certificate carries any more."""
-    ended = certificates(bench.site, bench.clock.utc().date(), needed_by(bench.plan).first)
+    ended = certificates(context.site, context.clock.utc().date(), needed_by(context.plan).first)
     if ended:
         raise TableRefused("; ".join(ended), "have it calibrated, then start again; nothing was measured")
 
@@ -159,7 +150,7 @@ async def _check_table_acts(session: Session) -> None:
         raise TableMismatch(why, "switch it on at the control and start again; nothing was measured")
 
 
-class _Whoever:
+class _PromptedPerson:
     """Passes on what the fixture at the console asks, with the place where the spindle stands; a stop ends the wait."""
 
     def __init__(self, control: Control) -> None:
@@ -173,6 +164,6 @@ class _Whoever:
         await self._control.unless_stopped(self._control.prompts.ask(text))
 
 
-def named_now(bench: InvestigationContext, recipe: str) -> InvestigationContext:
+def named_now(context: InvestigationContext, recipe: str) -> InvestigationContext:
     """The bench with its plan named as campaigns of this recipe are: recipe, machine, and when."""
-    return replace(bench, plan=replace(bench.plan, name=f"{recipe} {bench.site.name} {bench.clock.utc():%Y-%m-%d %H:%M:%S}"))
+    return replace(context, plan=replace(context.plan, name=f"{recipe} {context.site.name} {context.clock.utc():%Y-%m-%d %H:%M:%S}"))

@@ -18,11 +18,11 @@ from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock
-from abbe.service.compensation.correct import check_promise
+from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposal_diff import compare, largest
 from abbe.service.compensation.proposals import Made, check_temperature, gather, make
 from abbe.service.compensation.recovered_session import recovered_session
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.discovery.changed_since import since_of
 from abbe.service.discovery.changed_words import changed_words
@@ -67,7 +67,7 @@ class InvestigationContext:
     live: LiveFeed | None = None
 
 
-async def investigate(bench: InvestigationContext, alarm: Alarm, note: Note) -> None:
+async def investigate(context: InvestigationContext, alarm: Alarm, note: Note) -> None:
     """Take an alarm as far as it goes: to a proposal that waits for approval, or to the reason why there is none.
 
     Raises
@@ -79,41 +79,41 @@ async def investigate(bench: InvestigationContext, alarm: Alarm, note: Note) -> 
     AbbeError, DriverError, OSError, ArithmeticError, ValueError
         A device or the measurement failed. Lines that were written stay; the next call goes on behind them.
     """
-    bench.control.now(State.RUNNING)
+    context.control.now(State.RUNNING)
     try:
         while (step := next_step(alarm)) is not None:
-            await bench.control.gate()
-            alarm = await _STEPS[step](bench, alarm, note)
+            await context.control.gate()
+            alarm = await _STEPS[step](context, alarm, note)
     except NO as no:
         await note(AlarmKind.ENDED, {"text": f"no proposal: {no}", "code": no.code})
 
 
-async def _measured(bench: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
+async def _measured(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
     tries = sum(s.kind is AlarmKind.BEGUN for s in alarm.work) + 1
     if tries > TRIES:
         return await note(AlarmKind.ENDED, {"text": f"no proposal: {TRIES} tries to measure the full campaign were not completed"})
     again = "" if tries == 1 else ", anew: the last try was not completed"
-    plan = replace(bench.plan, name=f"alarm {alarm.number} {bench.clock.utc():%Y-%m-%d %H:%M:%S}")
-    site, manner = bench.site, Manner(control=bench.control, part=True, live=bench.live)
-    with alone(site.urls.cnc):
-        async with recovered_session(bench.store, site) as session:
+    plan = replace(context.plan, name=f"alarm {alarm.number} {context.clock.utc():%Y-%m-%d %H:%M:%S}")
+    site, manner = context.site, Manner(control=context.control, part=True, live=context.live)
+    with lock_machine(site.urls.cnc):
+        async with recovered_session(context.store, site) as session:
             # Only now: while another process has the machine nothing of this try has begun.
             await note(AlarmKind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
             plan = paced(plan, site.max_feed_mm_min)
-            ids = await measure(session, bench.store, site, plan, progress=bench.progress, clock=bench.clock, manner=manner)
+            ids = await measure(session, context.store, site, plan, progress=context.progress, clock=context.clock, manner=manner)
     return await note(AlarmKind.MEASURED, {"text": f"campaign {plan.name!r} is measured: {len(ids)} runs", "campaign": plan.name})
 
 
-async def _discovered(bench: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
+async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
     stopped = threading.Event()
 
     def tell(progress: Progress) -> None:
-        if stopped.is_set() or bench.control.stopping:
+        if stopped.is_set() or context.control.stopping:
             raise Stopped("the search was stopped", "it is begun anew")
-        bench.progress(progress)
+        context.progress(progress)
 
     try:
-        number, finding = await asyncio.to_thread(_search, replace(bench, progress=tell), _campaign(alarm))
+        number, finding = await asyncio.to_thread(_search, replace(context, progress=tell), _campaign(alarm))
     except asyncio.CancelledError:
         stopped.set()  # the thread ends at its next word: a service that stops does not wait for the rest of the search
         raise
@@ -121,16 +121,16 @@ async def _discovered(bench: InvestigationContext, alarm: Alarm, note: Note) -> 
     names = ", ".join(f"{name_of(e)} {size_text(e)}" for e in finding["effects"])
     changes = changed_words(finding)
     doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {told}", changes) if t), "discovery": number}
-    return await note(AlarmKind.DISCOVERED, doc | _against(finding, bench.store, bench.site.name))
+    return await note(AlarmKind.DISCOVERED, doc | _against(finding, context.store, context.site.name))
 
 
-def _search(bench: InvestigationContext, campaign: str) -> tuple[int | None, dict[str, Any]]:
-    store = bench.store
+def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, dict[str, Any]]:
+    store = context.store
     measured = from_store(store, campaign)
-    book, since = current(store, bench.site.name), since_of(store, measured)
+    book, since = current(store, context.site.name), since_of(store, measured)
     job = prepare(measured, catalogue(), book, table=table_then(store, measured), since=since)
     journal = journal_of(store, job)
-    return journal.id, discover(job, journal, search, bench.progress)
+    return journal.id, discover(job, journal, search, context.progress)
 
 
 def _against(finding: dict[str, Any], store: Store, machine: str) -> Doc:
@@ -150,34 +150,34 @@ def _against(finding: dict[str, Any], store: Store, machine: str) -> Doc:
     return {"against": "; ".join(why), "rms_um": rms_um, "unnamed": unnamed}
 
 
-async def _proposed(bench: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
+async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
     known = alarm.last(AlarmKind.DISCOVERED)
     assert known is not None
     if known.doc["unnamed"]:
         return await note(AlarmKind.ENDED, {"text": f"no proposal: {known.doc['against']} ({known.doc['text']})"})
 
     def agree(promised: Predicted) -> None:
-        check_promise(promised)
+        check_promise(promised, context.site.limits)
         check_cause(promised, known.doc["against"], float(known.doc["rms_um"]))
 
-    made = await made_of(bench, _campaign(alarm), agree)
-    doc = {"proposal": made.number, "text": await asyncio.to_thread(promise_words, bench.store, made)}
+    made = await made_of(context, _campaign(alarm), agree)
+    doc = {"proposal": made.number, "text": await asyncio.to_thread(promise_words, context.store, made)}
     if made.proposed.reasons:
         return await note(AlarmKind.ENDED, doc | {"text": f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"})
     return await note(AlarmKind.PROPOSED, doc | {"beside": known.doc["against"]})
 
 
-async def made_of(bench: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> Made:
+async def made_of(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> Made:
     """Solve a measured campaign and store what follows as a proposal, on the table that the controller has in force.
 
     ``agree`` and ``by`` as in `proposals.make`, whose errors are raised as well as those of a device.
     """
-    site, store = bench.site, bench.store
-    with alone(site.urls.cnc):
+    site, store = context.site, context.store
+    with lock_machine(site.urls.cnc):
         async with recovered_session(store, site, DeviceUrls(site.urls.cnc)) as session:
             gathered = await gather(session.controller, store, site, campaign)
             check_temperature(site, gathered.runs)
-            return await make(store, site, gathered, clock=bench.clock, progress=bench.progress, agree=agree, by=by)
+            return await make(store, site, gathered, clock=context.clock, progress=context.progress, agree=agree, by=by)
 
 
 def check_cause(promised: Predicted, against: str, rms_um: float) -> None:

@@ -15,7 +15,7 @@ from abbe.service.clock import Clock
 from abbe.service.push import operations as o
 from abbe.service.push.entries import Journal, facts
 from abbe.service.push.operations import Operation, OperationKind, Outcome, Truth
-from abbe.service.push.semantic_digest import meaning_of_bytes
+from abbe.service.push.semantic_digest import semantic_digest_of_image
 from abbe.service.sequences.interlocks import tripped
 
 LEASE_MS, BEAT_S = 60_000, 20.0
@@ -32,7 +32,7 @@ class PushActors:
     verify: Callable[[Journal], Awaitable[o.Verdict]]
 
 
-def nobody() -> PushActors:
+def no_actors() -> PushActors:
     """For recoveries: they ask nothing, and what they were asked would be no."""
 
     async def no_reason(journal: Journal) -> list[str]:
@@ -80,7 +80,7 @@ class ControllerPort:
             case OperationKind.READ:
                 return o.Done(await self._c.read_bank(op.bank, 2 * op.count or None))
             case OperationKind.READ_AGAIN:
-                return o.Done(meaning_of_bytes(await self._c.read_bank(op.bank, 2 * op.count or None)))
+                return o.Done(semantic_digest_of_image(await self._c.read_bank(op.bank, 2 * op.count or None)))
             case OperationKind.READ_CHUNK:
                 return o.Done(await self._c.read_part(op.bank, op.first, 2 * op.count))
             case OperationKind.VALIDATE | OperationKind.APPROVE | OperationKind.PROBE | OperationKind.VERIFY:

@@ -17,7 +17,7 @@ _VALUES_PER_MM = 1e6
 Rows = list[tuple[str, str, list[tuple[int, int]]]]
 
 
-def meaning_of_tables(tables: NineTables) -> str:
+def semantic_digest_of_tables(tables: NineTables) -> str:
     """Digest of corrections that are added to the command, (position in 10 nm, correction in nm) for each input and each corrected axis."""
     rows: Rows = []
     for a, moved in enumerate("XYZ"):
@@ -27,7 +27,7 @@ def meaning_of_tables(tables: NineTables) -> str:
     return _digest(rows)
 
 
-def meaning_of_bytes(image: bytes) -> str:
+def semantic_digest_of_image(image: bytes) -> str:
     """Digest of what the independent decoder makes of a bank; ``"unreadable"`` where it makes nothing of it."""
     try:
         curves = read_axis_tables(image)

@@ -102,13 +102,21 @@ def _evidence(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iter
         yield f"RUNS: {e.run_count}, needed are {limits.runs}"
     if not e.drift_mm <= limits.drift_mm:
         yield f"DRIFT: {e.drift_mm * 1e3:.1f} µm between the first and the last run, allowed are {limits.drift_mm * 1e3:.1f} µm"
-    gain = e.before_mm - e.after_mm
-    if not e.u_mm <= limits.share * gain or not gain > limits.k * e.u_mm or not gain >= limits.gain * e.before_mm:
-        yield f"PROMISE: {e.before_mm * 1e3:.2f} to {e.after_mm * 1e3:.2f} µm with an uncertainty of {e.u_mm * 1e3:.2f} µm: too little"
+    if promise := promise_reason(e.before_mm, e.after_mm, e.u_mm, limits):
+        yield f"PROMISE: {promise}"
     if not e.calibrated_until_s:
         yield "CERTIFICATE: the instruments have no calibration certificate"
     elif not min(e.calibrated_until_s) >= newest_s:
         yield "CERTIFICATE: a calibration had expired when it was measured"
+
+
+def promise_reason(before_mm: float, after_mm: float, u_mm: float, limits: PushLimits) -> str:
+    """Why a promise is too small to be written: rms before and after, mm, beside the model's standard uncertainty; empty: it is not."""
+    gain = before_mm - after_mm
+    if u_mm <= limits.share * gain and gain > limits.k * u_mm and gain >= limits.gain * before_mm:
+        return ""
+    promise = f"the tables promise {before_mm * 1e3:.1f} → {after_mm * 1e3:.1f} µm rms"
+    return f"{promise} (model uncertainty {u_mm * 1e3:.1f} µm): not enough to write"
 
 
 def _policy(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:

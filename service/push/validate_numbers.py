@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 from abbe.service.push.candidate import Candidate, CandidateContext, Column
@@ -28,9 +28,8 @@ def number_reasons(candidate: Candidate, scene: CandidateContext, limits: PushLi
         for reason in _size(column, active, limits, lsb_mm):
             yield f"{reason} ({name})"
     for axis in sorted({column.corrected for column in candidate.columns}):
-        total = sum(max(abs(v) for v in column.correction_mm) for column in candidate.columns if column.corrected == axis)
-        if total > limits.value_mm:
-            yield f"VALUE: the tables of {axis} together reach {total * 1e3:.1f} µm, allowed are {limits.value_mm * 1e3:.1f} µm"
+        total_mm = sum(max(abs(v) for v in column.correction_mm) for column in candidate.columns if column.corrected == axis)
+        yield from together_reasons(axis, total_mm, limits)
     yield from _whole(candidate, scene, limits)
 
 
@@ -45,6 +44,38 @@ def _odd(column: Column) -> str:
     return ""
 
 
+def size_reasons(p: Sequence[float], v: Sequence[float], active: Sequence[float], limits: PushLimits) -> Iterator[str]:
+    """What is too large or changes too much in one table: where, by how much, and the key of the machine file that limits it.
+
+    Parameters
+    ----------
+    p, v, active : sequence of float
+        Positions; corrections there, new and in force. Millimetres.
+    limits : PushLimits
+        What is allowed.
+    """
+    steps = [b - a for a, b in pairwise(v)]
+    changes = [a - b for a, b in zip(v, active, strict=True)]
+    bends = [b - a for a, b in pairwise(steps)]
+    for word, sizes, limit, key in (
+        ("VALUE", v, limits.value_mm, "table_value_um"),
+        ("CHANGE", changes, limits.change_mm, "table_change_um"),
+        ("STEP", steps, limits.step_mm, "table_step_um"),
+        ("BEND", bends, limits.second_mm, ""),
+    ):
+        k = max(range(len(sizes)), key=lambda n: abs(sizes[n]), default=0)
+        if sizes and abs(sizes[k]) > limit:
+            allowed = f"allowed are {limit * 1e3:.1f} µm" + (f" ([limits] {key})" if key else "")
+            yield f"{word}: {abs(sizes[k]) * 1e3:.1f} µm at {p[k]:.1f} mm, {allowed}"
+
+
+def together_reasons(axis: str, total_mm: float, limits: PushLimits) -> Iterator[str]:
+    """Whether the three tables of an axis, each at its largest, reach too far; ``total_mm``: the sum of those."""
+    if total_mm > limits.value_mm:
+        allowed = f"allowed are {limits.value_mm * 1e3:.1f} µm ([limits] table_value_um)"
+        yield f"VALUE: the tables of {axis} together reach {total_mm * 1e3:.1f} µm, {allowed}"
+
+
 def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm: float) -> Iterator[str]:
     v, p = column.correction_mm, column.position_mm
     counts = max(abs(x) / lsb_mm for x in v)
@@ -53,17 +84,8 @@ def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm:
     if len(active) != len(v):
         yield "CHANGE: the table in force has another grid and was not given on this one"
         return
-    steps = [b - a for a, b in pairwise(v)]
-    slopes = [abs(d) / (b - a) for d, a, b in zip(steps, p, p[1:], strict=False)]
-    seconds = [abs(b - a) for a, b in pairwise(steps)]
-    for word, worst, limit in (
-        ("VALUE", max(abs(x) for x in v), limits.value_mm),
-        ("CHANGE", max(abs(a - b) for a, b in zip(v, active, strict=True)), limits.change_mm),
-        ("STEP", max(abs(d) for d in steps), limits.step_mm),
-        ("BEND", max(seconds, default=0.0), limits.second_mm),
-    ):
-        if worst > limit:
-            yield f"{word}: {worst * 1e3:.1f} µm, allowed are {limit * 1e3:.1f} µm"
+    yield from size_reasons(p, v, active, limits)
+    slopes = [abs(d - c) / (b - a) for c, d, a, b in zip(v, v[1:], p, p[1:], strict=False)]
     if max(slopes) > limits.slope:
         yield f"SLOPE: {max(slopes) * 1e3:.2f} µm/mm, allowed are {limits.slope * 1e3:.2f} µm/mm"
     if abs(v[0]) > lsb_mm:

@@ -1,8 +1,9 @@
-"""The alarm desk: holds each check against the history, keeps the alarms, says what is to be done when the machine is free."""
+"""Alarms: holds each check against the history, keeps the alarms, says what is to be done when the machine is free."""
 
 from __future__ import annotations
 
 import asyncio
+from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,18 +14,19 @@ from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.audit.chain import Event
 from abbe.service.clock import Clock
 from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
-from abbe.service.events import Progress, ProgressSink
+from abbe.service.events import ProgressSink
 from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler import record
-from abbe.service.scheduler.job import FAILURES
+from abbe.service.scheduler.job import Job, carry_out, failure
 from abbe.service.scheduler.ports import Doc, FollowUp, JobWatcher, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.control import Control
 from abbe.service.storage.records import AlarmEntryRecord
-from abbe.service.tables.push_outcome import OPEN, STOPPED, PushOutcome, by_journal, in_force, last_push
+from abbe.service.tables.push_outcome import OPEN, STOPPED, by_journal, in_force, last_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
 
@@ -41,9 +43,8 @@ CODES = {
 """Lines that the broker is told of, and how the message is called."""
 SAID = {OPEN: "is open", STOPPED: "was stopped"}
 """Words of outcomes that make no sentence by themselves."""
-NOTHING_YET = PushOutcome("failed", "the service ended before anything was written")
-LAST_WORDS_S = 1.0
-"""A service that ends has five seconds for everything."""
+NOTHING_YET = JobOutcome("failed", "the service ended before anything was written")
+WAITS = "waits"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +66,11 @@ class Duties:
     warn_days: float
     campaign: str
     investigate: Callable[[Alarm, Note, ProgressSink, Control], Awaitable[None]]
-    push: Callable[[PushOrder], Awaitable[PushOutcome]] | None = None
+    push: Callable[[PushOrder], Awaitable[JobOutcome]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Telling:
+class AlarmChannels:
     """Whom the desk tells: topic of alarms (None: no broker), who is woken for it, the audit, and who watches jobs."""
 
     topic: str | None
@@ -98,24 +99,25 @@ class AlarmManager(RetryingStore):
     """
 
     def __init__(
-        self, store: ServiceStore, clock: Clock, machine: str, schedules: Sequence[Schedule], duties: Duties, telling: Telling
+        self, store: ServiceStore, clock: Clock, machine: str, schedules: Sequence[Schedule], duties: Duties, channels: AlarmChannels
     ) -> None:
         super().__init__(store, clock)
         self._machine = machine
         self._schedules = tuple(schedules)
-        self._duties = duties
-        self._telling = telling
+        self.duties = duties
+        """What is done about alarms."""
+        self._channels = channels
         self._checked_again: set[tuple[int, int]] = set()
 
     async def checked(self, doc: Doc, number: int) -> str:
         """Hold a kept verification against those before it; raise, hold or clear the alarm of its recipe. Returns that as a sentence."""
-        recipe, warn_days = doc["recipe"], self._duties.warn_days
+        recipe, warn_days = doc["recipe"], self.duties.warn_days
         records = await self._read(self._store.verifications_of, self._machine, READ_CHECKS)
         looked = await self._read(look, self._store, self._machine, recipe, records, warn_days)
         if looked.kind is None:
             return ""
         line = check_line(looked, recipe, doc["schedule"], number)
-        entry = await self._line(None if looked.now is None else looked.now.number, looked.kind, line)
+        entry = await self.line(None if looked.now is None else looked.now.number, looked.kind, line)
         return f"alarm {entry.alarm} {looked.kind}: {looked.found.text}"
 
     async def due(self) -> FollowUp | None:
@@ -143,13 +145,31 @@ class AlarmManager(RetryingStore):
             now = await asyncio.to_thread(in_force, self._store, self._machine, proposal, after) or NOTHING_YET
             if entry.kind == AlarmKind.PUSHING or now.word != OPEN:
                 text = f"{now.text} (it was interrupted with the service)" if entry.kind == AlarmKind.PUSHING else now.text
-                await self._tell_pushed(entry.alarm, proposal, after, PushOutcome(now.word, text))
+                await self._tell_pushed(entry.alarm, proposal, after, JobOutcome(now.word, text))
                 told = True
         return await asyncio.to_thread(self._store.alarm_entries, self._machine) if told else entries
 
-    async def _tell_pushed(self, alarm: int, proposal: int, after: int, done: PushOutcome) -> None:
+    async def note(self, number: int, kind: AlarmKind, doc: Doc) -> Alarm:
+        """Write a line of an alarm; return the alarm with it."""
+        await self.line(number, kind, doc)
+        return await self._read(alarm_numbered, self._store, self._machine, number)
+
+    async def settled(self, found: Approved, after: int, said: JobOutcome) -> JobOutcome:
+        """Write down how a push later than ``after`` ended, by the journal; return that."""
+        done = await self._read(by_journal, self._store, self._machine, found.proposal, after, said)
+        await self._tell_pushed(found.alarm, found.proposal, after, done)
+        return done
+
+    async def stopped(self, found: Approved, after: int) -> None:
+        """Write down where a push stands that was stopped with the service, at once."""
+        done = await asyncio.to_thread(in_force, self._store, self._machine, found.proposal, after) or NOTHING_YET
+        log.warning("the push was stopped with the service", word=done.word, text=done.text)
+        text = f"{done.text} (stopped with the service)"
+        await self._tell_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
+
+    async def _tell_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:
         text = f"proposal {proposal} {SAID.get(done.word, done.word)}: {done.text}"
-        await self._line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
+        await self.line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
 
     def _check_again(self, alarms: Sequence[Alarm]) -> FollowUp | None:
         """After a push that was kept the check that raised the alarm is made once at once: the trend begins anew with it."""
@@ -165,7 +185,7 @@ class AlarmManager(RetryingStore):
         return None
 
     async def _push(self, entries: Sequence[AlarmEntryRecord]) -> FollowUp | None:
-        if self._duties.push is None:
+        if self.duties.push is None:
             return None
         now_s = self._clock.utc().timestamp()
         found = await asyncio.to_thread(next_approved, self._store, self._machine, entries, now_s)
@@ -182,7 +202,7 @@ class AlarmManager(RetryingStore):
             schedule = self._schedule_of(one)
             if schedule is not None and schedule.on_alarm == "propose" and next_step(one) is not None:
                 needs = replace(schedule.needs, idle=True)  # a machine at work, or in another process's hands, is waited for
-                terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self._duties.campaign, needs=needs)
+                terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self.duties.campaign, needs=needs)
                 return FollowUp(terms.name, terms, partial(self._investigated, one, terms), "investigation")
         return None
 
@@ -191,100 +211,22 @@ class AlarmManager(RetryingStore):
         same = [s for s in self._schedules if s.recipe == one.recipe]
         return next((s for s in same if s.name == one.schedule), next(iter(same), None))
 
-    async def _investigated(self, one: Alarm, terms: Schedule, control: Control) -> str:
-        last = SlotState("done: nothing")
+    async def _investigated(self, one: Alarm, terms: Schedule, control: Control) -> SlotState:
+        return await self._carried_out(_Investigation(self, one), terms, control)
 
-        async def note(kind: AlarmKind, doc: Doc) -> Alarm:
-            nonlocal last
-            await self._line(one.number, kind, doc)
-            last = SlotState(f"done: {kind}", doc["text"])
-            return await self._read(alarm_numbered, self._store, self._machine, one.number)
-
-        self._begin(terms)
-        try:
-            await control.unless_aborted(self._investigate(one, note, control))
-        except MachineInUse as busy:
-            return _waits(busy)
-        except Exception as error:
-            await note(AlarmKind.FAILED, _failed(error))
-            # A defect of this program ends the service, as in a check; but its line stays: the next one must not fall over it again.
-            if _is_defect(error):
-                raise
-        finally:
-            control.now(State.ENDED)
-            self._end()
-        return last
-
-    async def _investigate(self, one: Alarm, note: Note, control: Control) -> None:
-        await self._duties.investigate(one, note, self._progress, control)
-
-    async def _pushed(self, found: Approved, terms: Schedule, control: Control) -> str:
+    async def _pushed(self, found: Approved, terms: Schedule, control: Control) -> SlotState:
         after = await self._read(last_push, self._store, self._machine)
-        text = f"proposal {found.proposal} is being pushed"
-        begun: Doc = {"proposal": found.proposal, "approval": found.approval, "after": after, "text": text}
-        told: list[AlarmEntryRecord] = []
+        return await self._carried_out(_ApprovedPush(self, found, after), terms, control)
 
-        async def tell_begun() -> None:
-            if not told:
-                told.append(await self._line(found.alarm, AlarmKind.PUSHING, begun))
+    async def _carried_out(self, job: Job[JobOutcome], terms: Schedule, control: Control) -> SlotState:
+        return await carry_out(job, terms, self._clock.utc(), control, self._channels.watchers)
 
-        self._begin(terms)
-        try:
-            said = await control.unless_aborted(self._push_now(PushOrder(found.proposal, tell_begun, self._progress, control)))
-        except MachineInUse as busy:
-            return _waits(busy)
-        except asyncio.CancelledError:
-            if told:
-                await self._stopped_with_the_service(found, after)
-            raise
-        except Exception as error:
-            if _is_defect(error):
-                raise
-            await tell_begun()
-            ended = isinstance(error, Stopped | Aborted)
-            said = PushOutcome(
-                STOPPED if ended else "failed", "; ".join([record.cause_of(error)["what"], *getattr(error, "__notes__", [])])
-            )
-        finally:
-            control.now(State.ENDED)
-            self._end()
-        done = await self._read(by_journal, self._store, self._machine, found.proposal, after, said)
-        await self._tell_pushed(found.alarm, found.proposal, after, done)
-        return SlotState(f"done: {done.word}", done.text)
-
-    async def _push_now(self, order: PushOrder) -> PushOutcome:
-        assert self._duties.push is not None
-        return await self._duties.push(order)
-
-    async def _stopped_with_the_service(self, found: Approved, after: int) -> None:
-        """Say by the journal where it stands, now, if the database takes it at once; else the next start says it."""
-        try:
-            async with asyncio.timeout(LAST_WORDS_S):
-                done = await asyncio.to_thread(in_force, self._store, self._machine, found.proposal, after) or NOTHING_YET
-                log.warning("the push was stopped with the service", word=done.word, text=done.text)
-                text = f"{done.text} (stopped with the service)"
-                await self._tell_pushed(found.alarm, found.proposal, after, PushOutcome(done.word, text))
-        except (AbbeError, TimeoutError) as trouble:
-            log.warning("the push was stopped with the service; the next start says where it stands", cause=str(trouble))
-
-    def _begin(self, terms: Schedule) -> None:
-        for watcher in self._telling.watchers:
-            watcher.job_started(terms, self._clock.utc())
-
-    def _progress(self, progress: Progress) -> None:
-        for watcher in self._telling.watchers:
-            watcher.job_progress(progress)
-
-    def _end(self) -> None:
-        for watcher in self._telling.watchers:
-            watcher.job_ended(None)
-
-    async def _line(self, number: int | None, kind: AlarmKind, doc: Doc) -> AlarmEntryRecord:
+    async def line(self, number: int | None, kind: AlarmKind, doc: Doc) -> AlarmEntryRecord:
         """Write a line with its message and its record in the audit."""
         messages = []
-        if self._telling.topic is not None and kind in CODES:
+        if self._channels.topic is not None and kind in CODES:
             head = {"schema": record.SCHEMA, "machine": self._machine, "code": CODES[kind], "at_utc": self._clock.utc().isoformat()}
-            messages.append((self._telling.topic, head | {"kind": str(kind), "what": doc["text"], "signals": doc.get("signals", [])}))
+            messages.append((self._channels.topic, head | {"kind": str(kind), "what": doc["text"], "signals": doc.get("signals", [])}))
 
         def append() -> AlarmEntryRecord:
             seq = 0 if number is None else last_seq(self._store.alarm_entries(self._machine), number) + 1
@@ -292,30 +234,94 @@ class AlarmManager(RetryingStore):
 
         entry = await self._write(append)
         if messages:
-            self._telling.posted()
+            self._channels.posted()
         log.warning(doc["text"], alarm=entry.alarm, kind=str(kind))
         if kind is not AlarmKind.HELD:
             target = f"{self._machine}, alarm {entry.alarm}" if entry.alarm != NO_ALARM else self._machine
             try:
                 event = Event(this_account(), "abbe serve", target, str(kind), {"text": doc["text"]})
-                await asyncio.to_thread(self._telling.audit.write, event)
+                await asyncio.to_thread(self._channels.audit.write, event)
             except AbbeError as error:  # the line itself is kept: a service that ends here would warn of nothing more
                 log.error("not in the audit", cause=error.detail)
         return entry
 
 
-def _failed(error: Exception) -> Doc:
-    cause = record.cause_of(error)
-    if isinstance(error, Stopped | Aborted):
-        return {"text": f"the investigation was ended by a person: {cause['what']}", "cause": cause}
-    return {"text": f"the investigation could not go on: {cause['what']}", "cause": cause}
+class _AlarmJob(Job[JobOutcome]):
+    """Work for an alarm. While another process has the machine it waits, and no try is counted."""
+
+    def __init__(self, manager: AlarmManager, name: str) -> None:
+        self._manager, self.name = manager, name
+
+    async def do(self, progress: ProgressSink, control: Control) -> JobOutcome:
+        try:
+            return await self.work(progress, control)
+        except MachineInUse as busy:
+            log.info("waiting for another process", cause=str(busy))
+            return JobOutcome(WAITS, str(busy))
+
+    @abstractmethod
+    async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
+        """What is done when the machine is ours."""
+
+    async def end(self, outcome: JobOutcome) -> SlotState:
+        return SlotState(WAITS, outcome.text) if outcome.word == WAITS else SlotState.of(outcome)
 
 
-def _is_defect(error: Exception) -> bool:
-    """Whether something other than devices, data and numerics failed."""
-    return not isinstance(error, FAILURES) and not (isinstance(error, ExceptionGroup) and error.split(FAILURES)[1] is None)
+class _Investigation(_AlarmJob):
+    """Each step is a line of the alarm; the last one says how it ended."""
+
+    def __init__(self, manager: AlarmManager, alarm: Alarm) -> None:
+        super().__init__(manager, f"investigation of alarm {alarm.number}")
+        self._alarm, self._last = alarm, JobOutcome("nothing", "")
+
+    async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
+        await self._manager.duties.investigate(self._alarm, self._note, progress, control)
+        return self._last
+
+    async def failed(self, error: Exception) -> JobOutcome:
+        cause = record.cause_of(error)
+        how = "was ended by a person" if isinstance(error, Stopped | Aborted) else "could not go on"
+        await self._note(AlarmKind.FAILED, {"text": f"the investigation {how}: {cause['what']}", "cause": cause})
+        return self._last
+
+    async def defect(self, error: Exception) -> None:
+        """Its line stays: the next service must not fall over it again."""
+        await self.failed(error)
+
+    async def _note(self, kind: AlarmKind, doc: Doc) -> Alarm:
+        self._last = JobOutcome(str(kind), doc["text"])
+        return await self._manager.note(self._alarm.number, kind, doc)
 
 
-def _waits(busy: MachineInUse) -> str:
-    log.info("waiting for another process", cause=str(busy))
-    return SlotState("waits", str(busy))
+class _ApprovedPush(_AlarmJob):
+    """A push that a person approved. It counts as tried once its first line is written; its end is what the push journal says."""
+
+    def __init__(self, manager: AlarmManager, found: Approved, after: int) -> None:
+        super().__init__(manager, f"push of proposal {found.proposal}")
+        self._found, self._after, self._is_begun = found, after, False
+
+    async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
+        push = self._manager.duties.push
+        assert push is not None
+        return await push(PushOrder(self._found.proposal, self._begun, progress, control))
+
+    async def _begun(self) -> None:
+        if not self._is_begun:
+            text = f"proposal {self._found.proposal} is being pushed"
+            doc = {"proposal": self._found.proposal, "approval": self._found.approval, "after": self._after, "text": text}
+            await self._manager.line(self._found.alarm, AlarmKind.PUSHING, doc)
+            self._is_begun = True
+
+    async def failed(self, error: Exception) -> JobOutcome:
+        await self._begun()
+        return failure(error)
+
+    async def end(self, outcome: JobOutcome) -> SlotState:
+        if outcome.word != WAITS:
+            outcome = await self._manager.settled(self._found, self._after, outcome)
+        return await super().end(outcome)
+
+    async def last_words(self) -> None:
+        """Say by the journal where it stands; else the next start says it."""
+        if self._is_begun:
+            await self._manager.stopped(self._found, self._after)

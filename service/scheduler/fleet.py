@@ -10,7 +10,7 @@ from typing import Any
 
 from abbe.service.scheduler.heartbeat import SILENT_AFTER
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.records import StationRecord, VerificationRecord
+from abbe.service.storage.records import HeartbeatRecord, VerificationRecord
 from abbe.service.verification.trend_table import FigureTrend, trends
 from abbe.service.verification.verified_by import LOOKED, VerifiedBy, of_push_taken_back, verified_by
 
@@ -103,17 +103,17 @@ def stands(store: ServiceStore, now: datetime) -> list[MachineStatus]:
     now : datetime
         With time zone.
     """
-    said = store.stations()
+    said = store.heartbeats()
     return [_stand(store, name, said.get(name), store.verifications_of(name, LOOKED), now) for name in store.machine_names()]
 
 
 def fleet(store: ServiceStore, now: datetime) -> list[MachineLine]:
     """One line for each machine of a database, by name, with the trends of its figures; parameters as for `stands`."""
-    said = store.stations()
+    said = store.heartbeats()
     return [_line(store, name, said.get(name), store.verifications_of(name, limit=CHECKS), now) for name in store.machine_names()]
 
 
-def _line(store: ServiceStore, name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
+def _line(store: ServiceStore, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
     stand = _stand(store, name, said, checks, now)
     found = trends(checks, stand.verified.since)
     soonest = min((one for one in found if not one.trend.forecast.reason), key=lambda one: one.trend.forecast.days, default=None)
@@ -126,7 +126,7 @@ def _line(store: ServiceStore, name: str, said: StationRecord | None, checks: Se
 
 
 def _stand(
-    store: ServiceStore, name: str, said: StationRecord | None, checks: Sequence[VerificationRecord], now: datetime
+    store: ServiceStore, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime
 ) -> MachineStatus:
     """``checks``: newest first."""
     state = state_of(said, now)
@@ -148,7 +148,7 @@ def _stand(
     )
 
 
-def state_of(said: StationRecord | None, now: datetime) -> str:
+def state_of(said: HeartbeatRecord | None, now: datetime) -> str:
     """What a machine's service does, as far as it can be known from what it said last."""
     if said is None:
         return NO_SERVICE

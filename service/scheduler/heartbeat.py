@@ -25,15 +25,15 @@ MEASURING = "measuring"
 WAITING = "waiting"
 
 
-class HeartbeatDesk(Protocol):
+class HeartbeatSink(Protocol):
     """The part of the store that is written here."""
 
-    def put_station(self, machine: str, doc: Doc) -> None:
+    def put_heartbeat(self, machine: str, doc: Doc) -> None:
         """Write what the service of a machine says of itself now."""
         ...
 
 
-class Station:
+class Heartbeat:
     """Keeps a machine's row true. A database that does not take it now gets the next one: nothing waits for this.
 
     Parameters
@@ -54,7 +54,7 @@ class Station:
         self,
         machine: str,
         version: str,
-        store: HeartbeatDesk,
+        store: HeartbeatSink,
         next_due: Callable[[], Sequence[tuple[Schedule, datetime]]],
         clock: Clock,
         attention: Sequence[str] = (),
@@ -94,7 +94,7 @@ class Station:
         while True:
             self._news.clear()
             try:
-                await asyncio.to_thread(self._store.put_station, self._machine, self.doc())
+                await asyncio.to_thread(self._store.put_heartbeat, self._machine, self.doc())
             except StoreError as trouble:
                 log.warning("the fleet's list was not told", cause=trouble.detail)
             await self._beat()

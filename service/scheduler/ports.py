@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal, NamedTuple, Protocol, Self
 
-from abbe.service.domain.job_state import JobKind
+from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.sequences.control import Control
@@ -76,24 +76,32 @@ pauses, resumes, stops or aborts it."""
 
 
 class SlotState(str):
-    """What a slot or a job ended as, with the sentence to it, and the numbers of a solution and a proposal that it has left."""
+    """What a slot or a job ended as, with the sentence to it, and the numbers of a solution, a proposal and a verification in the store."""
 
     reason: str
     solution: int | None
     proposal: int | None
+    verification: int | None
 
-    def __new__(cls, state: str, reason: str = "", solution: int | None = None, proposal: int | None = None) -> Self:
+    def __new__(
+        cls, state: str, reason: str = "", solution: int | None = None, proposal: int | None = None, verification: int | None = None
+    ) -> Self:
         """Make one."""
         made = super().__new__(cls, state)
-        made.reason, made.solution, made.proposal = reason, solution, proposal
+        made.reason, made.solution, made.proposal, made.verification = reason, solution, proposal, verification
         return made
+
+    @classmethod
+    def of(cls, outcome: JobOutcome) -> Self:
+        """What a job ended as by its outcome."""
+        return cls(f"done: {outcome.word}", outcome.text, outcome.solution, outcome.proposal)
 
 
 AfterCheck = Callable[[Doc, int], Awaitable[str]]
 """``await after(doc, number)``: what a kept verification means beyond itself, as a sentence; empty: nothing."""
 
 
-Work = Callable[[Control], Awaitable[str]]
+Work = Callable[[Control], Awaitable[SlotState]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +119,11 @@ class FollowUp:
     begun: Callable[[], None] | None = None
 
 
-Carry = Callable[[FollowUp], Awaitable[str]]
+Carry = Callable[[FollowUp], Awaitable[SlotState]]
 """``await carry(errand)``: does an errand's work so that people can see and steer it; returns how it ended."""
 
 
-async def carried_alone(errand: FollowUp) -> str:
+async def carried_alone(errand: FollowUp) -> SlotState:
     """Do an errand's work where nobody can steer it."""
     assert errand.work is not None
     return await errand.work(Control())

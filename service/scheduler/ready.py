@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from abbe.drivers.api import Condition, ControllerStatus
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.errors import AbbeError
@@ -41,7 +41,7 @@ def look_at(urls: DeviceUrls) -> Look:
     """Return how to look at the devices behind ``urls``. It is refused while a job has the machine."""
 
     async def look(with_air: bool) -> SeenDevices:
-        with alone(urls.cnc):
+        with lock_machine(urls.cnc):
             pass  # not held: who comes to measure meanwhile must not be turned away by somebody who only looks
         async with open_session(DeviceUrls(cnc=urls.cnc, laser=urls.laser if with_air else None)) as session:
             air = (await session.laser.peek()).air_temp_c if session.laser is not None else None

@@ -88,7 +88,7 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True)
-class Onward:
+class PathRemainder:
     """Where a path goes on: ``pieces`` as they count now, ``offset_mm`` of the whole path at which the rest begins, what is read twice.
 
     ``arc_mm`` and ``deviation_mm``, shape (n,): what the bar has read on the stretch, along the rest of the path; ``boot_id`` of the box
@@ -108,7 +108,7 @@ class Onward:
         return {"offset_mm": self.offset_mm, "pieces": [{"run": p.run, "to_mm": p.to_mm} for p in self.pieces]}
 
 
-def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, Onward] | None:
+def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, PathRemainder] | None:
     """What is left of a path, the number of the point at which it begins, and what is known of the rest.
 
     None: going on saves nothing, or there is not enough to compare with.
@@ -127,7 +127,7 @@ def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, Onwa
     pieces = (*so_far.pieces[:-1], RunPiece(so_far.pieces[-1].run, float(arc[twice])))
     offset = float(arc[begin])
     known = (so_far.arc_mm[on] - offset, so_far.deviation_mm[on])
-    return rest, begin, Onward(pieces, offset, float(arc[-1]), feed_mm_s, *known, so_far.boot_id)
+    return rest, begin, PathRemainder(pieces, offset, float(arc[-1]), feed_mm_s, *known, so_far.boot_id)
 
 
 def _before(arc: F1, at_mm: float) -> int:
@@ -138,14 +138,14 @@ def _before(arc: F1, at_mm: float) -> int:
 class SameStretch:
     """Compares what the bar reads on the stretch with what it has read there."""
 
-    def __init__(self, onward: Onward, rate_hz: int) -> None:
-        self._on, self._half_s = onward, 0.5 / rate_hz
+    def __init__(self, remainder: PathRemainder, rate_hz: int) -> None:
+        self._on, self._half_s = remainder, 0.5 / rate_hz
         self._first_us: int | None = None
         self._last: BarSample | None = None
         self._off: list[float] = []
-        slope, _ = np.polyfit(onward.arc_mm, onward.deviation_mm, 1)
+        slope, _ = np.polyfit(remainder.arc_mm, remainder.deviation_mm, 1)
         # The instant at which either path began is known to half a period of the samples.
-        self._allowed_mm = SAME_MM + abs(float(slope)) * onward.feed_mm_s / rate_hz
+        self._allowed_mm = SAME_MM + abs(float(slope)) * remainder.feed_mm_s / rate_hz
         self.off_mm: float | None = None
         """By how much the stretch reads otherwise, once it is read."""
 

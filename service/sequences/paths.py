@@ -13,7 +13,7 @@ from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.guard import motion_guard
 from abbe.service.sequences.interlocks import check_interlocks
-from abbe.service.sequences.path_resume import Onward, SameStretch, Way
+from abbe.service.sequences.path_resume import PathRemainder, SameStretch, Way
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
 
@@ -34,7 +34,7 @@ def bar_trouble(status: int) -> BarOutOfRange:
 
 
 async def record_path(
-    session: Session, step: RecordPath, recorder: Recorder, control: Control, way: Way, onward: Onward | None = None
+    session: Session, step: RecordPath, recorder: Recorder, control: Control, way: Way, remainder: PathRemainder | None = None
 ) -> dict[str, int]:
     """Run a path while the ball-bar streams; returns its start and end in controller time.
 
@@ -47,7 +47,7 @@ async def record_path(
     """
     controller = session.controller
     await controller.load_path(step.points_mm)
-    stretch = None if onward is None else SameStretch(onward, step.rate_hz)
+    stretch = None if remainder is None else SameStretch(remainder, step.rate_hz)
     pump = Pump(recorder, step.rate_hz, way, stretch)
     # The guard stands inside the stream: closing the stream of a mute box takes seconds, and the axes must not run on so long.
     async with session.need_ballbar().stream(step.rate_hz, recorder.tap()) as batches, motion_guard(controller):

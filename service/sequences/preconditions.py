@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from abbe.drivers.api import ControllerStatus
 from abbe.service.devices.session import Session
-from abbe.service.errors import WorldChanged
+from abbe.service.errors import PreconditionsChanged
 from abbe.service.sequences.interlocks import Watching, air_trouble, beam_trouble, check_interlocks
 
 
@@ -18,7 +18,7 @@ class ExpectedTable:
     table_crc: int
 
 
-async def check_world(session: Session, expected: ExpectedTable | None, watching: Watching, *, beam: bool) -> ControllerStatus:
+async def check_preconditions(session: Session, expected: ExpectedTable | None, watching: Watching, *, beam: bool) -> ControllerStatus:
     """Look at everything again; gives the controller's status.
 
     Parameters
@@ -55,12 +55,12 @@ def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> Non
         Which.
     """
     if boot_id != expected.boot_id:
-        raise WorldChanged(
+        raise PreconditionsChanged(
             f"the controller was restarted since this campaign began (boot id {boot_id:#x} instead of {expected.boot_id:#x})",
             "its clock began anew: measure a new campaign; the complete runs of this one stay",
         )
     if table_crc != expected.table_crc:
-        raise WorldChanged(
+        raise PreconditionsChanged(
             f"another compensation table is active (CRC {table_crc:08X} instead of {expected.table_crc:08X})",
             "make the old one active again, or measure a new campaign",
         )

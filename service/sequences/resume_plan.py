@@ -14,7 +14,7 @@ import numpy as np
 
 from abbe.service.errors import SetupDisturbed
 from abbe.service.runs.pieces import SoFar
-from abbe.service.sequences.path_resume import Onward, rest_of_path
+from abbe.service.sequences.path_resume import PathRemainder, rest_of_path
 from abbe.service.sequences.recipes.approach import cup_of, over_pole
 from abbe.service.sequences.steps import (
     ChangeBar,
@@ -46,7 +46,7 @@ REFERENCE_MM = 0.003
 
 
 @dataclass(frozen=True, slots=True)
-class Rewind:
+class ResumeTrail:
     """How to go on: along ``trail`` (oldest first) back to number ``to``, and forward again to number ``upto``.
 
     With ``carried`` records the last of them is read again there. Going forward again, every axis comes as it came before, so that lost
@@ -71,12 +71,12 @@ class Attempt:
     setup: str = ""
     offset: int = 0
     mounting: int = 1
-    rewind: Rewind = field(default_factory=Rewind)
+    resume_trail: ResumeTrail = field(default_factory=ResumeTrail)
     run_id: int = 0
-    onward: Onward | None = None
+    remainder: PathRemainder | None = None
 
 
-Rest = tuple[TestPlan, int, Rewind, Onward | None]
+Rest = tuple[TestPlan, int, ResumeTrail, PathRemainder | None]
 
 
 def rest_of(
@@ -104,7 +104,7 @@ def rest_of(
         return _after_point(test, first, records)
     stands = start is not None and (hand is None or isinstance(test.steps[hand], STANDS))
     if not stands:
-        return replace(test, steps=steps), first, Rewind(), None
+        return replace(test, steps=steps), first, ResumeTrail(), None
     if so_far is not None and (found := _along_path(test, first, start, so_far)) is not None:
         return found
     return replace(test, steps=steps), first, _to_beginning(_trail(start, _by_itself(steps)), steps), None
@@ -117,16 +117,16 @@ def _along_path(test: TestPlan, first: int, start: Point | None, so_far: SoFar) 
     path = None if k is None else steps[k]
     if k is None or not isinstance(path, RecordPath) or (found := rest_of_path(path, so_far)) is None:
         return None
-    rest, begin, onward = found
+    rest, begin, remainder = found
     trail = _trail(start, steps)
     to = len(_trail(start, (*steps[:k], replace(path, points_mm=path.points_mm[: begin + 1], measured=None)))) - 1
-    return replace(test, steps=(rest, *test.steps[first + k + 1 :])), first + k, Rewind(trail, to, to, _feed(steps)), onward
+    return replace(test, steps=(rest, *test.steps[first + k + 1 :])), first + k, ResumeTrail(trail, to, to, _feed(steps)), remainder
 
 
-def _to_beginning(trail: tuple[Point, ...], steps: tuple[Step, ...]) -> Rewind:
+def _to_beginning(trail: tuple[Point, ...], steps: tuple[Step, ...]) -> ResumeTrail:
     """Back along the trail to where the first step of what is left begins or, if that is a straight move, ends."""
     to = 0 if isinstance(steps[0], FollowPath | RecordPath) else min(1, len(trail) - 1)
-    return Rewind(trail, to, to, _feed(steps))
+    return ResumeTrail(trail, to, to, _feed(steps))
 
 
 def _by_itself(steps: tuple[Step, ...]) -> tuple[Step, ...]:
@@ -142,8 +142,8 @@ def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]
     ahead = _trail(come[-1], test.steps[last + 1 :])[1:2]
     upto = len(come) - 1
     feed = min(s.feed_mm_min for s in test.steps if isinstance(s, MoveTo))
-    rewind = Rewind(come + ahead, _all_axes_from(come), upto, feed, True, records[: len(reads)])
-    return replace(test, steps=test.steps[last + 1 :]), last + 1, rewind, None
+    resume_trail = ResumeTrail(come + ahead, _all_axes_from(come), upto, feed, True, records[: len(reads)])
+    return replace(test, steps=test.steps[last + 1 :]), last + 1, resume_trail, None
 
 
 def _all_axes_from(trail: tuple[Point, ...]) -> int:
@@ -152,7 +152,7 @@ def _all_axes_from(trail: tuple[Point, ...]) -> int:
     return min((int(np.flatnonzero(moved[:, a])[-1]) for a in range(3) if moved[:, a].any()), default=len(trail) - 1)
 
 
-def way_back(rewind: Rewind, position_mm: Point) -> tuple[Point, ...]:
+def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]:
     """Positions to go through from where the machine stands.
 
     Raises
@@ -160,10 +160,10 @@ def way_back(rewind: Rewind, position_mm: Point) -> tuple[Point, ...]:
     SetupDisturbed
         It does not stand on the way that it came.
     """
-    if not rewind.trail:
+    if not resume_trail.trail:
         return ()
-    trail, here = np.array(rewind.trail), np.array(position_mm)
-    segment, off_mm = _nearest(trail, here, rewind.to, latest=rewind.latest)
+    trail, here = np.array(resume_trail.trail), np.array(position_mm)
+    segment, off_mm = _nearest(trail, here, resume_trail.to, latest=resume_trail.latest)
     if off_mm > OFF_PATH_MM:
         raise SetupDisturbed(
             f"the machine stands {off_mm:.3f} mm beside the way that the test came",
@@ -171,7 +171,8 @@ def way_back(rewind: Rewind, position_mm: Point) -> tuple[Point, ...]:
         )
     if len(trail) == 1:
         return ()
-    points = rewind.trail[rewind.to : segment + 1][::-1] or rewind.trail[segment + 1 : rewind.to + 1]  # it may stand before it, too
+    way, to = resume_trail.trail, resume_trail.to
+    points = way[to : segment + 1][::-1] or way[segment + 1 : to + 1]  # it may stand before it, too
     return tuple(p for k, p in enumerate(points) if k or np.abs(np.array(p) - here).max() > 1e-5)
 
 

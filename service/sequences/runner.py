@@ -9,7 +9,7 @@ from typing import Any
 
 from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point
 from abbe.drivers.errors import Refused
-from abbe.drivers.flags import bar_is_out, bar_is_valid
+from abbe.drivers.flags import air_is_compensated, bar_is_out, bar_is_valid
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
 from abbe.service.runs.recorder import Recorder
@@ -18,7 +18,7 @@ from abbe.service.sequences.control import Control
 from abbe.service.sequences.guard import motion_guard
 from abbe.service.sequences.interlocks import AT_WORK, PAUSED, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
-from abbe.service.sequences.path_resume import Onward, Way
+from abbe.service.sequences.path_resume import PathRemainder, Way
 from abbe.service.sequences.paths import bar_trouble, follow_path, record_path
 from abbe.service.sequences.preconditions import ExpectedTable
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
@@ -80,7 +80,6 @@ async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, he
     }
 
 
-COMPENSATED = 3
 SAME_PLACE_MM = 1e-3
 MM_PER_COUNT = 1e-7
 BY_MOVES = 12
@@ -133,7 +132,7 @@ class Runner:
         """A point was read that the attempts before had not; of paths only the store can say."""
         self.way: Way | None = None
         """How far the path that is recorded came."""
-        self._onward: Onward | None = None
+        self._remainder: PathRemainder | None = None
         self.records: list[dict[str, Any]] = []
         """Laser records since the zero: what a continued run can begin with."""
 
@@ -148,7 +147,7 @@ class Runner:
             The axes are stopped before the error leaves.
         """
         attempt = attempt or Attempt()
-        self._onward = attempt.onward
+        self._remainder = attempt.remainder
         result: dict[str, int] = {}
         done, clock = 0.0, asyncio.get_running_loop().time
         # The guard stands outside: what it has to say of a stop that did not get through must not be lost with the watcher's own errors.
@@ -244,24 +243,24 @@ class Runner:
 
     async def _gone_back(self, attempt: Attempt, recorder: Recorder, watch: Watch) -> Point | None:
         """Back to the last checkpoint, along the way that the test came; gives where the machine stands then, None if it did not move."""
-        rewind = attempt.rewind
-        if not rewind.trail:
+        resume_trail = attempt.resume_trail
+        if not resume_trail.trail:
             return None
         status = await self._s.controller.status()
-        watch.beam = bool(rewind.carried)
-        points = way_back(rewind, status.position_mm)
+        watch.beam = bool(resume_trail.carried)
+        points = way_back(resume_trail, status.position_mm)
         if len(points) <= BY_MOVES:
             for point in points:
-                await self._safe_place(MoveTo(point, rewind.feed_mm_min), watch)
-                await self._move(point, rewind.feed_mm_min, None)
+                await self._safe_place(MoveTo(point, resume_trail.feed_mm_min), watch)
+                await self._move(point, resume_trail.feed_mm_min, None)
         else:
-            await follow_path(self._s.controller, FollowPath(points, rewind.feed_mm_min), self._control)
-        for point in rewind.trail[rewind.to + 1 : rewind.upto + 1]:
-            await self._safe_place(MoveTo(point, rewind.feed_mm_min), watch)
-            await self._move(point, rewind.feed_mm_min, None)
-        if rewind.carried:
-            await self._same_as(rewind.carried[-1], recorder, rewind.carried)
-        return rewind.trail[rewind.upto]
+            await follow_path(self._s.controller, FollowPath(points, resume_trail.feed_mm_min), self._control)
+        for point in resume_trail.trail[resume_trail.to + 1 : resume_trail.upto + 1]:
+            await self._safe_place(MoveTo(point, resume_trail.feed_mm_min), watch)
+            await self._move(point, resume_trail.feed_mm_min, None)
+        if resume_trail.carried:
+            await self._same_as(resume_trail.carried[-1], recorder, resume_trail.carried)
+        return resume_trail.trail[resume_trail.upto]
 
     async def _same_as(self, last: dict[str, Any], recorder: Recorder, carried: tuple[dict[str, Any], ...]) -> None:
         """Read the last complete point again: only if it says the same, nothing was knocked and no count was lost."""
@@ -323,7 +322,7 @@ class Runner:
     async def _recorded(self, step: RecordPath, recorder: Recorder) -> dict[str, int]:
         await self._stands_at(step.points_mm[0])
         self.way = Way(step)
-        return await record_path(self._s, step, recorder, self._control, self.way, self._onward)
+        return await record_path(self._s, step, recorder, self._control, self.way, self._remainder)
 
     async def _zeroed(self) -> None:
         laser = self._s.need_laser()
@@ -355,7 +354,7 @@ class Runner:
         laser = self._s.need_laser()
         before = await laser.read()
         reading = await laser.read(after_count=before.sample_count)  # a sample that began after the axes had settled
-        if not reading.status >> COMPENSATED & 1:
+        if not air_is_compensated(reading.status):
             raise MeasurementFault("the laser's environmental compensation was switched off during the run", "start the test again")
         return {
             "host_s": reading.host_s,

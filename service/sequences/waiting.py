@@ -12,10 +12,10 @@ from abbe.service.errors import BeamLost, DoorOpen, Interlock
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import CAN_CLEAR, Suspending, Watching, somebody_at_work
 from abbe.service.sequences.journal import GOES_ON, WAITS, Journal
-from abbe.service.sequences.preconditions import ExpectedTable, check_world
+from abbe.service.sequences.preconditions import ExpectedTable, check_preconditions
 
 LOOK_S = 0.1
-"""Signal low now, no reflector: unlike a lost count these clear by themselves."""
+"""How often a pause looks at devices and at what was asked."""
 
 
 async def paused(
@@ -46,7 +46,7 @@ async def paused(
         control.now(State.PAUSED, why)
         await visits.during(control.resumed())
         try:
-            await check_world(session, expected, watching, beam=beam)
+            await check_preconditions(session, expected, watching, beam=beam)
         except Interlock as trouble:
             if isinstance(trouble, BeamLost) or control.hurry:
                 raise
@@ -122,7 +122,7 @@ async def suspended(
         control.check()
         await visits.look()
         try:
-            await check_world(session, expected, watching, beam=False)
+            await check_preconditions(session, expected, watching, beam=False)
             if beam:
                 await _signal(session)
         except Interlock as now:

@@ -240,7 +240,7 @@ class SlotRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class StationRecord:
+class HeartbeatRecord:
     """What the service of a machine said of itself last."""
 
     machine: str

@@ -14,7 +14,7 @@ from abbe.service.storage.repositories.checkpoints import CheckpointStore
 from abbe.service.storage.repositories.decisions import DecisionStore
 from abbe.service.storage.repositories.discoveries import DiscoveryStore
 from abbe.service.storage.repositories.health import HealthStore
-from abbe.service.storage.repositories.heartbeats import StationStore
+from abbe.service.storage.repositories.heartbeats import HeartbeatStore
 from abbe.service.storage.repositories.pages import PageStore
 from abbe.service.storage.repositories.people import PeopleStore
 from abbe.service.storage.repositories.proposals import ProposalStore
@@ -35,7 +35,7 @@ class Store(
     PushStore,
     QueueStore,
     SlotStore,
-    StationStore,
+    HeartbeatStore,
     AlarmStore,
     PeopleStore,
     AuditStore,

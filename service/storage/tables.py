@@ -233,7 +233,7 @@ slots = Table(
     UniqueConstraint("schedule", "slot_utc"),
 )
 
-stations = Table(
+heartbeats = Table(
     "stations",
     metadata,
     Column("id", Integer, primary_key=True),

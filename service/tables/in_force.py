@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from abbe.drivers.api import Controller
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import TableMismatch
 from abbe.service.push.book import read_entries
@@ -57,7 +57,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
     corrects: dict[int, bool] = {}  # what was read of tables that no journal has: the same bytes are not read every ten seconds
 
     async def look() -> InForce:
-        with alone(site.urls.cnc):
+        with lock_machine(site.urls.cnc):
             pass  # not held, as for preconditions: who comes to measure is not turned away by somebody who only looks
         async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
             known = await asyncio.to_thread(known_tables, store)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from abbe.drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
@@ -10,6 +12,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate_numbers import size_reasons, together_reasons
 
 KIND_NINE = 1
 
@@ -44,44 +47,33 @@ def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
 
 
 def check_limits(tables: NineTables, active: NineTables | None, limits: PushLimits) -> None:
-    """Refuse, never clamp: value, change against the active table, step between neighbours, zero at the reference (reliability.md 3.3).
+    """Refuse, never clamp, the tables of a test step: size, change against the active table, steps, zero at the reference
+    (reliability.md 3.3). They may bend as they like.
 
     Raises
     ------
     TableRefused
         Which table, where, how much over which limit. Nothing has been written.
     """
+    against, limits = [], replace(limits, second_mm=np.inf)
     for a in range(3):
+        position = tables.position_mm[a]
         for i in range(3):
             values = tables.correction_mm[a][:, i]
             before = np.zeros_like(values)
             if active is not None:
-                before = np.interp(tables.position_mm[a], active.position_mm[a], active.correction_mm[a][:, i])
+                before = np.interp(position, active.position_mm[a], active.correction_mm[a][:, i])
             name = f"table of {AXES[i]} over {AXES[a]}"
             if not np.isfinite(values).all():
                 raise TableRefused(f"{name}: holds values that are no numbers", "check the solution; nothing was written")
-            checks = (
-                ("value", np.abs(values), limits.value_mm, "table_value_um"),
-                ("change against the active table", np.abs(values - before), limits.change_mm, "table_change_um"),
-                ("step between neighbours", np.abs(np.diff(values)), limits.step_mm, "table_step_um"),
-            )
-            for what, size, limit, key in checks:
-                k = int(np.argmax(size))
-                if size[k] > limit:
-                    at = tables.position_mm[a][k]
-                    raise TableRefused(
-                        f"{name}: {what} {size[k] * 1e3:.1f} µm at {at:.1f} mm exceeds the limit of {limit * 1e3:.1f} µm",
-                        f"check the measurement; if the machine is really so, raise {key} under [limits]. Nothing was written",
-                    )
             if abs(values[0]) > 5e-7:
                 raise TableRefused(f"{name}: not zero at its reference", "shift the table; nothing was written")
+            against += [f"{no} ({name})" for no in size_reasons(position.tolist(), values.tolist(), before.tolist(), limits)]
     for i in range(3):
-        total = sum(float(np.abs(tables.correction_mm[a][:, i]).max()) for a in range(3))
-        if total > limits.value_mm:
-            raise TableRefused(
-                f"the three tables of {AXES[i]} together reach {total * 1e3:.1f} µm, the limit is {limits.value_mm * 1e3:.1f} µm",
-                "check the measurement; if the machine is really so, raise table_value_um under [limits]. Nothing was written",
-            )
+        total_mm = sum(float(np.abs(tables.correction_mm[a][:, i]).max()) for a in range(3))
+        against += together_reasons(AXES[i], total_mm, limits)
+    if against:
+        raise TableRefused("; ".join(against), "raise the limit in the machine file if the machine is really so. Nothing was written")
 
 
 def tables_from_image(image: bytes) -> NineTables | None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import Journal, facts
 from abbe.service.push.states import BEFORE_ACTIVATION, PushState
@@ -14,18 +15,6 @@ from abbe.service.tables.push_history import operator_needed, pushes_of
 from abbe.service.tables.unverified import PushedTable, known_tables
 
 OPEN, STOPPED = "open", "stopped"
-
-
-@dataclass(frozen=True, slots=True)
-class PushOutcome:
-    """How it ended, and the sentence to it.
-
-    ``kept``: the new table is in force, and was verified. ``rolled back``: it was, and the old one is again. ``refused``, ``failed``,
-    ``stopped`` (by a person): the new one never was in force. ``open``: it may be in force and nobody has verified it.
-    """
-
-    word: str
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +34,7 @@ def last_push(store: Store, machine: str) -> int:
     return max((entry.push for entry in read_entries(store, machine)), default=0)
 
 
-def in_force(store: Store, machine: str, proposal: int, after: int) -> PushOutcome | None:
+def in_force(store: Store, machine: str, proposal: int, after: int) -> JobOutcome | None:
     """How the last push of a proposal stands, of those later than push ``after``; None: the journal has none, nothing was written.
 
     Raises
@@ -56,12 +45,12 @@ def in_force(store: Store, machine: str, proposal: int, after: int) -> PushOutco
     return _last_own(store, machine, lambda number, doc: number > after and doc.get("proposal") == proposal, Names())
 
 
-def ordered(store: Store, machine: str, order: str) -> PushOutcome | None:
+def ordered(store: Store, machine: str, order: str) -> JobOutcome | None:
     """How the push of an ordered rollback stands; None: the journal has none, nothing was written. Raises as `in_force` does."""
     return _last_own(store, machine, lambda _, doc: doc.get("order") == order, BACK)
 
 
-def _last_own(store: Store, machine: str, own: Callable[[int, dict[str, Any]], bool], names: Names) -> PushOutcome | None:
+def _last_own(store: Store, machine: str, own: Callable[[int, dict[str, Any]], bool], names: Names) -> JobOutcome | None:
     docs = {table.id: table.doc for table in store.tables()}
     journals = pushes_of(read_entries(store, machine))
     mine = [journal for number, journal in journals.items() if own(number, docs.get(int(facts(journal).get("table", 0)), {}))]
@@ -90,7 +79,7 @@ def _other(push: PushedTable) -> str:
     return f"push {push.push} of machine {push.machine!r}{at} stands at {push.state}: {what}"
 
 
-def by_journal(store: Store, machine: str, proposal: int, after: int, said: PushOutcome) -> PushOutcome:
+def by_journal(store: Store, machine: str, proposal: int, after: int, said: JobOutcome) -> JobOutcome:
     """What was said of a push, put right by the journal.
 
     Raises
@@ -101,37 +90,37 @@ def by_journal(store: Store, machine: str, proposal: int, after: int, said: Push
     return put_right(in_force(store, machine, proposal, after), said)
 
 
-def put_right(found: PushOutcome | None, said: PushOutcome) -> PushOutcome:
+def put_right(found: JobOutcome | None, said: JobOutcome) -> JobOutcome:
     """What was said of a push, and what the journal says (None: nothing of it), as one."""
     if found is None:
-        return said if said.word in ("refused", STOPPED) else PushOutcome("failed", said.text)
+        return said if said.word in ("refused", STOPPED) else JobOutcome("failed", said.text)
     if found.word == said.word:
         return said
     word = STOPPED if (found.word, said.word) == ("failed", STOPPED) else found.word
-    return PushOutcome(word, f"{found.text}; {said.text}")
+    return JobOutcome(word, f"{found.text}; {said.text}")
 
 
-def outcome_of(journal: Journal, names: Names = Names()) -> PushOutcome:
+def outcome_of(journal: Journal, names: Names = Names()) -> JobOutcome:
     """How a push stands by its journal."""
     last, known = journal[-1], facts(journal)
     name, why = f"push {last.push}", str(known.get("why", ""))
     match last.state:
         case PushState.KEEP:
-            return PushOutcome("kept", f"{name}: {names.new} is kept and in force: {known.get('verify', '')}")
+            return JobOutcome("kept", f"{name}: {names.new} is kept and in force: {known.get('verify', '')}")
         case PushState.ROLLED_BACK:
-            return PushOutcome("rolled back", f"{name}: {names.old} is in force again: {why}")
+            return JobOutcome("rolled back", f"{name}: {names.old} is in force again: {why}")
         case PushState.REJECTED:
-            return PushOutcome("refused", f"{name}: nothing was written: {'; '.join(known.get('reasons', [])) or why}")
+            return JobOutcome("refused", f"{name}: nothing was written: {'; '.join(known.get('reasons', [])) or why}")
         case PushState.ABORTED:
-            return PushOutcome("failed", f"{name}: {names.old} is in force, {names.it} never was: {why}")
+            return JobOutcome("failed", f"{name}: {names.old} is in force, {names.it} never was: {why}")
         case PushState.ACCEPTED:
             new = known["accepted_crc"] == known["crc"]
-            return PushOutcome("kept" if new else "rolled back", f"{name}: a person vouches for {names.new if new else 'another table'}")
+            return JobOutcome("kept" if new else "rolled back", f"{name}: a person vouches for {names.new if new else 'another table'}")
         case PushState.OPERATOR:
-            return PushOutcome(OPEN, f"{operator_needed(journal)}; a person has to look")
+            return JobOutcome(OPEN, f"{operator_needed(journal)}; a person has to look")
         case state if state in BEFORE_ACTIVATION:
-            return PushOutcome(OPEN, f"{name} stands at {state}: {names.old} is in force; the next start closes the journal")
+            return JobOutcome(OPEN, f"{name} stands at {state}: {names.old} is in force; the next start closes the journal")
     pending = f" ({known['pending']})" if known.get("pending") else ""
-    return PushOutcome(
+    return JobOutcome(
         OPEN, f"{name} stands at {last.state}{pending}: an unverified table may be in force; it is taken back before anything else"
     )

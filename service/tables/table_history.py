@@ -20,7 +20,7 @@ Doc = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class PushTold:
+class PushSummary:
     """One push. ``proposal``: 0 for none; ``why``: the reason that a person gave for a rollback; ``by``: who approved or ordered it."""
 
     push: int
@@ -62,16 +62,16 @@ class RollbackOffer:
 
 
 @dataclass(frozen=True, slots=True)
-class Story:
+class TableHistory:
     """Everything of a machine's tables. ``offer``: None where nothing can be taken back, ``refusal`` says why."""
 
     now: CurrentTable
-    pushes: tuple[PushTold, ...]
+    pushes: tuple[PushSummary, ...]
     offer: RollbackOffer | None
     refusal: str
 
 
-def story(store: Store, machine: str, control: str = "") -> Story:
+def table_history(store: Store, machine: str, control: str = "") -> TableHistory:
     """Read the journal of a machine, newest push first; ``control``: identity of its control, empty where it is not known.
 
     Raises
@@ -86,11 +86,11 @@ def story(store: Store, machine: str, control: str = "") -> Story:
         offer, refusal = offer_of(entries, _rollbacks(docs)), ""
     except TableRefused as no:
         offer, refusal = None, no.detail
-    return Story(_now(entries, told), tuple(reversed(told)), offer, refusal)
+    return TableHistory(_now(entries, told), tuple(reversed(told)), offer, refusal)
 
 
 def offered(store: Store, machine: str, control: str = "") -> RollbackOffer:
-    """What can be ordered back now, by the journal (`story`).
+    """What can be ordered back now, by the journal (`table_history`).
 
     Raises
     ------
@@ -128,7 +128,7 @@ def _doc(journal: Journal, docs: Mapping[int, Doc]) -> Doc:
     return docs.get(int(facts(journal).get("table", 0)), {})
 
 
-def _told(journal: Journal, doc: Doc) -> PushTold:
+def _told(journal: Journal, doc: Doc) -> PushSummary:
     last, known = journal[-1], facts(journal)
     kind = str(doc.get("kind", "push"))
     outcome = outcome_of(journal, BACK if kind == KIND else Names())
@@ -137,13 +137,13 @@ def _told(journal: Journal, doc: Doc) -> PushTold:
     text = outcome.text if ended is None else str(known.get(ended, ""))
     proposal = doc.get("proposal")
     by, reason = str(known.get("approved_by", "")), str(doc.get("reason", ""))
-    return PushTold(
+    return PushSummary(
         last.push, kind, proposal if isinstance(proposal, int) else 0, int(known.get("crc", 0)), int(known.get("base_crc", 0)),
         journal[0].utc, last.utc, str(last.state), outcome.word, text, by, reason,
     )  # fmt: skip
 
 
-def _now(entries: list[JournalEntry], told: tuple[PushTold, ...]) -> CurrentTable:
+def _now(entries: list[JournalEntry], told: tuple[PushSummary, ...]) -> CurrentTable:
     crc, settled = wanted_by(entries)
     if not entries:
         return CurrentTable(None, "", 0, "", "no push of this machine is in the journal")

@@ -141,7 +141,7 @@ def _said_strange(store: Store, machine: str, entries: Sequence[JournalEntry], c
     """Whether the machine's service saw a strange table when it was heard last, and neither a table came into force since nor a check found
     the journal's one in force.
     """
-    said = store.stations().get(machine)
+    said = store.heartbeats().get(machine)
     if said is None or not strange_table(said.doc.get("attention") or []):
         return False
     seen = datetime.fromisoformat(said.seen_utc)

@@ -29,7 +29,7 @@ from abbe.service.web.frame import Framed
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
 from abbe.service.web.login.access import PUBLIC, needs
-from abbe.service.web.login.auth_middleware import Guard
+from abbe.service.web.login.auth_middleware import AuthMiddleware
 from abbe.service.web.login.authentication import Authenticator
 from abbe.service.web.login.login import add_login
 from abbe.service.web.metrics import add_metrics
@@ -169,7 +169,7 @@ def create_app(
         add_metrics(app, parts.store, parts.core, parts.machine, parts.control)
     app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
     app.add_middleware(Framed, routes=app.router.routes, behind_tls=app.behind_tls)  # inside of the guard: it knows who asks
-    app.add_middleware(Guard, routes=app.router.routes, door=door)
+    app.add_middleware(AuthMiddleware, routes=app.router.routes, door=door)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[as_in_host_header(host) for host in hosts])
     return app
 

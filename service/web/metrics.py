@@ -12,7 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
-from abbe.service.channel.messages import Moment
+from abbe.service.channel.messages import Snapshot
 from abbe.service.errors import CoreSilent
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.roles import Permission
@@ -63,7 +63,7 @@ class _Figures(Collector):
         yield figures
 
 
-def _of_core(moment: Moment) -> Iterator[Metric]:
+def _of_core(moment: Snapshot) -> Iterator[Metric]:
     devices = GaugeMetricFamily("abbe_device_connected", "1: used or answered last, 0: fault or not used yet", labels=["role"])
     for device in moment.devices:
         devices.add_metric([device.role], float(device.state in {"in use", "answered"}))

@@ -1,4 +1,4 @@
-"""What status words mean: every word against the tables of docs/protocols, read from the documents themselves."""
+"""What status words mean: those of the controller against docs/protocols/cnc.md; those of bar and laser, typed in from their pages."""
 
 from __future__ import annotations
 
@@ -69,8 +69,9 @@ def test_the_bar_says_that_it_reads(word: int):
 @pytest.mark.parametrize("word", range(32))
 def test_the_laser_says_that_it_counts(word: int):
     """Bit 0 beam lost (latched), 1 signal low now, 2 zeroed, 3 air compensated, 4 no reflector."""
-    lost, low, zeroed, missing = (bool(word >> k & 1) for k in (0, 1, 2, 4))
+    lost, low, zeroed, compensated, missing = (bool(word >> k & 1) for k in range(5))
     assert flags.beam_is_gone(word) == (lost or missing)
     assert flags.beam_is_good(word) == (not (lost or low or missing))
     assert flags.signal_is_there(word) == (not (low or missing))
     assert flags.is_zeroed(word) == zeroed
+    assert flags.air_is_compensated(word) == compensated

@@ -18,7 +18,7 @@ from abbe.service.campaigns.campaign_run import Confirm
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.recover import recover
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, Helix, Linear
 from abbe.service.sequences.recipes.setups import shared_setups
@@ -59,7 +59,7 @@ async def job(words: dict[str, Any]) -> None:
     site = Site("sim", MACHINE, machine_doc("sim", MACHINE), urls)
     with Store.open(f"sqlite:///{Path(words['folder']) / 'abbe.sqlite3'}") as store:
         campaign = plan(words["name"])
-        with alone(urls.cnc):
+        with lock_machine(urls.cnc):
             await at_work(urls, store, site, campaign, confirm)
 
 

@@ -12,8 +12,8 @@ import pytest
 from abbe.drivers.errors import DriverError, Refused, ReplyTimeout, SettingsChanged, WrongDevice
 from abbe.service.campaigns.measure import measure
 from abbe.service.compensation.correct import correct, push
+from abbe.service.compensation.gate import PushContext
 from abbe.service.errors import ConfigError
-from abbe.service.events import ignore_progress
 from abbe.service.sequences.needed import needed_by
 from abbe.service.sequences.recipes.recipe import HelixPoints
 from abbe.service.sequences.steps import CampaignPlan
@@ -106,7 +106,7 @@ async def test_no_table_is_written_that_could_not_be_measured_afterwards(place: 
     b, store = place
     session = replace(b.session, **{missing: None})
     with pytest.raises(ConfigError, match=f"add {missing} = "):
-        await correct(session, store, b.site, "june", [], progress=ignore_progress)
+        await correct(PushContext(session, store, b.site), "june", [])
     with pytest.raises(ConfigError, match=f"add {missing} = "):
-        await push(session, store, b.site, 1, [], progress=ignore_progress)
+        await push(PushContext(session, store, b.site), 1, [])
     assert b.sim.table_accesses() == []

@@ -14,7 +14,7 @@ import pytest
 
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.service.compensation.commission_levels import RESTART, commission_levels
-from abbe.service.compensation.proved_levels import check_level, standing
+from abbe.service.compensation.proved_levels import check_level, level_status
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.errors import StillActive, TableRefused, UnsafeToMove
 from abbe.service.push.book import read_entries
@@ -192,7 +192,7 @@ async def test_an_honest_controller_is_proved_and_may_be_pushed_into_by_night(pl
     assert comp.owner(b.sim.now_s()) == 0
     assert b.sim.world.controller.position_mm == pytest.approx(where, abs=1e-5)
     assert bank.parse(comp.words[1 - active])[0] == 1  # the copy stays
-    assert (await standing(b.session.controller, store, b.site)).hint == ""
+    assert (await level_status(b.session.controller, store, b.site)).hint == ""
     assert (await push(b, store, attended=False, slope=2e-5)).kept
     assert facts(tuple(e for e in read_entries(store, "sim") if e.push == 2))["level"] == 3
 
@@ -279,13 +279,13 @@ async def test_another_firmware_is_another_controller(place, monkeypatch):
         return replace(await honest(), firmware="map 1, newer")
 
     monkeypatch.setattr(b.session.controller, "identify", newer, raising=False)
-    now = await standing(b.session.controller, store, b.site)
+    now = await level_status(b.session.controller, store, b.site)
     assert now.level == 2
     assert "another firmware" in now.hint
     with pytest.raises(TableRefused, match="a person who approves"):
         await push(b, store, attended=False)
     other = replace(b.site, name="another machine")
-    assert "never proved" in (await standing(b.session.controller, store, other)).hint
+    assert "never proved" in (await level_status(b.session.controller, store, other)).hint
 
 
 async def test_a_restart_between_two_commissionings_is_evidence(place):

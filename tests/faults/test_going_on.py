@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.campaigns.campaign_run import Resumed, nobody
+from abbe.service.campaigns.campaign_run import Resumed, decline
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import resume
-from abbe.service.errors import DoorOpen, EstopPressed, Interlock, Stopped, TemperatureOutside, UnsafeToMove, WorldChanged
+from abbe.service.errors import DoorOpen, EstopPressed, Interlock, PreconditionsChanged, Stopped, TemperatureOutside, UnsafeToMove
 from abbe.service.events import Progress
 from abbe.service.sequences.control import State
 from abbe.service.sequences.interlocks import Suspending, Watching
@@ -137,7 +137,7 @@ async def broken_off(b: Bench, store: Store, kind: str = "Linear", step: int = 9
     return plan
 
 
-async def going_on(b: Bench, store: Store, plan: CampaignPlan, confirm=nobody) -> Resumed:
+async def going_on(b: Bench, store: Store, plan: CampaignPlan, confirm=decline) -> Resumed:
     found = await resume(b.session, store, b.site, plan, "c", confirm)
     await measure(b.session, store, b.site, plan, manner=Manner(confirm=confirm, resumed=found))
     return found
@@ -221,15 +221,15 @@ async def test_a_changed_world_is_refused_in_one_line(place):
     b, store = place
     plan = await broken_off(b, store)
     other = CampaignPlan("c", (small("Linear", n=6),))
-    with pytest.raises(WorldChanged, match="begun with another recipe"):
+    with pytest.raises(PreconditionsChanged, match="begun with another recipe"):
         await resume(b.session, store, b.site, other, "c", yes)
     moved = replace(b.site, doc=b.site.doc | {"tool_mm": [0.0, 0.0, -100.0]})
-    with pytest.raises(WorldChanged, match="another machine, or its description was changed"):
+    with pytest.raises(PreconditionsChanged, match="another machine, or its description was changed"):
         await resume(b.session, store, moved, plan, "c", yes)
     comp, registers = b.sim.world.controller.comp, b.sim.registers
     crc = comp.crcs[comp.active]
     comp.crcs[comp.active] = crc ^ 1
-    with pytest.raises(WorldChanged, match="another compensation table is active"):
+    with pytest.raises(PreconditionsChanged, match="another compensation table is active"):
         await resume(b.session, store, b.site, plan, "c", yes)
     comp.crcs[comp.active] = crc
     b.sim.world.controller.set_door(is_open=True)
@@ -238,7 +238,7 @@ async def test_a_changed_world_is_refused_in_one_line(place):
     b.sim.world.controller.set_door(is_open=False)
     registers._boot_id ^= 1
     await b.session.controller.identify()
-    with pytest.raises(WorldChanged, match="the controller was restarted since this campaign began"):
+    with pytest.raises(PreconditionsChanged, match="the controller was restarted since this campaign began"):
         await resume(b.session, store, b.site, plan, "c", yes)
     assert len(statuses(store)) == 1
 

@@ -12,7 +12,7 @@ import pytest
 
 from abbe.drivers.errors import Rebooted
 from abbe.service.campaign_data.run_times import times
-from abbe.service.campaigns.campaign_run import nobody
+from abbe.service.campaigns.campaign_run import decline
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.errors import Interlock
@@ -165,7 +165,7 @@ async def test_nobody_vouches_and_it_begins_again(place):
     b, store = place
     plan = helix()
     await broken(b, store, plan, 9.0)
-    said = await gone_on(b, store, plan, nobody)
+    said = await gone_on(b, store, plan, decline)
     assert said.endswith("test begins again")
     assert "pieces" not in runs(store)[-1].start_doc["path"]
     assert [r.status for r in runs(store)] == ["failed", "complete"]

@@ -12,7 +12,7 @@ import pytest
 from abbe.service.campaigns.campaign_run import gone_on, items, mounted_anew
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import resume
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.errors import (
     ProgramRuns,
     SpindleTurns,
@@ -46,8 +46,8 @@ def test_before_a_bar_change_nothing_moves_and_the_place_is_looked_at():
     item = gone_on(items(on_one_cup(100.0, 60.0))[1], None, ())
     end = end_of(on_one_cup(100.0, 60.0).tests[0])
     assert end is not None
-    assert item.rewind.trail == (end,)
-    assert way_back(item.rewind, end) == ()
+    assert item.resume_trail.trail == (end,)
+    assert way_back(item.resume_trail, end) == ()
     assert isinstance(item.left.steps[0], TakeBarOut)
 
 
@@ -118,13 +118,13 @@ async def test_a_campaign_whose_process_lives_is_not_gone_on_with(place):
 
 def test_a_machine_is_one_process_s(tmp_path, monkeypatch):
     monkeypatch.setenv("ABBE_LOCK_FOLDER", str(tmp_path))
-    with alone("modbus+tcp://127.0.0.1:1?unit=1"):
-        second = alone("modbus+tcp://127.0.0.1:1")
+    with lock_machine("modbus+tcp://127.0.0.1:1?unit=1"):
+        second = lock_machine("modbus+tcp://127.0.0.1:1")
         with pytest.raises(UnsafeToMove, match=r"the machine at modbus\+tcp://127\.0\.0\.1:1 is in use by process \d+"):
             second.__enter__()
-        with alone("modbus+tcp://127.0.0.1:2"):
+        with lock_machine("modbus+tcp://127.0.0.1:2"):
             pass
-    with alone("modbus+tcp://127.0.0.1:1"):
+    with lock_machine("modbus+tcp://127.0.0.1:1"):
         pass
 
 

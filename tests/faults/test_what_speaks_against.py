@@ -17,16 +17,16 @@ import pytest
 from abbe.drivers.api import LaserReading
 from abbe.drivers.errors import DeviceFault
 from abbe.service.campaigns import campaign_run
-from abbe.service.campaigns.campaign_run import nobody
+from abbe.service.campaigns.campaign_run import decline
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import begun_source
 from abbe.service.errors import (
     ConfigError,
     DoorOpen,
     EstopPressed,
+    PreconditionsChanged,
     StatusUnknown,
     Stopped,
-    WorldChanged,
 )
 from abbe.service.events import Progress
 from abbe.service.sequences.control import Control, State
@@ -187,7 +187,7 @@ async def test_a_mirror_whose_count_was_lost_and_whose_axes_were_moved_is_mounte
 
 
 async def resume_all(b: Bench, store: Store, plan: CampaignPlan) -> None:
-    await going_on(b, store, plan, nobody)
+    await going_on(b, store, plan, decline)
 
 
 # ---- what changed meanwhile ---------------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ async def test_a_table_that_changes_while_a_question_stands_is_found(place):
         comp.crcs[comp.active] ^= 1
         return True
 
-    with pytest.raises(WorldChanged, match="another compensation table is active"):
+    with pytest.raises(PreconditionsChanged, match="another compensation table is active"):
         await going_on(b, store, plan, confirm)
     assert len(store.runs()) == runs
 
@@ -233,7 +233,7 @@ def test_a_campaign_whose_journal_names_no_recipe_is_one_line(tmp_path):
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         campaign = store.add_campaign(store.add_machine("m", {}), "c", {})
         store.add_checkpoint(campaign, "begun", {"plan": "", "source": {}})
-        with pytest.raises(WorldChanged, match="the journal of campaign 'c' does not name its recipe"):
+        with pytest.raises(PreconditionsChanged, match="the journal of campaign 'c' does not name its recipe"):
             begun_source(store, "c")
 
 

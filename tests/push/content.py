@@ -28,4 +28,4 @@ def images(codec: Any) -> tuple[bytes, bytes, bytes]:
 
 @cache
 def meanings(module: Any) -> Any:
-    return cache(module.meaning_of_bytes)
+    return cache(module.semantic_digest_of_image)

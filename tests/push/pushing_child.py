@@ -30,7 +30,7 @@ from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import check_chain, facts
 from abbe.service.push.execute import push, recover
 from abbe.service.push.order import OperationOrder
-from abbe.service.push.semantic_digest import meaning_of_tables
+from abbe.service.push.semantic_digest import semantic_digest_of_tables
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image
 
@@ -123,7 +123,7 @@ async def _work(words: dict[str, Any]) -> dict[str, Any]:
             port = KillingPort(ControllerPort(controller, people(clock, better=words.get("better", True)), clock), killer)
             if words["do"] == "push":
                 image = encode(table_image(tables(words["height"]), 100, words["height"]))
-                meaning = meaning_of_tables(tables(words["height"]))
+                meaning = semantic_digest_of_tables(tables(words["height"]))
                 order = OperationOrder(MACHINE, image, zlib.crc32(image), meaning, "limits", words["owner"] << 16)
                 ended = await push(port, KillingBook(await StoreBook.new(store, MACHINE, clock), killer), order)
             else:

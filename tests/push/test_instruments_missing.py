@@ -22,7 +22,7 @@ from abbe.service.compensation.push_approved import PushOrder, push_approved
 from abbe.service.config import load_machine
 from abbe.service.events import ignore_progress
 from abbe.service.jobs.check import run_check
-from abbe.service.jobs.guided_campaign import led_campaign
+from abbe.service.jobs.guided_campaign import run_guided_campaign
 from abbe.service.jobs.investigate import InvestigationContext
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.recipes.campaigns import identification
@@ -121,7 +121,7 @@ async def test_a_led_campaign_does_so(tmp_path: Path, nothing: str) -> None:
     async with killed_push(tmp_path) as left:
         site = site_of(load_machine(machine_file(left, tmp_path, nothing)).machine)
         with pytest.raises(DriverError, match=re.escape(nothing)):
-            await led_campaign(full(site, left), {}, "ann")
+            await run_guided_campaign(full(site, left), {}, "ann")
         assert await left.active() == left.base
 
 
@@ -130,7 +130,7 @@ async def test_a_led_campaign_without_any_laser_does_so(tmp_path: Path) -> None:
     async with killed_push(tmp_path) as left:
         site = site_of(load_machine(machine_file(left, tmp_path, None)).machine)
         with pytest.raises(Exception, match="needs a laser for test"):
-            await led_campaign(full(site, left), {}, "ann")
+            await run_guided_campaign(full(site, left), {}, "ann")
         assert await left.active() == left.base
 
 

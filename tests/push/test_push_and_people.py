@@ -16,7 +16,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation.pushing import AGAIN_S, Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import PushNotBegun, StillActive, TableMismatch
-from abbe.service.push.adapter import BEAT_S, ControllerPort, nobody
+from abbe.service.push.adapter import BEAT_S, ControllerPort, no_actors
 from abbe.service.push.book import read_entries
 from abbe.service.push.operations import Done, Operation, OperationKind, Verdict
 from abbe.service.push.states import PushState
@@ -127,7 +127,7 @@ async def test_a_control_that_refuses_an_activation_and_does_it_later_is_found(m
 
 async def test_moving_axes_and_an_open_door_reach_the_push_as_not_safe(machine) -> None:
     b, _ = machine
-    port = ControllerPort(b.session.controller, nobody(), SystemClock())
+    port = ControllerPort(b.session.controller, no_actors(), SystemClock())
 
     async def unsafe() -> str:
         looked = await port.execute(Operation(OperationKind.LOOK), ())

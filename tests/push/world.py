@@ -332,7 +332,7 @@ class World:
 
     def order(self) -> Any:
         case = self.case
-        meaning = self.p.semantic_digest.meaning_of_tables(tables(55))
+        meaning = self.p.semantic_digest.semantic_digest_of_tables(tables(55))
         return self.p.order.OperationOrder(
             "M", self.candidate, c.zlib.crc32(self.candidate), meaning, "limits", OWNER, case.level, case.attended, CHUNK_WORDS
         )

@@ -19,7 +19,7 @@ from abbe.service.cli.administration.serve import duties_on
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.proposal_checks import approve
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import standing
+from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.config import load_machine
 from abbe.service.config_timetable import AlarmSection
 from abbe.service.devices.session import open_session
@@ -28,7 +28,7 @@ from abbe.service.errors import StoreError
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.check import CheckResult, run_check
 from abbe.service.push.limits import PushLimits
-from abbe.service.scheduler.alarm_manager import AlarmManager, Telling
+from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
@@ -65,7 +65,7 @@ class Shop:
         return alarms_of(self.store, "sim")
 
     def state(self, number: int) -> str:
-        return standing(self.store, number, load(self.store, number), SystemClock().utc().timestamp()).word
+        return proposal_status(self.store, number, load(self.store, number), SystemClock().utc().timestamp()).word
 
     def told(self) -> list[dict[str, Any]]:
         found = [json.loads(m.payload) for m in self.store.outbox_pending() if m.topic == TOPICS[1]]
@@ -78,8 +78,8 @@ class Shop:
         full = identification(self.site.machine, rate_hz=RATE_HZ)
         tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
         duties = duties_on(AlarmSection(push="approved"), self.site, CampaignPlan("full", tests), RATE_HZ)(self.store)
-        telling = Telling(TOPICS[1], lambda: None, AuditBook(self.store, self.url), [board])
-        desk = AlarmManager(self.store, clock, "sim", [OFTEN], duties, telling)
+        channels = AlarmChannels(TOPICS[1], lambda: None, AuditBook(self.store, self.url), [board])
+        desk = AlarmManager(self.store, clock, "sim", [OFTEN], duties, channels)
         shelf = StoreShelf(self.store, clock, ("sim", self.store.add_machine("sim", self.site.doc)), TOPICS, lambda: None)
 
         async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:

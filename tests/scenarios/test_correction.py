@@ -15,6 +15,7 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.compensation import proposals as workflow
 from abbe.service.compensation import pushing
 from abbe.service.compensation.correct import correct
+from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, Session, open_session
@@ -22,7 +23,7 @@ from abbe.service.errors import MeasurementFault, StillActive, TableMismatch, Ta
 from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.limits import PushLimits
-from abbe.service.push.semantic_digest import meaning_of_tables
+from abbe.service.push.semantic_digest import semantic_digest_of_tables
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc
@@ -50,7 +51,7 @@ class Shop:
         return await load_runs(self.store, await measure(self.session, self.store, self.site, plan, progress=ignore_progress))
 
     async def correct(self, name: str, before: list[dict[str, Any]], watch: Callable[[Progress], None] = ignore_progress):
-        return await correct(self.session, self.store, self.site, name, before, rate_hz=RATE_HZ, progress=watch)
+        return await correct(PushContext(self.session, self.store, self.site, watch, rate_hz=RATE_HZ), name, before)
 
     async def active(self) -> tuple[int, int]:
         now = await self.session.controller.comp_status()
@@ -124,7 +125,7 @@ async def stops_take_it_back(shop: Shop) -> None:
         await shop.correct("june", shop.before[:3])
     warm = replace(shop.site, temperature_c=(30.0, 32.0))
     with pytest.raises(TableRefused, match="°C"):
-        await correct(shop.session, shop.store, warm, "june", shop.before, rate_hz=RATE_HZ, progress=ignore_progress)
+        await correct(PushContext(shop.session, shop.store, warm, rate_hz=RATE_HZ), "june", shop.before)
     assert len(read_entries(shop.store, "sim")) == pushes
 
 
@@ -152,7 +153,7 @@ async def test_a_stop_and_a_wrong_sign_take_the_table_back_and_the_right_one_sta
 
     with monkeypatch.context() as patch:
         patch.setattr(pushing, "table_image", image)
-        patch.setattr(pushing, "meaning_of_tables", lambda tables: meaning_of_tables(flipped(tables)))
+        patch.setattr(pushing, "semantic_digest_of_tables", lambda tables: semantic_digest_of_tables(flipped(tables)))
         with pytest.raises(TableRefused, match="the ball-bar's reading changed by"):
             await shop.correct("june", shop.before)
     assert (shop.state, await shop.active()) == ("ROLLED_BACK", base)

@@ -18,9 +18,10 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.correct import Correction, push
+from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposal_checks import approve, hold
 from abbe.service.compensation.proposal_doc import digest_of_doc, load
-from abbe.service.compensation.proposal_states import standing, standing_of
+from abbe.service.compensation.proposal_states import proposal_status, status_of_proposal
 from abbe.service.compensation.proposals import load_runs, login
 from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved, push_approved
 from abbe.service.config import load_machine
@@ -110,7 +111,7 @@ def try_push(shop: Shop, store: Store, number: int, *, site: Site | None = None,
         async with open_session((site or shop.site).urls) as session:
             ids = [r.id for r in store.runs("start")]
             runs = await load_runs(store, ids)
-            return await push(session, store, site or shop.site, number, runs, progress=ignore_progress, clock=Later(hours))
+            return await push(PushContext(session, store, site or shop.site, clock=Later(hours)), number, runs)
 
     return asyncio.run(work())
 
@@ -313,10 +314,10 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
         assert approved["approved_by"].startswith("anna; pushed by ")
         entries, docs, proposed = read_entries(store, "sim"), {t.id: t.doc for t in store.tables()}, load(store, 1)
         now_s = SystemClock().utc().timestamp()
-        assert standing(store, twin, proposed, now_s).word == "superseded"  # of the same time: banks were written since
+        assert proposal_status(store, twin, proposed, now_s).word == "superseded"  # of the same time: banks were written since
         for k, word in ((0, "proposed"), (1, "pushed"), (len(entries) - 1, "pushed"), (len(entries), "kept")):
-            assert standing_of(1, proposed, [], entries[:k], docs, now_s).word == word
-        assert standing_of(1, proposed, [], [], docs, proposed.valid_until_s).word == "expired"
+            assert status_of_proposal(1, proposed, [], entries[:k], docs, now_s).word == word
+        assert status_of_proposal(1, proposed, [], [], docs, proposed.valid_until_s).word == "expired"
     pushed = shop.words()
     code, out = abbe("push", shop.file, str(twin), "--before", "start")
     assert code == 1

@@ -14,7 +14,7 @@ import pytest
 
 from abbe.drivers.errors import DriverError
 from abbe.service.devices.session import open_session
-from abbe.service.errors import MeasurementFault, WorldChanged
+from abbe.service.errors import MeasurementFault, PreconditionsChanged
 from abbe.service.storage.store import Store
 from tests.scenarios.test_push import active
 from tests.scenarios.verifying import LIMIT_S, LONG, Push, Runs, Shop, long, made_shop, plan_of, state
@@ -155,7 +155,7 @@ async def test_another_table_in_the_middle_is_seen_and_goes_back(shop: Shop) -> 
                 await controller.release(7)
 
             push = Push(shop, store, session, shop.tables(), lambda: switched.append(asyncio.ensure_future(by_hand())))
-            with pytest.raises(WorldChanged, match="another compensation table is active"):
+            with pytest.raises(PreconditionsChanged, match="another compensation table is active"):
                 await push.bring()
             await switched[0]
             assert (await active(session), state(store)) == (base, "ROLLED_BACK")

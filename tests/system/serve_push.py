@@ -18,8 +18,9 @@ from abbe.service.compensation.push_approved import Approved, PushOrder
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.core.setup import ServiceSetup
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress
 from abbe.service.jobs.at_start import recover_at_start
@@ -33,7 +34,6 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.serve import serve
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.tables.base_table import read_base
-from abbe.service.tables.push_outcome import PushOutcome
 from tests.scenarios.test_push import linear_tables
 
 PROPOSAL = Approved(4, 9, 0)
@@ -70,8 +70,8 @@ async def probing(session: Session, store: ServiceStore, site: Site, order: Push
 
 def duties_on(site: Site, last: str) -> Any:
     def duties(store: ServiceStore) -> alarm_manager.Duties:
-        async def push(order: PushOrder) -> PushOutcome:
-            with alone(site.urls.cnc):
+        async def push(order: PushOrder) -> JobOutcome:
+            with lock_machine(site.urls.cnc):
                 async with open_session(site.urls) as session:
                     await recover(session.controller, store, site)
                     await order.begun()
@@ -85,7 +85,7 @@ def duties_on(site: Site, last: str) -> Any:
                     done = await Pushing(session.controller, store, site, control=order.control).bring(
                         wanted, Questions(list, "a test", probe, probe)
                     )
-                    return PushOutcome("kept" if done.kept else "rolled back", done.why)
+                    return JobOutcome("kept" if done.kept else "rolled back", done.why)
 
         async def investigate(*_: object) -> None:
             raise AssertionError

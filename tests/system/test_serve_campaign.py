@@ -22,7 +22,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.campaigns.resume import begun_source
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import standing
+from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
@@ -163,7 +163,7 @@ def test_somebody_at_the_page_is_led_to_a_proposal(tmp_path: Path) -> None:
         assert begun_source(store, first)["recipe"] == "identification"
         proposed = load(store, done["proposal"])
         assert (proposed.by, proposed.solution_id) == ("mia", done["solution"])
-        assert standing(store, done["proposal"], proposed, SystemClock().utc().timestamp()).word == "proposed"
+        assert proposal_status(store, done["proposal"], proposed, SystemClock().utc().timestamp()).word == "proposed"
         assert (store.approvals(done["proposal"]), store.push_entries("sim")) == ([], [])
         told = [(r.who, r.outcome) for r in store.audit(1000) if r.action == "campaign"]
         assert told == [("token:mia/test", word) for word in ("begun", "stopped", "begun", "proposed")]

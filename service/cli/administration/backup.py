@@ -57,11 +57,11 @@ def restore(
     as_json: JsonOption = False,
 ) -> None:
     """Bring a backup back, after its files, its schema and its audit were checked. Refused over a database that exists or is in use."""
-    from abbe.service.backup.restore import restore as bring_back
+    from abbe.service.backup.restore import restore as ordered_rollback
     from abbe.service.clock import SystemClock
 
     into, folder = _places(places, store, "BACKUP")
-    done = bring_back(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
+    done = ordered_rollback(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
     aside = [str(path) for path in done.aside]
     if as_json:
         print_json({"database": str(done.database), "backup": done.backup.doc, "audit_records": done.records, "aside": aside})

@@ -16,14 +16,14 @@ def check_config(
     as_json: JsonOption = False,
 ) -> None:
     """Check a machine file and print its effective values and where each comes from; exit code 2 where something cannot work."""
-    from abbe.service.campaigns.plausibility import doubts
+    from abbe.service.campaigns.plausibility import check_plausibility
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.errors import ConfigError
     from abbe.service.secrets import mask_secrets, visible
 
     loaded = load_machine(file)
-    found = doubts(loaded.machine, loaded.path.resolve().parent, SystemClock().utc().date())
+    found = check_plausibility(loaded.machine, loaded.path.resolve().parent, SystemClock().utc().date())
     database = mask_secrets(loaded.database_url)
     if as_json:
         values = {key: {"value": value, "origin": origin} for key, value, origin in loaded.values()}

@@ -13,16 +13,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from abbe.service.capture.live import LiveFeed
-    from abbe.service.channel.messages import MachineTold
+    from abbe.service.channel.messages import MachineSummary
     from abbe.service.compensation.ordered_rollback import BackOrder
     from abbe.service.compensation.push_approved import PushOrder
     from abbe.service.config import LoadedMachine
     from abbe.service.config_timetable import AlarmSection
-    from abbe.service.core.campaigns import CampaignOrder, MeasureCampaign
-    from abbe.service.core.orders import Hands
+    from abbe.service.core.orders import CampaignOrder, Hands, MeasureCampaign
     from abbe.service.core.setup import ServiceSetup
+    from abbe.service.domain.job_state import JobOutcome
     from abbe.service.events import ProgressSink
-    from abbe.service.jobs.guided_campaign import CampaignOutcome
     from abbe.service.jobs.investigate import Note
     from abbe.service.mqtt.broker import Broker
     from abbe.service.plant.opcua.setup import OpcUaSetup
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site
-    from abbe.service.tables.push_outcome import PushOutcome
     from abbe.service.verification.alarm_states import Alarm
 
 
@@ -74,7 +72,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         the first slot, at night.
     """
     from abbe.service.campaigns.builtin_recipes import RECIPES, campaign_plan
-    from abbe.service.campaigns.plausibility import check_unattended, doubts
+    from abbe.service.campaigns.plausibility import check_plausibility, check_unattended
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
     from abbe.service.core.setup import ServiceSetup
@@ -132,18 +130,18 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         hands=None if site.urls.cnc is None else hands_on(config.alarm, site),
         campaigns=_campaigns(config.alarm.campaign, site, folder),
         campaign=None if site.urls.cnc is None else campaign_on(site, folder, live),
-        doubts=doubts(config, folder, SystemClock().utc().date()).warnings,
+        warnings=check_plausibility(config, folder, SystemClock().utc().date()).warnings,
     )
 
 
-def _told(site: Site) -> MachineTold:
-    from abbe.service.channel.messages import MachineTold
+def _told(site: Site) -> MachineSummary:
+    from abbe.service.channel.messages import MachineSummary
 
     doc = site.doc
     axes = {axis: (float(low), float(high)) for axis, (low, high) in doc["stroke_mm"].items()}
     pivots = {axis: (float(x), float(y), float(z)) for axis, (x, y, z) in doc["pivots_mm"].items()}
     x, y, z = doc["tool_mm"]
-    return MachineTold(doc["chain"], axes, pivots, (float(x), float(y), float(z)), site.max_feed_mm_min)
+    return MachineSummary(doc["chain"], axes, pivots, (float(x), float(y), float(z)), site.max_feed_mm_min)
 
 
 def _broker(loaded: LoadedMachine) -> Broker | None:
@@ -190,7 +188,7 @@ def duties_on(
         async def look_into(one: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
             await investigate(InvestigationContext(site, store, plan, clock, progress, control, live), one, note)
 
-        async def push(order: PushOrder) -> PushOutcome:
+        async def push(order: PushOrder) -> JobOutcome:
             return await push_approved(site, store, order, clock=clock, rate_hz=rate_hz)
 
         return Duties(alarm.warn_days, alarm.campaign, look_into, push if alarm.push == "approved" else None)
@@ -201,15 +199,15 @@ def duties_on(
 def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]:
     """Return what a person can order of tables, given the service's store: a push only where the service does not push by itself."""
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.ordered_rollback import bring_back
+    from abbe.service.compensation.ordered_rollback import ordered_rollback
     from abbe.service.compensation.push_approved import push_approved
     from abbe.service.core.orders import Hands
 
     def on(store: ServiceStore) -> Hands:
-        async def back(order: BackOrder) -> PushOutcome:
-            return await bring_back(site, store, order, clock=SystemClock())
+        async def back(order: BackOrder) -> JobOutcome:
+            return await ordered_rollback(site, store, order, clock=SystemClock())
 
-        async def push(order: PushOrder) -> PushOutcome:
+        async def push(order: PushOrder) -> JobOutcome:
             return await push_approved(site, store, order, clock=SystemClock())
 
         return Hands(back, push if alarm.push == "never" else None)
@@ -220,14 +218,14 @@ def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[ServiceStore], MeasureCampaign]:
     """Return how a full campaign is measured that a person starts, given the service's store."""
     from abbe.service.clock import SystemClock
-    from abbe.service.jobs.guided_campaign import full_campaign, led_campaign, named_now
+    from abbe.service.jobs.guided_campaign import full_campaign, named_now, run_guided_campaign
     from abbe.service.jobs.investigate import InvestigationContext
 
     def on(store: ServiceStore) -> MeasureCampaign:
-        async def measure(order: CampaignOrder) -> CampaignOutcome:
+        async def measure(order: CampaignOrder) -> JobOutcome:
             plan, source = full_campaign(order.recipe, site.machine, folder)
-            bench = named_now(InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live), order.recipe)
-            return await led_campaign(bench, source, order.by)
+            context = named_now(InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live), order.recipe)
+            return await run_guided_campaign(context, source, order.by)
 
         return measure
 

@@ -109,7 +109,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
-    from abbe.service.compensation.comp_signed import SigningRequest, standing
+    from abbe.service.compensation.comp_signed import SigningRequest, seal_status
     from abbe.service.formats.compare import check_same
 
     control, known, at = control_for(form), None, reference_of(reference)
@@ -118,7 +118,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     nominal = known.machine if known is not None else _machine(machine)
     start = at if at is not None else nominal.stroke_mm[:, 0]
     files = read_files(file)
-    worth = standing(file, files, _machine_file(machine), SigningRequest(form, tuple(trust or ()), base), SystemClock().utc())
+    worth = seal_status(file, files, _machine_file(machine), SigningRequest(form, tuple(trust or ()), base), SystemClock().utc())
     found = read_key(form, files, settings_for(control, nominal, start))
     doc: dict[str, Any] = {"tables": _tables(found), "standing": "signed" if worth.signed else "candidate", "why": worth.why}
     if known is not None:

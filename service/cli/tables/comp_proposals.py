@@ -215,10 +215,10 @@ def _row(store: Store, number: int, proposed: Proposed) -> dict[str, Any]:
     from datetime import UTC, datetime
 
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_states import standing
+    from abbe.service.compensation.proposal_states import proposal_status
     from abbe.service.storage.base import utc_text
 
-    now = standing(store, number, proposed, SystemClock().utc().timestamp())
+    now = proposal_status(store, number, proposed, SystemClock().utc().timestamp())
     p, c = proposed.predicted, proposed.candidate
     approvals = [{"name": a.name, "login": a.login, "utc": a.utc, "expiry": a.expiry} for a in store.approvals(number)]
     return {

@@ -30,10 +30,8 @@ def push(
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
     from abbe.service.cli.waiting import taken_back_when_safe
-    from abbe.service.compensation.commission import check_commissioned
     from abbe.service.compensation.correct import push as work_push
-    from abbe.service.compensation.correct import reasons_now
-    from abbe.service.compensation.proved_levels import check_level
+    from abbe.service.compensation.gate import NotAdmitted, PushContext, admit
     from abbe.service.config import load_machine
     from abbe.service.errors import TableRefused
     from abbe.service.site import site_of
@@ -43,27 +41,23 @@ def push(
     site = site_of(loaded.machine)
     said: list[str] = []
 
-    async def work(store: Store) -> Correction | list[str]:
+    async def work(store: Store) -> Correction:
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
-                await check_commissioned(session.controller, store, site)
-                said.append(await check_level(session.controller, store, site))
-                against = await reasons_now(session, store, site, proposal)
-                if against:
-                    return against
+                context = PushContext(session, store, site, sink)
+                said.append((await admit(context, proposal)).hint)
                 runs = await verification_before(session, store, site, before, sink)
                 async with taken_back_when_safe(session, store, site, wait_s):
-                    return await work_push(session, store, site, proposal, runs, progress=sink)
+                    return await work_push(context, proposal, runs)
 
     with Store.open(loaded.database_url) as store:
         try:
             found = run_job(work(store))
         except TableRefused as error:  # the answer is no, not a fault
-            found = [error.detail, *getattr(error, "__notes__", [])]
-    if isinstance(found, list):
-        for reason in found:
-            typer.echo(f"not pushed: {reason}")
-        raise typer.Exit(1)
+            reasons = error.reasons if isinstance(error, NotAdmitted) else (error.detail,)
+            for reason in (*reasons, *getattr(error, "__notes__", [])):
+                typer.echo(f"not pushed: {reason}")
+            raise typer.Exit(1) from None
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
     for line in (*(f"not in the tables: {text}" for text in found.not_for_tables), *filter(None, said)):
         typer.echo(line)

@@ -8,32 +8,32 @@ from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
 from abbe.service.storage.base import StoreBase
 from abbe.service.storage.owner import Owner, this_process
-from abbe.service.storage.records import Doc, StationRecord
-from abbe.service.storage.tables import machines, stations
+from abbe.service.storage.records import Doc, HeartbeatRecord
+from abbe.service.storage.tables import heartbeats, machines
 
 
-class StationStore(StoreBase):
+class HeartbeatStore(StoreBase):
     """The services that write to this database."""
 
-    def put_station(self, machine: str, doc: Doc) -> None:
+    def put_heartbeat(self, machine: str, doc: Doc) -> None:
         """Write what this process, the service of a machine, says of itself now."""
         me = this_process()
         said = {"doc": doc, "seen_utc": self._now(), "owner_host": me.host, "owner_pid": me.pid, "owner_start": me.start}
 
         def work(connection: Connection) -> None:
-            fresh = pg_insert(stations) if connection.dialect.name == "postgresql" else sqlite_insert(stations)
+            fresh = pg_insert(heartbeats) if connection.dialect.name == "postgresql" else sqlite_insert(heartbeats)
             statement = fresh.values(machine=machine, **said)
-            connection.execute(statement.on_conflict_do_update(index_elements=[stations.c.machine], set_=said))
+            connection.execute(statement.on_conflict_do_update(index_elements=[heartbeats.c.machine], set_=said))
 
         self._write(work)
 
-    def stations(self) -> dict[str, StationRecord]:
+    def heartbeats(self) -> dict[str, HeartbeatRecord]:
         """What the services said last, by machine."""
-        query = select(stations).order_by(stations.c.machine)
+        query = select(heartbeats).order_by(heartbeats.c.machine)
         rows = self._read(lambda connection: connection.execute(query).all())
-        return {r.machine: StationRecord(r.machine, r.doc, r.seen_utc, Owner(r.owner_host, r.owner_pid, r.owner_start)) for r in rows}
+        return {r.machine: HeartbeatRecord(r.machine, r.doc, r.seen_utc, Owner(r.owner_host, r.owner_pid, r.owner_start)) for r in rows}
 
     def machine_names(self) -> list[str]:
         """Names of all machines that this database knows, whatever descriptions they have had."""
-        query = select(machines.c.name).union(select(stations.c.machine))
+        query = select(machines.c.name).union(select(heartbeats.c.machine))
         return sorted(str(row[0]) for row in self._read(lambda connection: connection.execute(query).all()))

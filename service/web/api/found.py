@@ -43,7 +43,7 @@ def _no_number(value: object) -> object:
     raise ValueError("expected a date and time, e.g. 2026-11-21T03:00:00Z")
 
 
-Moment = Annotated[datetime, BeforeValidator(_no_number)]
+UtcTime = Annotated[datetime, BeforeValidator(_no_number)]
 
 
 def add_found(app: FastAPI, sources: Sources) -> None:
@@ -56,7 +56,7 @@ def add_found(app: FastAPI, sources: Sources) -> None:
     def trend(
         machine: Annotated[str | None, Query(description="Absent: the machine of this service.")] = None,
         after: Annotated[
-            Moment | None, Query(description="Only later checks (UTC if it does not say); absent: since the table came.")
+            UtcTime | None, Query(description="Only later checks (UTC if it does not say); absent: since the table came.")
         ] = None,
     ) -> Trends:
         """Do the figures of the checks drift, since when, and when do they reach their limits."""

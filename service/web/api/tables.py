@@ -12,7 +12,7 @@ from abbe.service.compensation.proposal_checks import approve as work_approve
 from abbe.service.compensation.proposal_checks import reject as work_reject
 from abbe.service.compensation.proposal_diff import ACTIVE, compare, diff_json
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposal_states import ProposalStatus, check_waiting, standing, standing_of
+from abbe.service.compensation.proposal_states import ProposalStatus, check_waiting, proposal_status, status_of_proposal
 from abbe.service.errors import NotStored, Unusable
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import JournalEntry
@@ -124,7 +124,7 @@ def _standings(sources: Sources, rows: list[Doc]) -> list[s.Proposal]:
                 if machine not in journals:
                     journals[machine] = read_entries(store, machine, sources.control_of(machine))
                 decided = (store.approvals(number), journals[machine], tables, now_s, store.rejections(number))
-                now = standing_of(number, proposed, *decided)
+                now = status_of_proposal(number, proposed, *decided)
         except (Unusable, NotStored) as error:  # one bad row must not hide the others
             now = ProposalStatus("changed", error.detail)
         found.append(_proposal(row, now))
@@ -142,7 +142,7 @@ def _head(row: Doc, now: ProposalStatus) -> Doc:
 
 def _detail(sources: Sources, row: Doc, proposed: Proposed) -> s.ProposalDetail:
     number, store = row["id"], sources.store
-    now = standing(store, number, proposed, sources.clock.utc().timestamp())
+    now = proposal_status(store, number, proposed, sources.clock.utc().timestamp())
     p, c = proposed.predicted, proposed.candidate
     return s.ProposalDetail(
         **_head(row, now),

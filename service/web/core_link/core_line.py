@@ -16,9 +16,9 @@ from abbe.service.channel.messages import (
     Jobs,
     LivePath,
     LiveSamples,
-    Moment,
     PushNow,
     RollBack,
+    Snapshot,
     StartJob,
     SteerJob,
     from_core,
@@ -52,12 +52,12 @@ class CoreLine:
 
     def __init__(self, wire: Wire, clock: Clock) -> None:
         self._wire, self._clock = wire, clock
-        self._moment: Moment | None = None
+        self._moment: Snapshot | None = None
         self._jobs: tuple[JobState, ...] = ()
         self._heard_s = 0.0
         self._numbers = count(1)
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
-        self._listeners: dict[asyncio.Queue[Moment | None], str] = {}
+        self._listeners: dict[asyncio.Queue[Snapshot | None], str] = {}
         self.samples = SampleBoard()
         """What the running path reads."""
 
@@ -73,7 +73,7 @@ class CoreLine:
             message = from_core(body)
             self._heard_s = self._clock.monotonic_s()
             match message:
-                case Moment():
+                case Snapshot():
                     self._moment = message
                     for queue in self._listeners:
                         _put(queue, message)
@@ -96,7 +96,7 @@ class CoreLine:
 
     # ---- what it has said -------------------------------------------------------------------------------------------
 
-    def moment(self) -> Moment:
+    def moment(self) -> Snapshot:
         """How things stand.
 
         Raises
@@ -153,16 +153,16 @@ class CoreLine:
         return self._jobs
 
     @contextmanager
-    def listener(self, who: str = "") -> Iterator[Callable[[], AsyncIterator[Moment]] | None]:
+    def listener(self, who: str = "") -> Iterator[Callable[[], AsyncIterator[Snapshot]] | None]:
         """A way to hear every moment from now on; None: too many listen, or too many of this account. Who is slow hears the newest."""
         if len(self._listeners) >= MOST_LISTENERS or list(self._listeners.values()).count(who) >= MOST_EACH:
             yield None
             return
-        queue: asyncio.Queue[Moment | None] = asyncio.Queue(QUEUE)
+        queue: asyncio.Queue[Snapshot | None] = asyncio.Queue(QUEUE)
         if self._moment is not None:
             queue.put_nowait(self._moment)
 
-        async def moments() -> AsyncIterator[Moment]:
+        async def moments() -> AsyncIterator[Snapshot]:
             while (moment := await queue.get()) is not None:
                 yield moment
 
@@ -212,7 +212,7 @@ class CoreLine:
         raise CoreSilent("the core of the service did not answer in time", "look whether it was done before you ask again")
 
 
-def _put(queue: asyncio.Queue[Moment | None], moment: Moment | None) -> None:
+def _put(queue: asyncio.Queue[Snapshot | None], moment: Snapshot | None) -> None:
     if queue.full():
         queue.get_nowait()
     queue.put_nowait(moment)

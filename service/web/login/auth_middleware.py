@@ -39,7 +39,7 @@ class Visit:
     replayed: bool = False
 
 
-class Guard:
+class AuthMiddleware:
     """Lets through what is allowed.
 
     Parameters

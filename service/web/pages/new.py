@@ -12,7 +12,7 @@ from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
 from abbe.service.campaigns.builtin_recipes import USUAL_HZ
-from abbe.service.channel.messages import RulesTold
+from abbe.service.channel.messages import RulesSummary
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
@@ -55,7 +55,7 @@ def add_new_page(app: FastAPI, env: Environment, door: Authenticator, source: Pa
         )
 
 
-def expired(rules: RulesTold | None, today: date) -> list[tuple[str, date]]:
+def expired(rules: RulesSummary | None, today: date) -> list[tuple[str, date]]:
     """Instruments whose certificate is over, and since when."""
     told = {} if rules is None or rules.calibrated_until is None else rules.calibrated_until
     return [(kind, until) for kind, until in sorted(told.items()) if until < today]

@@ -12,7 +12,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proposal_checks import approve
 from abbe.service.compensation.proposal_diff import HEADINGS, compare, largest, rows
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposal_states import ProposalStatus, check_waiting, standing, standing_of
+from abbe.service.compensation.proposal_states import ProposalStatus, check_waiting, proposal_status, status_of_proposal
 from abbe.service.errors import StoreError
 from abbe.service.push.book import read_entries
 from abbe.service.rendering.plots.table_change import DiffCurve, change_plot
@@ -77,7 +77,7 @@ def proposal_lines(store: Store, clock: Clock | None = None) -> list[ProposalLin
                 _line(
                     record.id,
                     proposed,
-                    standing_of(record.id, proposed, store.approvals(record.id), own, docs, now_s, store.rejections(record.id)),
+                    status_of_proposal(record.id, proposed, store.approvals(record.id), own, docs, now_s, store.rejections(record.id)),
                 )
             )
         except StoreError as error:
@@ -107,7 +107,7 @@ def proposal_screen(store: Store, number: int, clock: Clock | None = None) -> Pr
         Its row was changed after it was stored.
     """
     proposed = load(store, number)
-    now = standing(store, number, proposed, (clock or SystemClock()).utc().timestamp())
+    now = proposal_status(store, number, proposed, (clock or SystemClock()).utc().timestamp())
     difference = compare(store, number, "ACTIVE")
     curves = [DiffCurve(c.moved, c.corrected, c.position_mm, c.old_mm * 1e3, c.new_mm * 1e3, c.u_mm * 1e3) for c in difference.curves]
     # The SVG writer has escaped every text; escaping again would show the reader the tags.

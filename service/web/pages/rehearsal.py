@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from abbe.models.machine import AXES, Machine
 from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, RATES_HZ, RECIPES, named, parted, recipe_plan
-from abbe.service.channel.messages import MachineTold, RulesTold
+from abbe.service.channel.messages import MachineSummary, RulesSummary
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.dry_run_page import picture
@@ -63,10 +63,10 @@ class Rehearsed:
 class Rehearsals:
     """What can be run dry here: the machine as its file describes it, and the recipes that a person may start."""
 
-    told: MachineTold | None = None
+    told: MachineSummary | None = None
     recipes: tuple[str, ...] = ()
     rates_hz: tuple[int, ...] = RATES_HZ
-    rules: RulesTold | None = None
+    rules: RulesSummary | None = None
 
     def choices(self) -> tuple[str, ...]:
         """Recipes that can be chosen: those that can be started first, then the full campaign. Rates are chosen apart.

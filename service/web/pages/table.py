@@ -9,7 +9,7 @@ from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
 from abbe.service.errors import JournalChanged
-from abbe.service.tables.table_history import story
+from abbe.service.tables.table_history import table_history
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.frame import current
@@ -36,7 +36,7 @@ def add_table_screen(app: FastAPI, env: Environment, door: Authenticator, source
     @needs(Permission.READ)
     async def table() -> HTMLResponse:
         try:
-            told = await desk.read(story, sources.store, sources.machine, sources.control)
+            told = await desk.read(table_history, sources.store, sources.machine, sources.control)
         except JournalChanged as error:
             return await desk.show("table.html", 409, broken=error.detail, told=None)
         status = await source.status()

@@ -17,7 +17,7 @@ from tests.patience import within
 ZEROED = 1 << 2
 
 
-class Meter:
+class ProgressMeter:
     """A laser displacement meter behind a Modbus peer."""
 
     def __init__(self, peer) -> None:
@@ -52,8 +52,8 @@ class Meter:
 
 
 @pytest.fixture
-def meter(peer) -> Meter:
-    return Meter(peer)
+def meter(peer) -> ProgressMeter:
+    return ProgressMeter(peer)
 
 
 @pytest.fixture
@@ -198,7 +198,7 @@ async def test_a_reboot_is_noticed_by_the_clock(laser, meter):
 
 
 async def test_a_reboot_behind_a_reconnect_is_noticed_although_the_clock_went_on(tcp_peer):
-    meter = Meter(tcp_peer)
+    meter = ProgressMeter(tcp_peer)
     laser = await open_laser(tcp_peer.url)
     await laser.read()
     meter.boot(8)
@@ -239,7 +239,7 @@ async def test_cancel_during_a_command(laser, meter):
 
 
 async def test_unplugged(tcp_peer):
-    meter = Meter(tcp_peer)
+    meter = ProgressMeter(tcp_peer)
     laser = await open_laser(tcp_peer.url)
     await tcp_peer.stop()
     with pytest.raises(LinkDown):

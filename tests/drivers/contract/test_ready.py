@@ -8,7 +8,7 @@ import sys
 from dataclasses import replace
 
 from abbe.service.clock import SystemClock
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.scheduler.ready import Ready, look_at
@@ -30,7 +30,7 @@ async def test_the_simulated_machine_is_ready_until_somebody_has_it() -> None:
         assert await ready.lack(SCHEDULE) == ""
         colder = Ready(look_at(urls), [SCHEDULE], (seen.air_c - 9, seen.air_c - 5), (), SystemClock())
         assert "the air has" in await colder.lack(SCHEDULE)
-        with alone(urls.cnc):
+        with lock_machine(urls.cnc):
             assert "is in use by" in await ready.lack(SCHEDULE)
         nowhere = Ready(look_at(replace(urls, cnc="modbus+tcp://127.0.0.1:1")), [SCHEDULE], (0.0, 40.0), (), SystemClock())
         assert "the devices cannot be asked" in await nowhere.lack(SCHEDULE)

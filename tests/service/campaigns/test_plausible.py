@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service import cli
-from abbe.service.campaigns.plausibility import Doubts, doubts
+from abbe.service.campaigns.plausibility import Plausibility, check_plausibility
 from abbe.service.cli.administration.serve import setup_of
 from abbe.service.config import load_machine
 from abbe.service.errors import ConfigError
@@ -87,8 +87,8 @@ def written(folder: Path, old: str, new: str) -> Path:
     return path
 
 
-def looked_at(path: Path) -> Doubts:
-    return doubts(load_machine(path).machine, path.parent, TODAY)
+def looked_at(path: Path) -> Plausibility:
+    return check_plausibility(load_machine(path).machine, path.parent, TODAY)
 
 
 def checked(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, str, str]:

@@ -52,7 +52,6 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
         held = SimpleNamespace(by="anna", approval=lambda clock: None)
         work = Work(cast("Any", bench), cast("Any", held), None, None, AFTER)
         monkeypatch.setattr(correct, "Pushing", Decided)
-        monkeypatch.setattr(correct, "check_commissioned", _nothing)
         await correct._push_and_verify(work, cast("Any", None))
         (stored,) = store.verifications()
         assert stored.verdict == ("pass" if kept else "fail")
@@ -61,6 +60,3 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
         with pytest.raises(StoreError) as told:
             await correct._push_and_verify(work, cast("Any", None))
     assert told.value.__notes__ == [WORDS[kept]]
-
-
-async def _nothing(*_: object) -> None: ...

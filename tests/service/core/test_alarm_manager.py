@@ -17,10 +17,11 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import How, SteerJob
 from abbe.service.compensation import push_approved
+from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.push_approved import Approved, PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.devices.machine_lock import ENVIRONMENT
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.events import ProgressSink
@@ -29,13 +30,14 @@ from abbe.service.jobs.investigate import InvestigationContext as Investigation
 from abbe.service.jobs.investigate import Note, investigate
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import PushState as Push
-from abbe.service.scheduler.alarm_manager import AlarmManager, Duties, Telling
+from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.records import AlarmEntryRecord
-from abbe.service.tables.push_outcome import PushOutcome, by_journal, open_push
+from abbe.service.tables.push_outcome import by_journal, open_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
@@ -69,13 +71,13 @@ class Bench:
     url: str
     clock: FakeClock = field(default_factory=lambda: FakeClock(NOON))
     investigate: Investigate | None = None
-    push: Callable[[PushOrder], Awaitable[PushOutcome]] | None = None
+    push: Callable[[PushOrder], Awaitable[JobOutcome]] | None = None
 
     def __post_init__(self) -> None:
         self.machine = self.store.add_machine("mill-7", {"name": "mill-7"})
         duties = Duties(0.0, "identification", self._investigate, self._push)
         self.desk = AlarmManager(
-            self.store, self.clock, "mill-7", [YEARLY], duties, Telling(None, lambda: None, AuditBook(self.store, self.url))
+            self.store, self.clock, "mill-7", [YEARLY], duties, AlarmChannels(None, lambda: None, AuditBook(self.store, self.url))
         )
         self.book = JobRegistry(self._check, ("quick-check",), self._may, self.clock, lambda: None)
         terms = LoopTerms(errands=self.desk, carry=self.book.errand)
@@ -84,14 +86,14 @@ class Bench:
     async def _may(self, who: str) -> bool:
         return who == "user:bob"
 
-    async def _check(self, schedule: Schedule, slot: datetime, control: Control) -> tuple[str, int]:
-        return "done: pass", 1
+    async def _check(self, schedule: Schedule, slot: datetime, control: Control) -> SlotState:
+        return SlotState("done: pass", verification=1)
 
     async def _investigate(self, alarm: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
         assert self.investigate is not None
         await self.investigate(alarm, note, progress, control)
 
-    async def _push(self, order: PushOrder) -> PushOutcome:
+    async def _push(self, order: PushOrder) -> JobOutcome:
         assert self.push is not None
         return await self.push(order)
 
@@ -217,14 +219,14 @@ async def test_a_push_is_a_job_and_is_not_paused_while_a_table_is_not_verified(b
     seen: list[tuple[str, str]] = []
     pausing: list[bool] = []
 
-    async def push(order: PushOrder) -> PushOutcome:
+    async def push(order: PushOrder) -> JobOutcome:
         await order.begun()
         order.control.now(State.RUNNING)
         for hurry in ("a table that nobody has verified may be in force", ""):
             order.control.hurry = hurry
             seen.append(await bench.steer("pause"))
             pausing.append(order.control.pausing)
-        return PushOutcome("refused", "not today")
+        return JobOutcome("refused", "not today")
 
     bench.push = push
     from abbe.service.scheduler.ports import FollowUp
@@ -304,7 +306,7 @@ async def free(alarm: Alarm, note: Note, progress: ProgressSink, control: Contro
 
 
 async def test_a_kept_table_is_kept_whatever_failed_afterwards(bench: Bench) -> None:
-    async def push(order: PushOrder) -> PushOutcome:
+    async def push(order: PushOrder) -> JobOutcome:
         await order.begun()
         await bench.journal(*KEPT, verify="better by 4 µm")
         raise StoreError("the disk is full")
@@ -318,33 +320,33 @@ async def test_a_kept_table_is_kept_whatever_failed_afterwards(bench: Bench) -> 
     assert (begun.kind, begun.doc["approval"], begun.doc["after"]) == (AlarmKind.PUSHING, 9, 0)
 
 
-Heard = Exception | PushOutcome
+Heard = Exception | JobOutcome
 
 
 @pytest.mark.parametrize(
     ("states", "heard", "word", "part"),
     [
-        (KEPT, PushOutcome("failed", "no answer"), "kept", "in force"),
+        (KEPT, JobOutcome("failed", "no answer"), "kept", "in force"),
         (
             (*IN_FORCE, Push.ROLLBACK, Push.ROLLED_BACK),
-            PushOutcome("failed", "no answer"),
+            JobOutcome("failed", "no answer"),
             "rolled back",
             "the old table is in force again",
         ),
         ((*IN_FORCE, Push.ROLLBACK, Push.ROLLED_BACK), ArithmeticError("no number"), "rolled back", "no number"),
         (IN_FORCE, StillActive("the door is open"), "open", "stands at PROBED: an unverified table may be in force"),
-        (IN_FORCE, PushOutcome("rolled back", "as somebody thought"), "open", "an unverified table may be in force"),
-        ((Push.SNAPSHOT, Push.VALIDATED), PushOutcome("failed", "no answer"), "open", "the old table is in force"),
-        ((Push.SNAPSHOT, Push.REJECTED), PushOutcome("failed", "no answer"), "refused", "nothing was written"),
-        ((Push.SNAPSHOT, Push.ABORTED), PushOutcome("kept", "as somebody thought"), "failed", "the new one never was"),
-        ((Push.SNAPSHOT, Push.ABORTED), PushOutcome("stopped", "by a person"), "stopped", "the new one never was"),
+        (IN_FORCE, JobOutcome("rolled back", "as somebody thought"), "open", "an unverified table may be in force"),
+        ((Push.SNAPSHOT, Push.VALIDATED), JobOutcome("failed", "no answer"), "open", "the old table is in force"),
+        ((Push.SNAPSHOT, Push.REJECTED), JobOutcome("failed", "no answer"), "refused", "nothing was written"),
+        ((Push.SNAPSHOT, Push.ABORTED), JobOutcome("kept", "as somebody thought"), "failed", "the new one never was"),
+        ((Push.SNAPSHOT, Push.ABORTED), JobOutcome("stopped", "by a person"), "stopped", "the new one never was"),
         ((), TableRefused("too old"), "failed", "too old"),
-        ((), PushOutcome("refused", "too old"), "refused", "too old"),
-        ((), PushOutcome("kept", "as somebody thought"), "failed", "thought"),
+        ((), JobOutcome("refused", "too old"), "refused", "too old"),
+        ((), JobOutcome("kept", "as somebody thought"), "failed", "thought"),
     ],
 )
 async def test_the_word_is_that_of_the_journal(bench: Bench, states: tuple[Push, ...], heard: Heard, word: str, part: str) -> None:
-    async def push(order: PushOrder) -> PushOutcome:
+    async def push(order: PushOrder) -> JobOutcome:
         await order.begun()
         if states:
             await bench.journal(*states)
@@ -361,21 +363,21 @@ async def test_the_word_is_that_of_the_journal(bench: Bench, states: tuple[Push,
 async def test_a_push_before_this_one_says_nothing_of_it(bench: Bench) -> None:
     await bench.journal(*KEPT)
 
-    async def push(order: PushOrder) -> PushOutcome:
+    async def push(order: PushOrder) -> JobOutcome:
         await order.begun()
-        return PushOutcome("failed", "no answer")
+        return JobOutcome("failed", "no answer")
 
     bench.push = push
     assert (await bench.pushed())[0] == "failed"
-    assert by_journal(bench.store, "mill-7", 4, 0, PushOutcome("failed", "")).word == "kept"
-    assert by_journal(bench.store, "mill-7", 5, 0, PushOutcome("failed", "")).word == "failed"
+    assert by_journal(bench.store, "mill-7", 4, 0, JobOutcome("failed", "")).word == "kept"
+    assert by_journal(bench.store, "mill-7", 5, 0, JobOutcome("failed", "")).word == "failed"
 
 
 async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def push(order: PushOrder) -> PushOutcome:
+    async def push(order: PushOrder) -> JobOutcome:
         await order.begun()
         await bench.journal(*KEPT)
-        return PushOutcome("failed", "no answer")
+        return JobOutcome("failed", "no answer")
 
     bench.push = push
     bench.clock.sleep = lambda s: asyncio.sleep(0)  # type: ignore[method-assign]
@@ -388,14 +390,14 @@ async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(be
     assert (bench.lines()[-1].kind, bench.lines()[-1].doc["word"]) == (AlarmKind.PUSHED, "kept")
 
 
-def _unreadable(*_: object) -> PushOutcome:
+def _unreadable(*_: object) -> JobOutcome:
     raise StoreError("the database is locked")
 
 
 async def test_what_stays_open_is_told_and_told_again_when_it_is_closed(bench: Bench) -> None:
     """As after a stop of the service, and after a door that was open."""
 
-    async def push(order: PushOrder) -> PushOutcome:
+    async def push(order: PushOrder) -> JobOutcome:
         await order.begun()
         await bench.journal(*IN_FORCE)
         await asyncio.Event().wait()
@@ -434,14 +436,12 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
         await safe.wait()
         return "the old table was made active again"
 
-    async def back(ask: Callable[[Control], None]) -> PushOutcome:
+    async def back(ask: Callable[[Control], None]) -> JobOutcome:
         begun.clear()
         control, nothing = Control(), cast("Any", SimpleNamespace(controller=None))
         control.stop()  # before the way back begins
         order = PushOrder(4, cast("Any", None), lambda now: None, control)
-        task = asyncio.create_task(
-            push_approved._back(push_approved._PushContext(nothing, nothing, bench.store, bench.clock, 100), order, told)
-        )
+        task = asyncio.create_task(push_approved._back(PushContext(nothing, bench.store, nothing, clock=bench.clock), order, told))
         async with asyncio.timeout(within(20)):
             await begun.wait()
             ask(control)
@@ -450,7 +450,7 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
     monkeypatch.setattr(push_approved, "finish_when_safe", finish)
     aborted = await back(Control.abort)
     assert (aborted.word, aborted.text.endswith("it is taken back as soon as it can be")) == ("failed", True)
-    assert await back(lambda control: safe.set()) == PushOutcome("rolled back", "the door is open; the old table was made active again")
+    assert await back(lambda control: safe.set()) == JobOutcome("rolled back", "the door is open; the old table was made active again")
 
 
 async def test_what_is_open_by_the_journal(bench: Bench) -> None:

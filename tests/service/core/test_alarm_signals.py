@@ -14,19 +14,19 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
 from abbe.service.scheduler import record
-from abbe.service.scheduler.alarm_manager import AlarmManager, Duties, Telling
+from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.base import utc_text
 from abbe.service.storage.records import PushEntryRecord, VerificationRecord
-from abbe.service.tables.push_outcome import PushOutcome
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, open_alarms, series_begins
 from tests.service.core.fakes import FakeClock, FakeWatcher, Result, utc
@@ -112,7 +112,7 @@ class Bench:
         self.asked: list[Alarm] = []
         self.trouble: Exception | None = None
         self.outcome: Result | Exception = result(0)
-        telling = Telling(TOPICS[1], lambda: None, AuditBook(store, url), [self.watcher])
+        channels = AlarmChannels(TOPICS[1], lambda: None, AuditBook(store, url), [self.watcher])
 
         async def look_into(one: Alarm, note: Note, progress: Any, control: Any) -> None:
             self.asked.append(one)
@@ -120,11 +120,11 @@ class Bench:
                 raise self.trouble
             await note(AlarmKind.ENDED, {"text": "no proposal: the tables promise too little"})
 
-        async def push_one(order: Any) -> PushOutcome:
-            return PushOutcome("kept", "better")
+        async def push_one(order: Any) -> JobOutcome:
+            return JobOutcome("kept", "better")
 
         duties = Duties(14.0, "identification", look_into, push_one if push else None)
-        self.desk = AlarmManager(store, self.clock, "mill-7", [DAILY], duties, telling)
+        self.desk = AlarmManager(store, self.clock, "mill-7", [DAILY], duties, channels)
         shelf = StoreShelf(store, self.clock, ("mill-7", self.machine_id), TOPICS, lambda: None)
         self.job = CheckJob("mill-7", self._check, shelf, [], self.clock, self.desk.checked)
 

@@ -13,11 +13,12 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.channel.messages import MOST_JOBS, Answer, How, StartJob, SteerJob
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, OpenEnds
+from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, PushRecovery
 from abbe.service.core.rights import may_measure
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MachineInUse, StillActive, StoreError
 from abbe.service.scheduler.loop import Scheduler
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.users.passwords import Passwords
@@ -52,12 +53,12 @@ class Bench:
     async def may(self, who: str) -> bool:
         return who in self.allowed
 
-    async def run(self, schedule: Schedule, slot: datetime, control: Control) -> tuple[str, int]:
+    async def run(self, schedule: Schedule, slot: datetime, control: Control) -> SlotState:
         control.now(State.RUNNING)
         self.ran.append(schedule.name)
         await control.unless_stopped(self.may_end.wait())
         control.now(State.ENDED)
-        return "done: pass", len(self.ran)
+        return SlotState("done: pass", verification=len(self.ran))
 
     async def start(self, recipe: str = "quick-check", key: str = "", who: str = "user:bob") -> Answer:
         self.numbers += 1
@@ -182,7 +183,7 @@ class Tries:
     def __init__(self, bench: Bench, *ends: Exception | str | None) -> None:
         self.ends, self.attention, self.changes, self.bench = list(ends), ["something else"], 0, bench
         self.open: bool | StoreError = False
-        open_ends = OpenEnds(self.one, self.is_open, bench.scheduler, bench.shelf, self.attention, bench.clock, self.changed)
+        open_ends = PushRecovery(self.one, self.is_open, bench.scheduler, bench.shelf, self.attention, bench.clock, self.changed)
         self.task = asyncio.create_task(open_ends.run())
 
     async def is_open(self) -> bool:

@@ -18,20 +18,20 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, DoneByHand, How, StartJob, SteerJob
-from abbe.service.core.campaigns import CampaignJobs, CampaignOrder
 from abbe.service.core.jobs import JobRegistry
+from abbe.service.core.orders import CampaignOrder, Ground, full_campaigns
 from abbe.service.core.snapshot import SnapshotSource
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.errors import StoreError, TableMismatch
-from abbe.service.jobs.guided_campaign import CampaignOutcome
 from abbe.service.scheduler.loop import Scheduler
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, Prompts
 from abbe.service.web.core_link.board import Board
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
-LED = CampaignOutcome("proposed", "proposal 4 waits for approval", 7, 4)
+LED = JobOutcome("proposed", "proposal 4 waits for approval", 7, 4)
 BAR, LASER = "hang in the bar", "set up the laser"
 
 
@@ -43,7 +43,7 @@ class Bench:
     audit: AuditBook
     clock: FakeClock = field(default_factory=lambda: FakeClock(utc(2026, 6, 1, 12)))
     orders: list[CampaignOrder] = field(default_factory=list)
-    end: CampaignOutcome | BaseException = LED
+    end: JobOutcome | BaseException = LED
     notes: tuple[str, ...] = ()
     allowed: set[str] = field(default_factory=lambda: {"token:bob/ci", "user:oscar"})
     proposers: set[str] = field(default_factory=lambda: {"token:bob/ci", "user:pia"})
@@ -59,14 +59,15 @@ class Bench:
 
         self.book = JobRegistry(self.check, ("quick-check",), may, self.clock, self.news.set)
         self.board = Board({}, self.clock)
-        self.book.full = CampaignJobs("mill-7", ("identification", "own.toml"), self.measure, self.audit, [self.board]).full(may_propose)
+        ground = Ground("mill-7", may, self.audit, [self.board])
+        self.book.full = full_campaigns(ground, ("identification", "own.toml"), self.measure, may_propose)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
-        self.moments = SnapshotSource(self.board, self.book, list, self.clock)
+        self.snapshots = SnapshotSource(self.board, self.book, list, self.clock)
 
-    async def check(self, schedule: object, slot: datetime, control: Control) -> tuple[str, int]:
+    async def check(self, schedule: object, slot: datetime, control: Control) -> SlotState:
         raise AssertionError
 
-    async def measure(self, order: CampaignOrder) -> CampaignOutcome:
+    async def measure(self, order: CampaignOrder) -> JobOutcome:
         self.orders.append(order)
         self.news.set()
         try:
@@ -131,7 +132,7 @@ async def test_it_asks_goes_on_by_the_right_word_and_ends_with_a_proposal(bench:
     assert bench.scheduler.take("a check") == "by hand: identification at 500 Hz"
     job = bench.book.seen()[0]
     assert (job.kind, job.state, job.prompt, job.ask, job.who) == ("campaign", "asking", 1, BAR, "token:bob/ci")
-    told = bench.moments.now(0).check
+    told = bench.snapshots.now(0).check
     assert told is not None
     assert (told.id, told.state, told.prompt, told.ask) == (job.id, "asking", 1, BAR)
     for prompt, who, outcome in ((1, "user:eve", "forbidden"), (0, "token:bob/ci", "conflict"), (2, "token:bob/ci", "conflict")):
@@ -193,7 +194,7 @@ async def test_one_key_is_one_campaign_and_only_declared_ones_are_started(bench:
 @pytest.mark.parametrize(
     ("end", "state", "text"),
     [
-        (CampaignOutcome("ended", "no proposal: not enough to write"), "done: ended", "no proposal: not enough to write"),
+        (JobOutcome("ended", "no proposal: not enough to write"), "done: ended", "no proposal: not enough to write"),
         (LinkDown("modbus+tcp://127.0.0.1:502", "read", "refused", "is it on?"), "done: failed", "read: refused; is it on?"),
         (ExceptionGroup("two", [TableMismatch("another table", "measure again")]), "done: failed", "another table; measure again"),
     ],

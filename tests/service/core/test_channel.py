@@ -34,7 +34,7 @@ from tests.patience import within
 from tests.service.core.fakes import FakeClock, settle, utc
 
 NOW = utc(2026, 11, 22, 6)
-MOMENT = m.Moment(
+MOMENT = m.Snapshot(
     "moment",
     3,
     RunningCheck(
@@ -79,8 +79,8 @@ CORE = [
         8080,
         False,
         (),
-        m.RulesTold({}, None, None),
-        m.MachineTold("w-Y-X-b-Z-t", {"X": (0.0, 600.0)}, {"X": (0.0, 0.0, 0.0)}, (0.0, 0.0, 150.0), 6000.0),
+        m.RulesSummary({}, None, None),
+        m.MachineSummary("w-Y-X-b-Z-t", {"X": (0.0, 600.0)}, {"X": (0.0, 0.0, 0.0)}, (0.0, 0.0, 150.0), 6000.0),
         ("identification",),
         1024,
         "modbus+tcp://127.0.0.1:502",
@@ -251,8 +251,8 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
     with pytest.raises(CoreSilent):
         line.moment()
     listening = asyncio.create_task(line.listen())
-    with line.listener() as moments:
-        assert moments is not None
+    with line.listener() as snapshots:
+        assert snapshots is not None
         for changes in range(1, 3 * QUEUE):
             pair.core.send(replace(MOMENT, changes=changes))
         pair.core.send(m.Jobs("jobs", (JOB,)))
@@ -260,7 +260,7 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
         await listening
         assert (line.moment().changes, line.jobs()) == (3 * QUEUE - 1, (JOB,))
         line.end()
-        heard = [moment.changes async for moment in moments()]
+        heard = [moment.changes async for moment in snapshots()]
         assert heard == list(range(2 * QUEUE + 1, 3 * QUEUE))  # the newest that fit, and the end
     clock.now_s += SILENT_S + 0.1
     for look in (line.moment, line.jobs, line.next_due, lambda: line.job, lambda: line.devices):

@@ -22,15 +22,15 @@ from abbe.service.compensation.ordered_rollback import BackOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders
 from abbe.service.core.rights import may
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.errors import StoreError
 from abbe.service.push.states import PushState, S
 from abbe.service.scheduler.loop import Scheduler
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.tables.push_history import KIND
-from abbe.service.tables.push_outcome import PushOutcome
-from abbe.service.tables.table_history import story
+from abbe.service.tables.table_history import table_history
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.users.roles import Permission, Role
@@ -50,7 +50,7 @@ class Bench:
     clock: FakeClock = field(default_factory=lambda: FakeClock(utc(2026, 6, 1, 12)))
     orders_seen: list[BackOrder] = field(default_factory=list)
     states: tuple[PushState, ...] = KEPT
-    said: PushOutcome | Exception = field(default_factory=lambda: PushOutcome("kept", "push 2"))
+    said: JobOutcome | Exception = field(default_factory=lambda: JobOutcome("kept", "push 2"))
     may_end: asyncio.Event = field(default_factory=asyncio.Event)
     written: asyncio.Event = field(default_factory=asyncio.Event)
     news: asyncio.Event = field(default_factory=asyncio.Event)
@@ -64,17 +64,17 @@ class Bench:
 
         self.book = JobRegistry(self.check, ("quick-check",), anybody, self.clock, self.news.set)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
-        self.orders = Orders(self.store, self.clock, self.book, Ground(MACHINE, allowed, self.audit), Hands(self.bring_back))
+        self.orders = Orders(self.store, self.clock, self.book, Ground(MACHINE, allowed, self.audit), Hands(self.ordered_rollback))
 
-    async def check(self, schedule: object, slot: datetime, control: Control) -> tuple[str, int]:
+    async def check(self, schedule: object, slot: datetime, control: Control) -> SlotState:
         await self.may_end.wait()
-        return "done: pass", 1
+        return SlotState("done: pass", verification=1)
 
     async def push(self, doc: dict[str, Any], base: bytes, image: bytes, states: tuple[PushState, ...]) -> None:
         """A push in the journal, as far as ``states`` go."""
         await as_if_pushed(self.store, self.clock, MACHINE, doc, (base, image), states)
 
-    async def bring_back(self, order: BackOrder) -> PushOutcome:
+    async def ordered_rollback(self, order: BackOrder) -> JobOutcome:
         self.orders_seen.append(order)
         if self.states:
             await self.push({"kind": KIND, "order": order.ordered.number, "reason": order.ordered.reason}, NEW, OLD, self.states)
@@ -124,7 +124,7 @@ async def test_it_is_a_job_with_who_and_why_in_the_audit(bench: Bench) -> None:
     assert (order.push, order.crc, order.ordered.who, order.ordered.reason) == (1, crc32(NEW), "user:ann", "worse")
     assert bench.recorded() == [("user:ann", "rollback", "begun", "worse"), ("user:ann", "rollback", "kept", "worse")]
     assert bench.audit.verify() == []
-    told = story(bench.store, MACHINE)
+    told = table_history(bench.store, MACHINE)
     assert (told.now.crc, told.now.how, told.now.push) == (crc32(OLD), "ordered", 2)
     assert (told.pushes[0].why, told.pushes[1].proposal) == ("worse", 4)
     assert (told.pushes[1].word, told.pushes[1].text) == ("kept", "better")  # and not that it is in force: it is not any more
@@ -135,15 +135,16 @@ async def test_it_is_a_job_with_who_and_why_in_the_audit(bench: Bench) -> None:
     ("states", "said", "state", "text"),
     [
         (KEPT, StoreError("the disk is full"), "done: kept", "the table ordered back is kept and in force"),
-        (TAKEN_BACK, PushOutcome("kept", "all is well"), "done: rolled back", "the table from before the order is in force again"),
-        (UP_TO_ACTIVE, PushOutcome("kept", "all is well"), "done: open", "an unverified table may be in force"),
+        (TAKEN_BACK, JobOutcome("kept", "all is well"), "done: rolled back", "the table from before the order is in force again"),
+        (UP_TO_ACTIVE, JobOutcome("kept", "all is well"), "done: open", "an unverified table may be in force"),
         ((*UP_TO_ACTIVE[:4], S.ABORTED), OSError("the cable"), "done: failed", "the cable"),
-        ((), PushOutcome("kept", "all is well"), "done: failed", "all is well"),
-        ((), PushOutcome("refused", "door open"), "done: refused", "door open"),
+        ((), JobOutcome("kept", "all is well"), "done: failed", "all is well"),
+        ((), JobOutcome("refused", "door open"), "done: refused", "door open"),
+        ((), ExceptionGroup("watched side by side", [OSError("the cable"), OSError("the other")]), "done: failed", "the cable"),
     ],
 )
 async def test_the_word_is_the_journal_s(
-    bench: Bench, states: tuple[PushState, ...], said: PushOutcome | Exception, state: str, text: str
+    bench: Bench, states: tuple[PushState, ...], said: JobOutcome | Exception, state: str, text: str
 ) -> None:
     await bench.push({}, OLD, NEW, KEPT)
     bench.states, bench.said = states, said
@@ -167,7 +168,7 @@ async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) ->
     await bench.push({}, NEW, OTHER, UP_TO_ACTIVE)
     answer = await bench.ask(push=2)
     assert (answer.outcome, answer.text.split(":")[0]) == ("conflict", "which table is in force is not known")
-    assert story(bench.store, MACHINE).now.crc is None
+    assert table_history(bench.store, MACHINE).now.crc is None
     assert (bench.orders_seen, bench.book.seen(), bench.recorded()) == ([], (), [])
 
 

@@ -142,8 +142,8 @@ def quiet() -> Iterator[None]:
 @pytest.mark.parametrize("zone", ZONES)
 async def test_two_years(zone: str) -> None:
     world = World(zone)
-    moments = sorted([(at, "off", length) for at, length in OFF] + [(BACK[0], "back", BACK[1])])
-    for at, what, length in moments:
+    snapshots = sorted([(at, "off", length) for at, length in OFF] + [(BACK[0], "back", BACK[1])])
+    for at, what, length in snapshots:
         if what == "off":
             await world.live(at, killed=True)
             world.clock.utc_now += length

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.devices import machine_lock as module
-from abbe.service.devices.machine_lock import alone, lock_folder
+from abbe.service.devices.machine_lock import lock_folder, lock_machine
 from abbe.service.errors import MachineInUse, UnsafeToMove
 from tests.patience import within
 
@@ -75,16 +75,16 @@ def test_two_accounts_are_kept_apart_by_a_folder_for_their_group(folder: Path) -
     folder.chmod(0o3770)
     theirs, said = _holder(NOBODY, group)
     assert said == f"has it {NOBODY}"
-    with pytest.raises(MachineInUse, match=rf"in use by process {theirs.pid} \(-c"), alone(URL):
+    with pytest.raises(MachineInUse, match=rf"in use by process {theirs.pid} \(-c"), lock_machine(URL):
         pass
-    with alone("modbus+tcp://127.0.0.1:2"):  # another machine is free
+    with lock_machine("modbus+tcp://127.0.0.1:2"):  # another machine is free
         pass
     _over(theirs)
     (lock,) = [file for file in folder.iterdir() if file.stat().st_uid == NOBODY]
     thief = [sys.executable, "-c", "import os, sys; os.setgroups([54321]); os.setuid(65533); os.unlink(sys.argv[1])", str(lock)]
     assert b"PermissionError" in subprocess.run(thief, check=False, capture_output=True).stderr  # also who is in the group
     assert (lock.stat().st_gid, oct(lock.stat().st_mode & 0o777)) == (group, "0o660")
-    with alone(URL):
+    with lock_machine(URL):
         mine, said = _holder(NOBODY - 1, group)
         assert said.startswith(f"MachineInUse the machine at {URL} is in use by process {os.getpid()} ")
         _over(mine)
@@ -100,14 +100,14 @@ def test_without_an_installation_too(folder: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.delenv(module.ENVIRONMENT)
     monkeypatch.setattr(module, "INSTALLED", folder / "none")
     monkeypatch.setattr(module, "WITHOUT_INSTALLATION", folder / "open")
-    with alone(URL):
+    with lock_machine(URL):
         monkeypatch.setenv(module.ENVIRONMENT, str(folder / "open"))  # for the child, which knows the usual places only
         other, said = _holder(NOBODY)
         assert said.startswith("MachineInUse")
         _over(other)
     other, said = _holder(NOBODY)
     assert said == f"has it {NOBODY}"
-    with pytest.raises(MachineInUse), alone(URL):
+    with pytest.raises(MachineInUse), lock_machine(URL):
         pass
     _over(other)
 
@@ -117,11 +117,11 @@ def test_a_killed_process_gives_it_back_and_a_removed_file_keeps_nobody_out_or_i
     assert said.startswith("has it")
     child.kill()
     child.communicate(timeout=within(20))
-    with alone(URL):
+    with lock_machine(URL):
         (lock,) = folder.iterdir()
     lock.unlink()
-    with alone(URL):
-        again: AbstractContextManager[None] = alone(URL)
+    with lock_machine(URL):
+        again: AbstractContextManager[None] = lock_machine(URL)
         with pytest.raises(MachineInUse):
             again.__enter__()
         assert [file.name for file in folder.iterdir()] == [lock.name]
@@ -129,7 +129,7 @@ def test_a_killed_process_gives_it_back_and_a_removed_file_keeps_nobody_out_or_i
 
 def test_a_folder_that_is_not_there_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(module.ENVIRONMENT, str(folder / "none"))
-    with pytest.raises(UnsafeToMove, match=r"none/\w+\.lock cannot be used \(No such file") as told, alone(URL):
+    with pytest.raises(UnsafeToMove, match=r"none/\w+\.lock cannot be used \(No such file") as told, lock_machine(URL):
         pass
     assert type(told.value) is UnsafeToMove  # nobody has it: waiting would not help
     monkeypatch.delenv(module.ENVIRONMENT)
@@ -166,11 +166,11 @@ def test_a_folder_for_all_accounts_has_to_keep_them_from_each_others_files(folde
     assert shared.stat().st_mode & 0o7777 == 0o1777
     shared.chmod(0o777)
     monkeypatch.setattr(os, "geteuid", lambda: shared.stat().st_uid + 1)
-    with pytest.raises(UnsafeToMove, match="open has the mode 777: the lock of a machine could") as told, alone(URL):
+    with pytest.raises(UnsafeToMove, match="open has the mode 777: the lock of a machine could") as told, lock_machine(URL):
         pass
     assert told.value.remedy == f"let its owner or root do: chmod 1777 {shared}"
     shared.chmod(0o1777)
-    with alone(URL):
+    with lock_machine(URL):
         pass
 
 
@@ -179,22 +179,22 @@ def _full(*_: object) -> int:
 
 
 def test_a_full_disk_and_what_is_no_file_are_told_in_a_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with alone(URL):
+    with lock_machine(URL):
         (lock,) = folder.iterdir()
     with monkeypatch.context() as patch:
         patch.setattr(os, "pwrite", _full)
-        with alone(URL), pytest.raises(MachineInUse, match="by another process"), alone(URL):
+        with lock_machine(URL), pytest.raises(MachineInUse, match="by another process"), lock_machine(URL):
             pass  # nobody hears the holder's name, and it is held
     lock.unlink()
     os.mkfifo(lock)
-    with pytest.raises(UnsafeToMove, match="it is no plain file"), alone(URL):
+    with pytest.raises(UnsafeToMove, match="it is no plain file"), lock_machine(URL):
         pass
     lock.unlink()
     lock.symlink_to(folder / "elsewhere")
-    with pytest.raises(UnsafeToMove, match="symbolic links"), alone(URL):
+    with pytest.raises(UnsafeToMove, match="symbolic links"), lock_machine(URL):
         pass
     assert not (folder / "elsewhere").exists()
     _without(monkeypatch, folder)
     monkeypatch.setattr(Path, "mkdir", _full)
-    with pytest.raises(UnsafeToMove, match=r"open cannot be used \(No space left"), alone(URL):
+    with pytest.raises(UnsafeToMove, match=r"open cannot be used \(No space left"), lock_machine(URL):
         pass

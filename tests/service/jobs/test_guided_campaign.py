@@ -21,9 +21,9 @@ from abbe.service.campaigns.campaign_run import plan_hash
 from abbe.service.cli.administration.serve import _campaigns
 from abbe.service.cli.measure import _plan
 from abbe.service.clock import SystemClock
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
-from abbe.service.jobs.guided_campaign import CampaignOutcome
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes.recipe import Helix, Linear
@@ -71,13 +71,13 @@ async def test_after_the_last_day_of_a_certificate_nothing_is_measured(monkeypat
     bench = pretended(calibrated_until={"laser": date(2020, 5, 31), "ballbar": date(2020, 4, 30)})
     line = Linear("l", "L1", "identify", 0, n=5).plan(MACHINE)
     bench.plan = CampaignPlan("full 1", (line,))
-    led = await work.led_campaign(bench, {}, "bob")
+    led = await work.run_guided_campaign(bench, {}, "bob")
     assert (led.word, "certificate of the laser has ended on 2020-05-31" in led.text, "ball-bar" in led.text) == ("ended", True, False)
 
 
 async def test_without_certificates_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(work, "_measured")
-    led = await work.led_campaign(pretended(calibrated_until={}), {}, "bob")
+    led = await work.run_guided_campaign(pretended(calibrated_until={}), {}, "bob")
     assert (led.word, "no calibration certificate" in led.text) == ("ended", True)
 
 
@@ -87,7 +87,7 @@ async def test_what_is_ended_before_it_begins_asks_no_device(how: str, monkeypat
     bench = pretended(calibrated_until={})
     getattr(bench.control, how)()
     with pytest.raises((Stopped, Aborted)):
-        await work.led_campaign(bench, {}, "bob")
+        await work.run_guided_campaign(bench, {}, "bob")
 
 
 async def test_a_stop_while_a_push_is_taken_back_begins_no_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +105,7 @@ async def test_a_stop_while_a_push_is_taken_back_begins_no_campaign(monkeypatch:
     monkeypatch.delattr(work, "start_campaign")
     bench.live = None
     with pytest.raises(Stopped):
-        await work.led_campaign(bench, {}, "bob")
+        await work.run_guided_campaign(bench, {}, "bob")
 
 
 @pytest.mark.parametrize(
@@ -139,8 +139,8 @@ async def test_an_answer_that_is_no_is_the_end_s_text(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(work, "_measured", measured)
     monkeypatch.setattr(work, "made_of", refuse)
-    led = await work.led_campaign(pretended(), {}, "bob")
-    assert led == CampaignOutcome("ended", f"no proposal: {no}; campaign 'full 1' stays, and `abbe solve` shows what it says")
+    led = await work.run_guided_campaign(pretended(), {}, "bob")
+    assert led == JobOutcome("ended", f"no proposal: {no}; campaign 'full 1' stays, and `abbe solve` shows what it says")
 
 
 async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,8 +153,8 @@ async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypat
 
     monkeypatch.setattr(work, "_measured", measured)
     monkeypatch.setattr(work, "made_of", made)
-    led = await work.led_campaign(pretended(), {}, "bob")
-    assert led == CampaignOutcome("ended", "proposal 3 cannot be approved: LIMITS: too much; STALE", 2, 3)
+    led = await work.run_guided_campaign(pretended(), {}, "bob")
+    assert led == JobOutcome("ended", "proposal 3 cannot be approved: LIMITS: too much; STALE", 2, 3)
     assert seen == ["full 1 by bob"]
 
 
@@ -167,7 +167,7 @@ async def test_a_stop_while_it_is_solved_leaves_no_proposal(monkeypatch: pytest.
     monkeypatch.setattr(work, "_measured", measured)
     monkeypatch.setattr(work, "made_of", made)
     with pytest.raises(Stopped) as told:
-        await work.led_campaign(pretended(), {}, "bob")
+        await work.run_guided_campaign(pretended(), {}, "bob")
     assert "abbe comp propose MACHINE.toml 'full 1'" in told.value.__notes__[0]
 
 
@@ -176,11 +176,11 @@ async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wai
         return SimpleNamespace(position_mm=(300.04, -1.0, 99.96))
 
     control = Control()
-    whoever = work._Whoever(control)
-    whoever.session = SimpleNamespace(controller=SimpleNamespace(status=status))  # type: ignore[assignment]
+    prompted = work._PromptedPerson(control)
+    prompted.session = SimpleNamespace(controller=SimpleNamespace(status=status))  # type: ignore[assignment]
     control.now(State.RUNNING)
     for number, word in ((1, control.prompts.answer), (2, lambda _: control.stop())):
-        asking = asyncio.create_task(whoever.ask("Hang in the bar. Done?"))
+        asking = asyncio.create_task(prompted.ask("Hang in the bar. Done?"))
         await settle()
         assert control.prompts.now is not None
         assert (control.prompts.now.number, control.prompts.now.text) == (

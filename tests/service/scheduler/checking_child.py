@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 from abbe.service.clock import SystemClock
 from abbe.service.domain.schedule import Schedule
 from abbe.service.events import ProgressSink
-from abbe.service.scheduler.heartbeat import Station
+from abbe.service.scheduler.heartbeat import Heartbeat
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.store import ServiceStore
@@ -47,12 +47,12 @@ async def main() -> None:
             return Result(campaign, {"body_diagonal_um": float(len(name))})
 
         shelf = StoreShelf(store, clock, (name, machine_id), ("v", "a"), lambda: None)
-        station = Station(name, "0", store, lambda: [], clock)
-        job, ledger = CheckJob(name, check, shelf, [station], clock), StoreLedger(store, clock, name)
+        heartbeat = Heartbeat(name, "0", store, lambda: [], clock)
+        job, ledger = CheckJob(name, check, shelf, [heartbeat], clock), StoreLedger(store, clock, name)
         sys.stdout.write("ready\n")
         sys.stdout.flush()
         sys.stdin.readline()
-        told = asyncio.create_task(station.run())
+        told = asyncio.create_task(heartbeat.run())
         for done[0] in range(count):
             slot = FIRST + timedelta(minutes=done[0])
             assert await ledger.claim("quick", slot)

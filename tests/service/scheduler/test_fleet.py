@@ -20,10 +20,10 @@ from abbe.service.audit.chain import Event
 from abbe.service.cli import run
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, row, stands, state_of
-from abbe.service.scheduler.heartbeat import SILENT_AFTER, Station
+from abbe.service.scheduler.heartbeat import SILENT_AFTER, Heartbeat
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.owner import Owner, this_process
-from abbe.service.storage.records import StationRecord
+from abbe.service.storage.records import HeartbeatRecord
 from tests.experiments.bench.history_case import START, History, build
 from tests.service.core.fakes import FakeClock
 
@@ -69,7 +69,7 @@ def test_two_services_at_once_are_not_mixed(url: str) -> None:
                 assert [r.start_doc for r in store.runs(campaign.id)] == [{"of": name}]
             assert {slot.state for slot in store.slots_of(f"{name}/quick")} == {"done: pass"}
             assert len(store.slots_of(f"{name}/quick")) == CHECKS
-        assert sorted(store.stations()) == store.machine_names() == sorted(names)
+        assert sorted(store.heartbeats()) == store.machine_names() == sorted(names)
         assert {line.machine: line.state for line in fleet(store, datetime.now(UTC))} == dict.fromkeys(
             names, "not running"
         )  # they have ended
@@ -82,10 +82,10 @@ def test_the_list_of_a_history(url: str, capsys: pytest.CaptureFixture[str]) -> 
         {"schedule": name, "recipe": "quick-check", "due_utc": (now + timedelta(hours=h)).isoformat()} for name, h in (("b", 7), ("a", 2))
     ]
     with ServiceStore.open(url) as store:
-        store.put_station("mill-1", {"state": "waiting", "due": due})
-        store.put_station("mill-2", {"state": "waiting", "due": []})
-        store.put_station("mill-2", {"state": "measuring", "due": []})
-        store.put_station("new-4", {"state": "waiting", "due": []})
+        store.put_heartbeat("mill-1", {"state": "waiting", "due": due})
+        store.put_heartbeat("mill-2", {"state": "waiting", "due": []})
+        store.put_heartbeat("mill-2", {"state": "measuring", "due": []})
+        store.put_heartbeat("new-4", {"state": "waiting", "due": []})
         one, two, three, new = fleet(store, now)
         standing = stands(store, now)
     assert standing == [
@@ -131,7 +131,7 @@ def test_computers_with_one_key_prove_one_audit(postgres: Callable[[], str], tmp
 
 
 def test_a_service_that_is_gone_or_silent_is_not_running() -> None:
-    said = StationRecord("m", {"state": "waiting"}, NOW.isoformat(), this_process())
+    said = HeartbeatRecord("m", {"state": "waiting"}, NOW.isoformat(), this_process())
     assert state_of(None, NOW) == "no service"
     assert state_of(said, NOW) == "waiting"
     assert state_of(said, NOW + SILENT_AFTER + timedelta(seconds=1)) == "not running"
@@ -158,23 +158,23 @@ async def test_a_station_says_every_change_and_goes_on_when_the_database_does_no
         fails = [False]
 
         class Desk:
-            def put_station(self, machine: str, doc: dict) -> None:
+            def put_heartbeat(self, machine: str, doc: dict) -> None:
                 try:
                     if fails[0]:
                         store.run("none")  # a real StoreError
-                    store.put_station(machine, doc)
+                    store.put_heartbeat(machine, doc)
                 finally:  # not before: the test looks into the database, or lets it fail, as soon as it hears of this
                     loop.call_soon_threadsafe(seen.put_nowait, doc["state"])
 
         loop = asyncio.get_running_loop()
-        station = Station("mill-1", "0", Desk(), lambda: [(schedule, NOW + timedelta(hours=1))], clock)
-        task = asyncio.create_task(station.run())
+        heartbeat = Heartbeat("mill-1", "0", Desk(), lambda: [(schedule, NOW + timedelta(hours=1))], clock)
+        task = asyncio.create_task(heartbeat.run())
         assert await seen.get() == "waiting"
         fails[0] = True
-        station.job_started(schedule, NOW)
+        heartbeat.job_started(schedule, NOW)
         assert await seen.get() == "measuring"
         fails[0] = False
-        station.job_ended(None)
+        heartbeat.job_ended(None)
         assert await seen.get() == "waiting"
         task.cancel()
         with pytest.raises(asyncio.CancelledError):

@@ -152,8 +152,8 @@ def watched(ask: Any) -> None:
         ask.add_alarm_entry("mill-7", None if seq == 0 else 1, seq, "raised", DOC, [("a/alarm", {"code": "ALM-001"})])
     ask.alarm_entries("mill-7"), ask.alarm_entries("MILL-7")
     for name in ("mill-7", "MILL-7", "mill-7"):
-        ask.put_station(name, DOC | {"name": name})
-    ask.stations(), ask.machine_names()
+        ask.put_heartbeat(name, DOC | {"name": name})
+    ask.heartbeats(), ask.machine_names()
     ask.put_message("a/state", DOC), ask.outbox_add("a/alarm", b"\x00\xff"), ask.outbox_add("a/state", "ü"), ask.waiting_messages()
     ask.outbox_done(1), ask.outbox_done(2), ask.outbox_done(77), ask.outbox_prune(1), ask.outbox_pending(2)
     ask.outbox_shed(("a/alarm",), 2, 1, lambda count, first, last: ("a/alarm", f"{count} {first} {last}".encode())), ask.outbox_pending()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from abbe.drivers.api import BarSample, Condition, ControllerStatus
 from abbe.service.errors import RunInterrupted, StretchDiffers
 from abbe.service.runs.pieces import RunPiece, SoFar, arc_of
-from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, Onward, SameStretch, Way, rest_of_path
+from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, PathRemainder, SameStretch, Way, rest_of_path
 from abbe.service.sequences.recipes.recipe import Circle
 from abbe.service.sequences.resume_plan import rest_of, way_back
 from abbe.service.sequences.steps import MountBar, RecordPath
@@ -74,7 +74,7 @@ def test_the_pieces_and_the_rest_are_the_whole_path_once(shares, leads):
     step = path((40, 560) if leads else None)
     begins_mm, pieces, counted_mm = float(ARC[40]) if leads else 0.0, [], float(ARC[40]) if leads else 0.0
     ends_mm = float(ARC[560]) if leads else float(ARC[-1])
-    onward, rest = None, step
+    remainder, rest = None, step
     for share in shares:
         good = counted_mm + share * (float(ARC[-1]) - counted_mm)
         before = so_far(good, counted_mm)
@@ -83,21 +83,23 @@ def test_the_pieces_and_the_rest_are_the_whole_path_once(shares, leads):
             # only where there is no room for lead and stretch, before what counts already or before the end
             assert min(good, ends_mm) < max(counted_mm, 0.5 * FEED_MM_S) + 0.5 * FEED_MM_S + 3.0
             continue
-        rest, begin, onward = found
-        pieces = list(onward.pieces)
+        rest, begin, remainder = found
+        pieces = list(remainder.pieces)
         assert rest.points_mm == POINTS[begin:]
         assert rest.measured is not None
-        counted_mm = onward.offset_mm + float(arc_of(rest.points_mm)[rest.measured[0]])
-        assert onward.pieces[-1].to_mm == pytest.approx(counted_mm)
-        assert onward.pieces[-1].to_mm <= good + 1e-6
-        assert onward.arc_mm[0] >= 0.5 * FEED_MM_S - 1e-6  # the lead
-        assert onward.arc_mm[0] >= counted_mm - onward.offset_mm - 1e-6  # what was read on the stretch before the break is only compared
-        assert onward.offset_mm + onward.arc_mm[-1] <= good + 1e-6
-        assert onward.arc_mm[-1] - onward.arc_mm[0] >= 0.5 * FEED_MM_S - 2.0 * FEED_MM_S / 200.0 - 1.0
-    if onward is not None and rest.measured is not None:
-        ends = [begins_mm, *(p.to_mm for p in onward.pieces)]
+        counted_mm = remainder.offset_mm + float(arc_of(rest.points_mm)[rest.measured[0]])
+        assert remainder.pieces[-1].to_mm == pytest.approx(counted_mm)
+        assert remainder.pieces[-1].to_mm <= good + 1e-6
+        assert remainder.arc_mm[0] >= 0.5 * FEED_MM_S - 1e-6  # the lead
+        assert (
+            remainder.arc_mm[0] >= counted_mm - remainder.offset_mm - 1e-6
+        )  # what was read on the stretch before the break is only compared
+        assert remainder.offset_mm + remainder.arc_mm[-1] <= good + 1e-6
+        assert remainder.arc_mm[-1] - remainder.arc_mm[0] >= 0.5 * FEED_MM_S - 2.0 * FEED_MM_S / 200.0 - 1.0
+    if remainder is not None and rest.measured is not None:
+        ends = [begins_mm, *(p.to_mm for p in remainder.pieces)]
         assert all(b > a for a, b in pairwise(ends))
-        assert onward.offset_mm + arc_of(rest.points_mm)[rest.measured[1]] == pytest.approx(ends_mm)
+        assert remainder.offset_mm + arc_of(rest.points_mm)[rest.measured[1]] == pytest.approx(ends_mm)
 
 
 def test_too_little_begins_again():
@@ -106,11 +108,13 @@ def test_too_little_begins_again():
     assert rest_of_path(path(), so_far(300.0)) is not None
 
 
-def read(onward: Onward, off_mm: float, *, status: int = 0b1000, noise_mm: float = 3e-4, seed: int = 1, lost: bool = False) -> SameStretch:
-    compare, rng = SameStretch(onward, 200), np.random.default_rng(seed)
+def read(
+    remainder: PathRemainder, off_mm: float, *, status: int = 0b1000, noise_mm: float = 3e-4, seed: int = 1, lost: bool = False
+) -> SameStretch:
+    compare, rng = SameStretch(remainder, 200), np.random.default_rng(seed)
     compare.see(BarSample(2**31 if lost else 99, 500, 0, 0))
-    for k in range(ceil(onward.arc_mm[-1] / FEED_MM_S * 200.0) + 3):
-        at = onward.offset_mm + (k + 0.5) / 200.0 * FEED_MM_S
+    for k in range(ceil(remainder.arc_mm[-1] / FEED_MM_S * 200.0) + 3):
+        at = remainder.offset_mm + (k + 0.5) / 200.0 * FEED_MM_S
         reading_mm = np.sin(at / 20.0) * 0.01 + off_mm + noise_mm * rng.standard_normal()
         compare.see(BarSample(100 + k, 1000 + 5000 * k, round(reading_mm * 1e6), status))
     return compare
@@ -133,9 +137,9 @@ def test_a_steep_stretch_is_no_knock():
     """Either beginning is known to half a period: at 6000 mm/min and 50 Hz that is 2 mm of path."""
     slope = 0.002
     at = np.arange(0.0, 60.0, 0.1)
-    onward = Onward((RunPiece(1, 100.0),), 0.0, 500.0, 100.0, at, slope * at, 5)
+    remainder = PathRemainder((RunPiece(1, 100.0),), 0.0, 500.0, 100.0, at, slope * at, 5)
     for shift in (-0.5, 0.0, 0.5):
-        compare = SameStretch(onward, 50)
+        compare = SameStretch(remainder, 50)
         compare.see(BarSample(0, 0, 0, 0))
         for k in range(40):
             compare.see(BarSample(1 + k, 20000 * (1 + k), round(slope * (k + 0.5 + shift) * 2.0 * 1e6), 0b1000))
@@ -166,9 +170,9 @@ def test_on_a_circle_whose_places_are_passed_twice_it_goes_back_a_lead_and_a_str
     at = np.arange(0.0, good, FEED_MM_S / 200.0)
     mounted = next(k for k, s in enumerate(circle.steps) if isinstance(s, MountBar))
     known = SoFar((RunPiece(1, good),), 0.0, at, 0.0 * at, 5)
-    _, _, rewind, onward = rest_of(circle, mounted, (), None, known)
-    assert onward is not None
+    _, _, resume_trail, remainder = rest_of(circle, mounted, (), None, known)
+    assert remainder is not None
     stands = [float(np.interp(good + 7.0, arc, np.array(step.points_mm)[:, a])) for a in range(3)]
-    way = [tuple(stands), *way_back(rewind, (stands[0], stands[1], stands[2]))]
-    assert sum(dist(a, b) for a, b in pairwise(way)) == pytest.approx(good + 7.0 - onward.offset_mm, abs=0.1)
-    assert way[-1] == step.points_mm[int(np.searchsorted(arc, onward.offset_mm - 1e-6))]
+    way = [tuple(stands), *way_back(resume_trail, (stands[0], stands[1], stands[2]))]
+    assert sum(dist(a, b) for a, b in pairwise(way)) == pytest.approx(good + 7.0 - remainder.offset_mm, abs=0.1)
+    assert way[-1] == step.points_mm[int(np.searchsorted(arc, remainder.offset_mm - 1e-6))]

@@ -9,7 +9,7 @@ import pytest
 from abbe.drivers.api import BarBatch, BarSample, Condition
 from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.service.campaigns.measure import OpenCampaign, measure_test
-from abbe.service.campaigns.progress import Meter
+from abbe.service.campaigns.progress import ProgressMeter
 from abbe.service.devices.session import Session
 from abbe.service.errors import MeasurementFault
 from abbe.service.sequences.guard import UNDELIVERED, motion_guard, warnings_of
@@ -175,7 +175,7 @@ class Clock:
 
 def test_the_time_a_person_takes_does_not_spoil_the_eta():
     clock, seen = Clock(), []
-    meter = Meter("job", 100.0, seen.append, clock)
+    meter = ProgressMeter("job", 100.0, seen.append, clock)
     clock.now_s = 300.0
     meter.at(0.0, "mounted", waited_s=300.0)
     clock.now_s = 310.0

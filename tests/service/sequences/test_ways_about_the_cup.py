@@ -69,10 +69,10 @@ def test_another_bar_is_reached_over_the_pole_and_along_its_own_sphere(radii, pl
     assert clear_mm(second.steps, end_of(first)) > 0.9 * min(radii)
     dry_run(MACHINE, second)
     # and where the test is broken off on that way, the machine goes back along it
-    left, offset, rewind, _ = rest_of(second, 0, (), end_of(first))
+    left, offset, resume_trail, _ = rest_of(second, 0, (), end_of(first))
     assert offset == 1
-    assert rewind.trail[0] == end_of(first)
-    assert clear_mm(left.steps, rewind.trail[rewind.to]) > 0.9 * min(radii)
+    assert resume_trail.trail[0] == end_of(first)
+    assert clear_mm(left.steps, resume_trail.trail[resume_trail.to]) > 0.9 * min(radii)
 
 
 def test_each_end_is_held_against_its_own_bar_where_bars_are_changed():

@@ -218,7 +218,7 @@ def test_a_table_that_somebody_else_changed_is_unverified_until_a_person_has_loo
     world.board.attention.append(text)
     assert world.status().verified.why == "changed"
     assert world.fleet().verdict == "pass"
-    world.store.put_station("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
+    world.store.put_heartbeat("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
     assert world.fleet().verdict == "unverified"
     world.accept(b"a stranger's table")
     assert world.known().why == "accepted"
@@ -228,14 +228,14 @@ def test_a_check_measured_after_what_the_service_saw_ends_it(world: World) -> No
     """The service is gone, and so is what it said last: a check found the journal's table in force since."""
     world.push(OLD, NEW)
     text = f"{STRANGE}: somebody else changed the compensation in force"
-    world.store.put_station("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
+    world.store.put_heartbeat("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
     world.check("pass")
     assert world.known().why == "changed", "with which table, nobody wrote down"
     world.check("pass", b"a stranger's table")
     assert world.known().why == "changed"
     world.check("pass", NEW)
     assert (world.known().why, world.fleet().verdict) == ("check", "pass")
-    world.store.put_station("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
+    world.store.put_heartbeat("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
     assert world.known().why == "changed", "seen again"
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from abbe.service.compensation.proposal_checks import reject, valid_approval
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import check_waiting, standing
+from abbe.service.compensation.proposal_states import check_waiting, proposal_status
 from abbe.service.errors import TableRefused
 from abbe.service.storage.repositories.decisions import RejectionRecord
 from tests.service.web.api_bench import Plant
@@ -117,7 +117,7 @@ async def test_a_rejection_is_final_and_says_why(client, plant, fresh):
     assert (answer.status_code, answer.json()["decision"], answer.json()["reason"]) == (200, "rejected", "the cup was loose <b>\ufffd")
     now_s = plant.clock.utc().timestamp()
     proposed = load(plant.store, fresh)
-    assert standing(plant.store, fresh, proposed, now_s).word == "rejected"
+    assert proposal_status(plant.store, fresh, proposed, now_s).word == "rejected"
     with pytest.raises(TableRefused, match="rejected"):
         check_waiting(plant.store, fresh, proposed, now_s)
     after = await decide(client, fresh, "approve", who, key=f"z{fresh}")

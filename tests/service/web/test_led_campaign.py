@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
-from abbe.service.channel.messages import Answer, DoneByHand, Jobs, Moment, Outcome, StartJob, from_web
+from abbe.service.channel.messages import Answer, DoneByHand, Jobs, Outcome, Snapshot, StartJob, from_web
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobState
@@ -47,7 +47,7 @@ class Desk:
     asked: list[Any] = field(default_factory=list)
     answer: tuple[Outcome, str, str] = ("done", "", NUMBER)
 
-    async def says(self, job: JobState, moment: Moment) -> None:
+    async def says(self, job: JobState, moment: Snapshot) -> None:
         self.far.send(Jobs("jobs", (job,)))
         with self.core.listener() as moments:
             assert moments is not None
@@ -67,7 +67,7 @@ class Desk:
         return (await self.client.get(path, headers=who)).text
 
 
-def asking(prompt: int) -> Moment:
+def asking(prompt: int) -> Snapshot:
     check = replace(MOMENT.check, id=NUMBER, state="asking", prompt=prompt, ask=ASK if prompt else "")  # type: ignore[type-var]
     return replace(MOMENT, check=check, changes=100 + prompt)
 

@@ -17,10 +17,10 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.scheduler.loop import Scheduler
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.tables.push_outcome import PushOutcome
 from abbe.service.web.pages.proposals import approve_as
 from tests.pages_world import Filled, Served
 from tests.patience import within
@@ -47,7 +47,7 @@ class Bench:
     def with_hands(self, hands: Hands) -> Orders:
         return Orders(self.store, self.clock, self.book, Ground(self.filled.machine, self.anna, self.audit), hands)
 
-    async def never(self, *_: object) -> tuple[str, int]:
+    async def never(self, *_: object) -> SlotState:
         raise AssertionError
 
     async def anybody(self, _: str) -> bool:
@@ -56,10 +56,10 @@ class Bench:
     async def anna(self, who: str) -> bool:
         return who == "user:anna"
 
-    async def push(self, order: PushOrder) -> PushOutcome:
+    async def push(self, order: PushOrder) -> JobOutcome:
         self.pushed.append(order.proposal)
         await as_if_pushed(self.store, self.clock, self.filled.machine, {"proposal": order.proposal}, (b"June", b"July"), TAKEN_BACK)
-        return PushOutcome("kept", "all is well")
+        return JobOutcome("kept", "all is well")
 
     async def ask(self, number: int, who: str = "user:anna", key: str = "") -> Answer:
         return await self.orders.push(PushNow("push", 1, number, key, who))

@@ -9,7 +9,7 @@ import pytest
 from fastapi import FastAPI
 
 from abbe.service.campaigns.builtin_recipes import RATES_HZ, named, parted, recipe_plan
-from abbe.service.channel.messages import MachineTold, RulesTold
+from abbe.service.channel.messages import MachineSummary, RulesSummary
 from abbe.service.clock import SystemClock
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run_campaign
@@ -23,7 +23,7 @@ from abbe.service.web.schemas_jobs import LONGEST_RECIPE
 from tests.service.core.fakes import utc
 
 STROKES = {"X": (0.0, 600.0), "Y": (0.0, 500.0), "Z": (0.0, 450.0)}
-TOLD = MachineTold("w-Y-X-b-Z-t", STROKES, dict.fromkeys("XYZ", (0.0, 0.0, 0.0)), (0.0, 0.0, 150.0), 6000.0)
+TOLD = MachineSummary("w-Y-X-b-Z-t", STROKES, dict.fromkeys("XYZ", (0.0, 0.0, 0.0)), (0.0, 0.0, 150.0), 6000.0)
 MACHINE = machine_from_doc({"chain": TOLD.chain, "stroke_mm": TOLD.stroke_mm, "pivots_mm": TOLD.pivots_mm, "tool_mm": TOLD.tool_mm})
 PLANS = Rehearsals(TOLD, ("quick-check", "verification"))
 
@@ -46,7 +46,7 @@ def test_it_says_what_the_command_line_says(rate_hz: int) -> None:
 
 
 def test_what_cannot_be_run_says_why() -> None:
-    slow = Rehearsals(MachineTold(**{**_fields(), "max_feed_mm_min": 500.0}), ("quick-check",)).run("quick-check", 100)
+    slow = Rehearsals(MachineSummary(**{**_fields(), "max_feed_mm_min": 500.0}), ("quick-check",)).run("quick-check", 100)
     assert slow is not None
     assert not slow.startable
     assert "allowed are 500" in slow.trouble
@@ -106,7 +106,7 @@ async def test_a_name_that_its_rate_makes_too_long_is_refused() -> None:
 
 def test_certificates_that_are_over_are_told() -> None:
     today = utc(2026, 11, 22, 6).date()
-    rules = RulesTold({}, {"ballbar": today.replace(year=2025), "laser": today}, None)
+    rules = RulesSummary({}, {"ballbar": today.replace(year=2025), "laser": today}, None)
     assert expired(rules, today) == [("ballbar", today.replace(year=2025))]
     assert expired(None, today) == []
 

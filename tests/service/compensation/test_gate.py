@@ -1,0 +1,71 @@
+"""The gate before a push says everything that speaks against it at once, and lets nothing pass by."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from abbe.service.compensation import gate
+from abbe.service.compensation.gate import NotAdmitted, PushContext
+from abbe.service.errors import TableRefused
+
+
+class Control:
+    """What the gate asks, answered as each test wants it; ``asked``: what was asked."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, *, commissioned: bool = True, level: bool = True, reasons: tuple[str, ...] = ()
+    ) -> None:
+        self.asked: list[str] = []
+
+        def answers(name: str, good: bool, detail: str, remedy: str) -> Any:
+            async def check(*_: object, **options: object) -> str:
+                self.asked.append(name)
+                if not good:
+                    raise TableRefused(detail, remedy)
+                return "a hint"
+
+            return check
+
+        async def hold(*_: object, **options: object) -> Any:
+            self.asked.append(f"hold attended={options['attended']}")
+            return SimpleNamespace(reasons=lambda: list(reasons))
+
+        monkeypatch.setattr(gate, "recover", answers("recover", True, "", ""))
+        monkeypatch.setattr(gate, "check_devices", answers("devices", True, "", ""))
+        monkeypatch.setattr(gate, "check_commissioned", answers("commissioned", commissioned, "never proved", "abbe comp commission"))
+        monkeypatch.setattr(gate, "check_level", answers("level", level, "level 1 is too low", "a person has to attend"))
+        monkeypatch.setattr(gate, "load", lambda *_: None)
+        monkeypatch.setattr(gate, "hold", hold)
+        site = SimpleNamespace(machine=None, watching=SimpleNamespace(air_c=None))
+        monkeypatch.setattr(gate, "verification", lambda *_, **__: None)
+        self.context = PushContext(cast("Any", SimpleNamespace(controller=None)), cast("Any", None), cast("Any", site), attended=False)
+
+
+async def test_all_reasons_come_at_once_with_the_first_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    control = Control(monkeypatch, commissioned=False, level=False, reasons=("STALE: measured 80 h ago", "APPROVAL: none"))
+    with pytest.raises(NotAdmitted) as closed:
+        await gate.admit(control.context, 4)
+    assert closed.value.reasons == ("never proved", "level 1 is too low", "STALE: measured 80 h ago", "APPROVAL: none")
+    assert closed.value.remedy == "abbe comp commission"
+
+
+async def test_each_question_is_asked_once_and_the_old_push_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    control = Control(monkeypatch)
+    admission = await gate.admit(control.context, 4)
+    assert control.asked == ["recover", "devices", "commissioned", "level", "hold attended=False"]
+    assert admission.hint == "a hint"
+
+
+async def test_before_a_proposal_only_the_control_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    control = Control(monkeypatch)
+    assert await gate.ready(control.context) == "a hint"
+    assert control.asked == ["recover", "devices", "commissioned", "level"]
+
+
+async def test_a_control_that_was_never_proved_stops_the_measurement_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    control = Control(monkeypatch, commissioned=False)
+    with pytest.raises(NotAdmitted, match="never proved"):
+        await gate.ready(control.context)
