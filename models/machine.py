@@ -13,7 +13,7 @@ AXES = ("X", "Y", "Z")
 
 @dataclass(frozen=True)
 class Machine:
-    """Nominal geometry of a 3-axis machine (docs/conventions.md).
+    """Nominal geometry of a 3-axis machine (docs/explanation/conventions.md).
 
     Parameters
     ----------

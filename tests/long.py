@@ -1,7 +1,7 @@
 """What only the long run proves: every test file that knows ``ABBE_TEST_LONG``, one after the other, at full size (``make test-long``).
 
 Takes hours, so it can be stopped (Ctrl-C) and goes on where it was: what passed at this commit is not run again. Each file's
-outcome is a line of ``.long.jsonl``, and the table at the end says what passed. docs/coverage.md keeps when that was last seen.
+outcome is a line of ``.long.jsonl``, and the table at the end says what passed. docs/explanation/coverage.md keeps when that was last seen.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ SCALE_NOTE = "at the machine's temperature while it was measured"
 """What every printed scale has to say: no material temperature correction is made."""
 
 SQUARENESS = (("C0Y", 0, 1, -1.0), ("B0Z", 0, 2, 1.0), ("A0Z", 1, 2, -1.0))
-"""Name, the two axes, and the sign that turns the sum of both slopes into it (docs/conventions.md)."""
+"""Name, the two axes, and the sign that turns the sum of both slopes into it (docs/explanation/conventions.md)."""
 
 
 @dataclass(frozen=True, slots=True)

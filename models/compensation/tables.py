@@ -30,8 +30,8 @@ class NineTables:
 
     ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the first position, from all sources (noise,
     priors, orders above the chosen one, stated inputs; `abbe.models.uncertainty.sources`), in the frame in which the deviation field has no
-    rigid motion over the volume (docs/conventions.md, "Frame"). The slope of a cross table (Y and Z over X, ...) is partly a rotation of
-    the whole frame, which no measurement of this kind sees, which moves no distance between two points of a part, and which the
+    rigid motion over the volume (docs/explanation/conventions.md, "Frame"). The slope of a cross table (Y and Z over X, ...) is partly a
+    rotation of the whole frame, which no measurement of this kind sees, which moves no distance between two points of a part, and which the
     corrections leave as the model happens to place it: compare tables only after taking the best-fit rotation out.
     """
 

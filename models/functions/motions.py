@@ -17,7 +17,7 @@ from abbe.models.machine import AXES
 ROTATIONS = ("A", "B", "C")
 REVERSE = "@reverse"
 SQUARENESS: Mapping[str, tuple[int, int, float]] = MappingProxyType({"C0Y": (1, 0, -1.0), "B0Z": (2, 0, 1.0), "A0Z": (2, 1, -1.0)})
-"""Axis, component and sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/conventions.md)."""
+"""Axis, component and sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/explanation/conventions.md)."""
 
 _SLOPES = {"EXY": ("C0Y", -1.0), "EXZ": ("B0Z", 1.0), "EYZ": ("A0Z", -1.0), "EYX": ("C0Y", -1.0), "EZX": ("B0Z", 1.0), "EZY": ("A0Z", -1.0)}
 """What the slope of a straightness adds to which squareness (angle of +a and +b less 90 degrees, math.md 1)."""

@@ -61,7 +61,7 @@ def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
     Returns
     -------
     array, shape (n, len(terms)): Legendre value (zero at stroke start for positioning and angles), or, for squareness, the travel of the
-    axis from its stroke start with the sign of docs/conventions.md.
+    axis from its stroke start with the sign of docs/explanation/conventions.md.
     """
     order = max((t.order for t in terms), default=0)
     start = legendre_values(np.zeros(1), np.array([0.0, 1.0]), order)[0]  # P_k(-1)

@@ -72,7 +72,9 @@ def deviation_mm(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | 
 def exact_deviation_mm(
     machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | None = None, *, rotation: RotationForm = "vector"
 ) -> F2:
-    """The same with finite rotations (docs/conventions.md, "Exact kinematics"); parameters, result and errors as in `deviation_mm`.
+    """The same with finite rotations; parameters, result and errors as in `deviation_mm`.
+
+    Source: docs/explanation/conventions.md, "Exact kinematics".
 
     Only what the errors add is carried along the chain, never the position itself, so the result is good to about 16 digits of its own
     size and not of the machine's.

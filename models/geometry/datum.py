@@ -19,7 +19,7 @@ from abbe.models.geometry.rotation import turn_vector
 from abbe.models.machine import AXES
 
 _ISO_SIGN = np.array([1.0, -1.0, 1.0])
-"""θ_XY = +C0Y, θ_XZ = −B0Z, θ_YZ = +A0Z, all obtuse positive (docs/conventions.md)."""
+"""θ_XY = +C0Y, θ_XZ = −B0Z, θ_YZ = +A0Z, all obtuse positive (docs/explanation/conventions.md)."""
 
 PARALLEL = 1e-9
 """Sine of an angle between two lines below which they make no plane; six digits of the plane's direction are left there."""

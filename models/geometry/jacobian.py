@@ -15,7 +15,7 @@ from abbe.models.geometry.rotation import cross_matrix, rotation_matrix, turn_ve
 from abbe.models.machine import Machine, levers_mm, split_chain
 
 SQUARENESS = tuple(t for t in smooth_terms(1) if t.order == 0)
-"""C0Y, B0Z, A0Z: which translation of which axis each of them is (docs/conventions.md)."""
+"""C0Y, B0Z, A0Z: which translation of which axis each of them is (docs/explanation/conventions.md)."""
 
 
 def motion_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> F4:
@@ -47,7 +47,7 @@ def motion_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = Non
 
 
 def exact_jacobian(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | None = None) -> F4:
-    """The same of the exact kinematics with rotation vectors, at given errors (docs/conventions.md, "Exact kinematics").
+    """The same of the exact kinematics with rotation vectors, at given errors (docs/explanation/conventions.md, "Exact kinematics").
 
     Analytic: each carriage turns what the carriages before it contributed, and its own turn is Rodrigues' formula differentiated. Without
     errors it is `motion_jacobian`.
@@ -90,7 +90,7 @@ def exact_jacobian(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 
 
 
 def squareness_motions(axes_mm: F2, start_mm: F1 | None = None) -> F4:
-    """Error motions per unit of squareness: slope times travel, signs of docs/conventions.md (X the datum).
+    """Error motions per unit of squareness: slope times travel, signs of docs/explanation/conventions.md (X the datum).
 
     C0Y gives EXY = −C0Y·y, B0Z gives EXZ = +B0Z·z, A0Z gives EYZ = −A0Z·z.
 

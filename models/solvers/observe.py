@@ -1,4 +1,4 @@
-"""What a run reads of a machine and its set-up, exactly, and how each unknown changes it (docs/conventions.md, "Readings").
+"""What a run reads of a machine and its set-up, exactly, and how each unknown changes it (docs/explanation/conventions.md, "Readings").
 
 Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns (`abbe.models.solvers.observe_setup`).
 The readings are those of math.md 4.2 and 5.4 without any linearisation: finite rotations in the chain, the length of the bar as a length,

@@ -4,8 +4,8 @@ Published methods take the set-ups as perfect (math.md 4.5, 5.4). Here each is a
 (`abbe.models.solvers.priors`).
 
 - ``cup_<setup>_x/y/z``, mm: where the cup stands less where the machine really was when the spindle put it down: the mounting alone.
-- ``bar_length_<radius>``, mm: what the reading is too long by (docs/conventions.md), so what the bar is SHORTER than it says; one per
-  nominal radius, because one bar serves all runs of its length. Radii that are the same to 0.01 mm are one bar (`bar_length_name`).
+- ``bar_length_<radius>``, mm: what the reading is too long by (docs/explanation/conventions.md), so what the bar is SHORTER than it says;
+  one per nominal radius, because one bar serves all runs of its length. Radii that are the same to 0.01 mm are one bar (`bar_length_name`).
 - ``bar_drift_<setup>_x/y/z``, mm/s: slow growth of the tool against the cup since the set-up's first reading.
 - ``tilt_<setup>_1/2``, rad: how far the mirror's normal leans towards the two directions of `perpendicular`.
 - ``cosine_<setup>``: 1 / (m.l) - 1 of mirror m and beam l. The direction of the beam enters by this one number only, of second order in

@@ -95,8 +95,8 @@ def predict_deviation(
     tool_mm : array, shape (3,), optional
         Spindle reference to functional point; None: the machine's own tool.
     frame : RigidFree, optional
-        None: the machine's own frame, where positioning and angles are zero at the start of the strokes (docs/conventions.md). Compare
-        maps, or a map with what a part shows, in the rigid-free frame.
+        None: the machine's own frame, where positioning and angles are zero at the start of the strokes (docs/explanation/conventions.md).
+        Compare maps, or a map with what a part shows, in the rigid-free frame.
     probability : float
 
     Raises

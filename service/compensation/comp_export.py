@@ -187,7 +187,8 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[s
         out.append(f"{form.name}: {form.sign.evidence}; acts after: {form.live}")
         if not form.sign.sure:
             out.append(
-                f"{form.name}: no manual states the sign ({form.sign.words}): write the 10 µm step first and measure it (docs/formats.md)"
+                f"{form.name}: no manual states the sign ({form.sign.words}): write the 10 µm step first and measure it "
+                "(docs/reference/formats.md)"
             )
     return tuple(out)
 

@@ -1,7 +1,7 @@
 """A machine as it was identified, as far as tables need it, and its error taken apart into what controls can hold.
 
-Rule G (docs/conventions.md): a carriage's angle times a travel of ANOTHER axis is a product of two functions of one axis each; everything
-else of a first-order machine is a sum of functions of one axis. So one-axis tables, cross tables and products are all there is.
+Rule G (docs/explanation/conventions.md): a carriage's angle times a travel of ANOTHER axis is a product of two functions of one axis each;
+everything else of a first-order machine is a sum of functions of one axis. So one-axis tables, cross tables and products are all there is.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """What is exported, in one form for all controls: corrections added to the command, and one function that does what a control would do.
 
-A machine that goes too far by e needs the correction −e (docs/conventions.md). Tables are broken lines with their end values held.
+A machine that goes too far by e needs the correction −e (docs/explanation/conventions.md).
+Tables are broken lines with their end values held.
 """
 
 from __future__ import annotations

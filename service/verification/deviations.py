@@ -115,7 +115,7 @@ def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exac
     points_path : Path
         CSV, see `abbe.service.runs.points.read_points`.
     exact : bool
-        Finite rotations (docs/conventions.md) in place of rule G.
+        Finite rotations (docs/explanation/conventions.md) in place of rule G.
 
     Raises
     ------

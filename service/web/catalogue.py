@@ -1,6 +1,6 @@
 """Every code that an error can have, from one place: the classes that carry them, and the answers of the network that have no class.
 
-``python -m abbe.service.web.catalogue`` prints the page docs/error-codes.md; a test compares the two.
+``python -m abbe.service.web.catalogue`` prints the page docs/reference/error-codes.md; a test compares the two.
 """
 
 from __future__ import annotations

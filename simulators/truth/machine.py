@@ -1,4 +1,4 @@
-"""Exact kinematics of a three-axis machine with finite rotations (docs/conventions.md, "Exact kinematics")."""
+"""Exact kinematics of a three-axis machine with finite rotations (docs/explanation/conventions.md, "Exact kinematics")."""
 
 import numpy as np
 

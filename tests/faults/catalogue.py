@@ -1,4 +1,4 @@
-"""Which rows and cases the fault matrix has: the tests take their cases from here, the page docs/faults.md is written from here.
+"""Which rows and cases the fault matrix has: the tests take their cases from here, the page docs/reference/faults.md is written from here.
 
 Every file ``tests/faults/rows_*.py`` holds ``ROWS``, a tuple of ``Row``.
 """

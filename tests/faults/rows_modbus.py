@@ -28,7 +28,7 @@ LINE_FAULTS = ("echo", "collision", "foreign master", "noise tail", "noise in fr
 LINE_KINDS = ("status", "motion command", "laser reading", "laser command")
 
 _TEST = "test_modbus_matrix.py"
-_LATER = "the push protocol itself is not built yet; its single requests (bank write, compensation command) are played here"
+_LATER = "tests/push plays faults at every operation of a push; its single requests (bank write, compensation command) are played here"
 _RTU_WRONG = {"tid": "check sum"}
 
 

@@ -77,7 +77,7 @@ def test_every_row_is_there_once_and_its_test_exists():
     found = rows()
     assert len({row.name for row in found}) == len(found)
     for row in found:
-        assert (PAGE.parents[1] / "tests" / "faults" / row.test).exists(), row.name
+        assert (PAGE.parents[2] / "tests" / "faults" / row.test).exists(), row.name
 
 
 def test_the_page_is_current():

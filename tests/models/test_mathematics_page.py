@@ -1,10 +1,10 @@
-"""docs/mathematics.md names functions that exist."""
+"""docs/explanation/mathematics.md names functions that exist."""
 
 import importlib
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).parents[2] / "docs" / "mathematics.md"
+PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "mathematics.md"
 ENTRY = re.compile(r"`(abbe\.models\.[\w.]+)`: ((?:`\w+`(?:, )?)+)")
 
 

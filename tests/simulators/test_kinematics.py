@@ -1,4 +1,4 @@
-"""The exact kinematics against rule G of docs/conventions.md, written here once more and on its own."""
+"""The exact kinematics against rule G of docs/explanation/conventions.md, written here once more and on its own."""
 
 import itertools
 

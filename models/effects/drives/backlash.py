@@ -60,7 +60,7 @@ EFFECT = Effect(
     signature="circle and helix: a step outward at both ends of the axis, of the same size at all feeds; laser: forth and back stay apart",
     remedy="control parameter",
     remedy_text="enter the width as backlash compensation of the axis; if it grows or exceeds 30 um: screw nut, coupling, thrust bearing",
-    source="effects.md 1; docs/conventions.md, direction-dependent error",
+    source="effects.md 1; docs/explanation/conventions.md, direction-dependent error",
     separated_by={
         "backlash": ("ballbar", "planar_circles", "opposite_direction"),
         "backlash_position_dependent": ("second_radius",),

@@ -1,6 +1,6 @@
 """What a user would take instead: homogeneous transforms in numpy, sympy's lambdify, pytransform3d's batches.
 
-All three work the exact chain w-X-Y-b-Z-t (docs/conventions.md) and return actual minus nominal, shape (n, 3).
+All three work the exact chain w-X-Y-b-Z-t (docs/explanation/conventions.md) and return actual minus nominal, shape (n, 3).
 """
 
 from __future__ import annotations

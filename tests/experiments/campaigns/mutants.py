@@ -27,10 +27,10 @@ COPIED = ("abbe", "service", "drivers", "models", "simulators", "tests", "pyproj
 TEST_S, RUN_S = 400, 3600
 HEAD = """# Mistakes that the tests have to notice
 
-One mistake each is put into a copy of the source; the named test has to fail with it, and passes without it. Written by
-`python -m tests.experiments.campaigns.mutants --page docs/mutants.md` (half an hour on two busy cores), last on {date}: {killed} of {all}
-killed. CI runs the rows marked *, all at once. The mistakes in the push protocol that its sweep has to notice are a list of their own:
-`python -m tests.experiments.campaigns.push mutants` (docs/how-to/push.md).
+One mistake each is put into a copy of the source; the named test has to fail with it, and passes without it. Half an hour
+of two busy cores writes this page
+(`python -m tests.experiments.campaigns.mutants --page docs/explanation/mutants.md`), last on {date}: {killed} of {all} killed.
+CI runs the rows marked *, all at once. The push protocol has mutants of its own: `python -m tests.experiments.campaigns.push mutants`.
 
 | mistake | in | outcome | by |
 |---|---|---|---|
@@ -118,7 +118,7 @@ def outcome(copy: Path, mutant: Mutant, good: dict[tuple[str, ...], Found]) -> t
 
 
 def page(rows: list[tuple[Mutant, str, str]]) -> str:
-    """The table for docs/mutants.md."""
+    """The table for docs/explanation/mutants.md."""
     killed = sum(word == "killed" for _, word, _ in rows)
     lines = [f"| {m.name}{' *' if m.fast else ''} | `{m.path}` | {word} | `{by.split('[')[0]}` |" for m, word, by in rows]
     return HEAD.format(date=datetime.now(UTC).date(), killed=killed, all=len(rows)) + "\n".join(lines) + "\n"

@@ -12,7 +12,7 @@ from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 
 
 def largest_range_mm(field, tables=None):
-    """Largest range of the deviation along a body diagonal (docs/conventions.md), with tables if given."""
+    """Largest range of the deviation along a body diagonal (docs/explanation/conventions.md), with tables if given."""
     found = []
     for name in DIAGONALS:
         start, end = diagonal_ends(MACHINE.stroke_mm, name)

@@ -68,7 +68,7 @@ class Yang:
 
     @property
     def truth(self) -> np.ndarray:
-        """EXX, EYY, EZZ slopes; C0Y, B0Z, A0Z (docs/conventions.md: the angles XZ and YZ are -B0Z and +A0Z)."""
+        """EXX, EYY, EZZ slopes; C0Y, B0Z, A0Z (docs/explanation/conventions.md: the angles XZ and YZ are -B0Z and +A0Z)."""
         xy, xz, yz = self.squareness
         return np.array([*self.scales, xy, -xz, yz])
 

@@ -1,4 +1,4 @@
-"""Writes docs/formats.md from the code: ``python -m tests.service.formats.page`` (``--check``: only say whether it is current)."""
+"""Writes docs/reference/formats.md from the code: ``python -m tests.service.formats.page`` (``--check``: is it current?)."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from abbe.service.formats.proof import all_proofs
 from abbe.service.formats.registry import FORMATS
 from tests.written_page import run
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "formats.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "formats.md"
 _HEAD = """# Formats of compensation tables
 
 Written by `python -m tests.service.formats.page` from `service/formats`; a test checks that it is current. e = actual − nominal: a machine
-that goes too far has e > 0 and needs the correction −e. How to export: [how-to/export.md](how-to/export.md).
+that goes too far has e > 0 and needs the correction −e. How to export: [Make tables and files for a control](../how-to/tables.md).
 
 **Verified by execution**: the rule was seen on the real control (LinuxCNC 2.9, positions read back; specification, "Controllers", 1.4 and
 1.5). **By manual**: read in documents only; no such control was at hand.

@@ -49,7 +49,7 @@ NODES = [-50.0, 100.0, 300.0, 450.0]  # a not-a-knot spline through four points 
 
 
 def by_hand(p: np.ndarray, tool: np.ndarray = TOOL, reverse: bool = False) -> np.ndarray:
-    """Rule G of docs/conventions.md for w-X-Y-b-Z-t: X and Y carry the table, Z the tool."""
+    """Rule G of docs/explanation/conventions.md for w-X-Y-b-Z-t: X and Y carry the table, Z the tool."""
     d, e = motions(p, reverse)
     px, py, pz = (np.array(OBJECT["pivots_mm"][a], dtype=float) for a in "XYZ")
     x, y, z = np.diag(p)

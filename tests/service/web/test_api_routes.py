@@ -203,6 +203,6 @@ async def test_codes_are_one_catalogue_and_one_page(client):
     assert [one["code"] for one in told] == [one.code for one in entries()]
     assert len(told) == len({one["code"] for one in told}) > 60
     assert all(one["meaning"] for one in told)
-    assert (ROOT / "docs" / "error-codes.md").read_text(encoding="utf-8") == page(), (
-        "python -m abbe.service.web.catalogue > docs/error-codes.md"
+    assert (ROOT / "docs" / "reference" / "error-codes.md").read_text(encoding="utf-8") == page(), (
+        "python -m abbe.service.web.catalogue > docs/reference/error-codes.md"
     )

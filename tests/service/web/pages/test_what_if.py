@@ -169,7 +169,7 @@ def test_what_is_corrected_leaves_its_uncertainty(known) -> None:
 
 
 def test_mean_linear_errors_that_are_taken_off_are_gone(known) -> None:
-    """Slopes of the main effects of what is left, by straight lines through means over planes (docs/conventions.md has the signs)."""
+    """Slopes of the main effects of what is left, by straight lines through means over planes (signs: docs/explanation/conventions.md)."""
     wanted = {"EXX": 2e-5, "EZZ": -3e-6, "C0Y": 4e-5, "B0Z": -1e-5, "A0Z": 7e-6}
     n = 7
     points = volume_grid(known.machine.stroke_mm, n)
