@@ -120,7 +120,7 @@ def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, Path
     twice = _before(arc, arc[counts] - max(STRETCH_MM, STRETCH_S * feed_mm_s))
     begin = _before(arc, arc[max(twice, 0)] - max(LEAD_MM, LEAD_S * feed_mm_s))
     on = (so_far.arc_mm >= arc[max(twice, 0)]) & (so_far.arc_mm <= arc[counts])
-    if begin <= 0 or arc[twice] < so_far.counted_from_mm or int(on.sum()) < 2 * LEAST_READINGS:
+    if begin <= 0 or twice <= _before(arc, so_far.counted_from_mm) or int(on.sum()) < 2 * LEAST_READINGS:
         return None
     ends = last if step.measured else len(arc) - 1
     rest = RecordPath(step.points_mm[begin:], step.feed_mm_min, step.rate_hz, step.direction, (twice - begin, ends - begin))

@@ -10,8 +10,8 @@ from types import ModuleType, SimpleNamespace
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = (
-    "states", "entries", "operations", "levels", "limits", "approval", "learn", "staging", "back", "order", "machine", "execute",
-    "semantic_digest",
+    "states", "entries", "operations", "levels", "limits", "candidate", "validate_numbers", "approval", "learn", "staging", "back", "order",
+    "machine", "execute", "semantic_digest",
 )  # fmt: skip
 """In the order of their imports."""
 OUTSIDE = {"second_decoder": "drivers/cnc/second_decoder.py", "codec": "service/tables/nine_tables.py"}

@@ -260,8 +260,8 @@ async def test_work_that_ends_by_itself_is_not_touched_by_an_abort() -> None:
 
 HOLDER = """
 import sys
-from abbe.service.devices.machine_lock import alone
-with alone(sys.argv[1]):
+from abbe.service.devices.machine_lock import lock_machine
+with lock_machine(sys.argv[1]):
     print("has it", flush=True)
     sys.stdin.readline()
 """

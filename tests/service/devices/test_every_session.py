@@ -21,7 +21,7 @@ ONLY_LOOKS = {
     ("scheduler/ready.py", "look_at"): "reads the status",
     ("tables/in_force.py", "look_at_table"): "reads which table is in force",
     ("cli/tables/table.py", "accept_table"): "a person vouches",
-    ("compensation/ordered_rollback.py", "bring_back"): "goes through `rollback`, which recovers",
+    ("compensation/ordered_rollback.py", "ordered_rollback"): "goes through `rollback`, which recovers",
     ("demo/demo.py", "run_demo"): "a control of its own, begun with this database",
     ("demo/demo_serve.py", "run_served_demo"): "the same",
     ("demo/demo_hidden.py", "run_hidden_demo"): "the same",

@@ -20,7 +20,7 @@ URL = "modbus+tcp://127.0.0.1:1"
 NOBODY = 65534
 HOLDER = """
 import os, sys
-from abbe.service.devices.machine_lock import alone
+from abbe.service.devices.machine_lock import lock_machine
 uid, gid, url = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 if uid:  # after the imports: what this account may read of the installation is not what is tried here
     os.setgroups([gid] if gid else [])
@@ -28,7 +28,7 @@ if uid:  # after the imports: what this account may read of the installation is 
     os.setuid(uid)
 os.umask(0o077)
 try:
-    with alone(url):
+    with lock_machine(url):
         print("has it", os.getuid(), flush=True)
         sys.stdin.readline()
 except Exception as error:

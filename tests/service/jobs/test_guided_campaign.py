@@ -98,7 +98,7 @@ async def test_a_stop_while_a_push_is_taken_back_begins_no_campaign(monkeypatch:
         bench.control.stop()
         yield SimpleNamespace(controller=None)
 
-    for name, instead in (("alone", lambda _: nullcontext()), ("recovered_session", session)):
+    for name, instead in (("lock_machine", lambda _: nullcontext()), ("recovered_session", session)):
         monkeypatch.setattr(work, name, instead)
     for name, instead in (("paced", lambda plan, _: plan), ("check_devices", all_there)):
         monkeypatch.setattr(work, name, instead)

@@ -7,7 +7,7 @@ from math import ceil, dist
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from abbe.drivers.api import BarSample, Condition, ControllerStatus
@@ -69,6 +69,7 @@ def so_far(good_mm: float, counted_from_mm: float = 0.0) -> SoFar:
 
 
 @settings(deadline=None)
+@example([0.5, 0.5625, 0.375, 0.109375], False)  # the last break is exactly a stretch behind what counts: no piece of no length
 @given(st.lists(st.floats(0.1, 0.99), min_size=1, max_size=6), st.booleans())
 def test_the_pieces_and_the_rest_are_the_whole_path_once(shares, leads):
     step = path((40, 560) if leads else None)
