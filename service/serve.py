@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
-from abbe.service.audit.chain import Event
 from abbe.service.campaigns.builtin_recipes import parted
 from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
@@ -37,6 +36,7 @@ from abbe.service.core.systemd import notify
 from abbe.service.core.table_watch import TableWatch
 from abbe.service.core.watch import BoardWatch, StateTeller, VerifiedWatch
 from abbe.service.core.web_process import WebProcess
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import ConfigError
 from abbe.service.jobs.at_start import push_is_open
 from abbe.service.mqtt.outbox import StoreOutbox
@@ -108,7 +108,7 @@ class Service:
         self._web = WebProcess(begin, listening, snapshots.now, self._jobs, clock, setup.live, orders)
         self._opcua = self._make_opcua()
         doc = {"host": setup.host, "port": listening.getsockname()[1]}
-        book.write(Event(this_account(), "abbe serve", setup.machine, "begun", doc))
+        book.write(AuditEvent(who=this_account(), action="abbe serve", target=setup.machine, outcome="begun", doc=doc))
 
     def _begin(self, recipes: tuple[str, ...]) -> Begin:
         setup = self._setup

@@ -13,12 +13,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from abbe.service.audit.chain import Anchor, Event, anchor_of, faults, follow, key_name
+from abbe.service.audit.chain import Anchor, anchor_of, faults, follow, key_name
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken
 from abbe.service.secrets import mask_secrets, visible
 from abbe.service.storage.engine import parse_url
 from abbe.service.storage.private import private_file
-from abbe.service.storage.repositories.audit import AuditRecord
 from abbe.service.storage.store import Store
 
 # The two files of the audit: made for their owner only, appended to, and refused with words that say whose they are.
@@ -136,7 +136,7 @@ class AuditBook:
             files_ready(self.key_file, self.head_file)
         self._store.can_write()
 
-    def write(self, event: Event) -> AuditRecord:
+    def write(self, event: AuditEvent) -> AuditEvent:
         """Append a record; on return it is on disk and its head is kept outside.
 
         Raises
@@ -145,9 +145,14 @@ class AuditBook:
             It cannot be written.
         """
         key = self._key_of(make=True)
-        target = _clean(event.target)[:2000]
-        event = Event(_clean(event.who)[:200], _clean(event.action)[:200], target, _clean(event.outcome)[:200], _cleaned(event.doc))
-        record = self._store.append_audit(lambda last, utc: follow(last, utc, event, key))
+        cleaned = AuditEvent(
+            who=_clean(event.who)[:200],
+            action=_clean(event.action)[:200],
+            target=_clean(event.target)[:2000],
+            outcome=_clean(event.outcome)[:200],
+            doc=_cleaned(event.doc),
+        )
+        record = self._store.append_audit(lambda last, utc: follow(last, utc, cleaned, key))
         self._keep(anchor_of(record, key))
         return record
 

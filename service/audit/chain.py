@@ -5,35 +5,10 @@ from __future__ import annotations
 import hashlib
 import hmac
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from abbe.service.push.entries import GENESIS, Doc, canonical
-from abbe.service.storage.repositories.audit import AuditRecord
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """What is to be recorded.
-
-    Parameters
-    ----------
-    who : str
-        ``os:NAME@HOST`` at the command line, ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous`` on the network.
-    action : str
-        ``abbe measure``, ``POST /login``.
-    target : str
-        Machine file, user, file, address.
-    outcome : str
-        ``done``, ``no``, ``refused 403``, a code of an error.
-    doc : dict
-        More of it: options, reasons. No secrets.
-    """
-
-    who: str
-    action: str
-    target: str
-    outcome: str
-    doc: Doc
+from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.push.entries import GENESIS, canonical
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,26 +30,26 @@ def mac_of(key: bytes, digest: str) -> str:
     return hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
 
 
-def digest_of(number: int, utc: str, event: Event, prev: str, name: str) -> str:
-    """SHA-256 of a record's content and of the digest before it."""
-    return hashlib.sha256(canonical([number, utc, event.who, event.action, event.target, event.outcome, event.doc, prev, name])).hexdigest()
+def digest_of(event: AuditEvent) -> str:
+    """SHA-256 of an event's content and of the digest before it."""
+    content = [event.id, event.utc, event.who, event.action, event.target, event.outcome, event.doc, event.prev, event.key]
+    return hashlib.sha256(canonical(content)).hexdigest()
 
 
-def follow(last: AuditRecord | None, utc: str, event: Event, key: bytes) -> AuditRecord:
-    """Make the record that follows ``last``."""
-    number, prev, name = (1, GENESIS, key_name(key)) if last is None else (last.id + 1, last.digest, key_name(key))
-    digest = digest_of(number, utc, event, prev, name)
-    return AuditRecord(
-        number, utc, event.who, event.action, event.target, event.outcome, event.doc, prev, digest, name, mac_of(key, digest)
-    )
+def follow(last: AuditEvent | None, utc: str, event: AuditEvent, key: bytes) -> AuditEvent:
+    """Make of an event the record that follows ``last``."""
+    number, prev = (1, GENESIS) if last is None else (last.id + 1, last.digest)
+    placed = replace(event, id=number, utc=utc, prev=prev, key=key_name(key))
+    digest = digest_of(placed)
+    return replace(placed, digest=digest, mac=mac_of(key, digest))
 
 
-def faults(records: Sequence[AuditRecord], anchors: Sequence[Anchor], key: bytes) -> list[str]:
-    """Everything that is wrong with an audit; an empty list: it is all there and as written.
+def faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
+    """Everything that is wrong with an audit; an empty list: it is complete and unchanged.
 
     Parameters
     ----------
-    records : sequence of AuditRecord
+    records : sequence of AuditEvent
         All of them, in the order of their numbers.
     anchors : sequence of Anchor
         What was kept outside.
@@ -83,13 +58,12 @@ def faults(records: Sequence[AuditRecord], anchors: Sequence[Anchor], key: bytes
     """
     found, head, mine = [], GENESIS, key_name(key)
     for number, record in enumerate(records, 1):
-        event = Event(record.who, record.action, record.target, record.outcome, record.doc)
         if record.id != number:
             found.append(f"record {number} is missing")
             break
         if record.prev != head:
             found.append(f"record {number} does not follow the one before it")
-        if record.digest != _digest_or_none(record, event):
+        if record.digest != _digest_or_none(record):
             found.append(f"record {number} was changed after it was written")
         if record.key != mine:
             found.append(f"record {number} is sealed with a key that is not here ({record.key})")
@@ -99,14 +73,14 @@ def faults(records: Sequence[AuditRecord], anchors: Sequence[Anchor], key: bytes
     return found + _against(records, anchors, key)
 
 
-def _digest_or_none(record: AuditRecord, event: Event) -> str | None:
+def _digest_or_none(record: AuditEvent) -> str | None:
     try:
-        return digest_of(record.id, record.utc, event, record.prev, record.key)
+        return digest_of(record)
     except (TypeError, ValueError):  # no JSON any more
         return None
 
 
-def _against(records: Sequence[AuditRecord], anchors: Sequence[Anchor], key: bytes) -> list[str]:
+def _against(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
     """What the kept heads say: the database must hold each of them."""
     found, held = [], {record.id: record.digest for record in records}
     for anchor in anchors:
@@ -121,6 +95,6 @@ def _against(records: Sequence[AuditRecord], anchors: Sequence[Anchor], key: byt
     return found
 
 
-def anchor_of(record: AuditRecord, key: bytes) -> Anchor:
+def anchor_of(record: AuditEvent, key: bytes) -> Anchor:
     """The head to keep of a record."""
     return Anchor(record.id, record.digest, mac_of(key, f"{record.id} {record.digest}"))

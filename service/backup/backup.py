@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from abbe.service.audit.book import AuditBook, this_account
-from abbe.service.audit.chain import Event
 from abbe.service.backup.backup_files import (
     CAPTURE,
     DATABASE,
@@ -28,6 +27,7 @@ from abbe.service.backup.backup_files import (
     listed,
 )
 from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import BackupRefused
 from abbe.service.secrets import mask_secrets
 from abbe.service.storage.copying import copy_online, prove_copy, rows_of, sync_file
@@ -115,7 +115,9 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
         shutil.rmtree(part, ignore_errors=True)
     with Store.open(source.url) as store:
         told = {"made_utc": doc["made_utc"], "key": "with" if with_key else "without"}
-        AuditBook(store, source.url).write(Event(this_account(), "abbe backup", str(target), "done", told))
+        AuditBook(store, source.url).write(
+            AuditEvent(who=this_account(), action="abbe backup", target=str(target), outcome="done", doc=told)
+        )
     return doc
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from abbe.service.audit.book import heads_in
 from abbe.service.audit.chain import faults
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import BackupRefused
 from abbe.service.files import is_plain, read_plain
 from abbe.service.storage.copying import rows_of
-from abbe.service.storage.repositories.audit import AuditRecord
 
 FORMAT = "abbe-backup/1"
 LIST = "backup.json"
@@ -110,9 +109,11 @@ def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, li
     return len(records), faults(records, heads_in(heads), key.read_bytes())
 
 
-def _records(database: Path) -> Sequence[AuditRecord]:
-    query = "SELECT id, utc, who, action, target, outcome, doc, prev, digest, key, mac FROM audit ORDER BY id"
-    return [AuditRecord(*(*row[:6], json.loads(row[6]), *row[7:])) for row in rows_of(database, query)]
+def _records(database: Path) -> list[AuditEvent]:
+    """The audit of a copied database. Documents are text there."""
+    names = [one.name for one in fields(AuditEvent)]
+    rows = (dict(zip(names, row, strict=True)) for row in rows_of(database, f"SELECT {', '.join(names)} FROM audit ORDER BY id"))  # noqa: S608 - our own names
+    return [AuditEvent(**row | {"doc": json.loads(row["doc"])}) for row in rows]
 
 
 def counts(database: Path) -> dict[str, int]:

@@ -11,10 +11,10 @@ from datetime import datetime
 from pathlib import Path
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base, this_account
-from abbe.service.audit.chain import Event
 from abbe.service.backup.backup import BackupSource, sqlite_file
 from abbe.service.backup.backup_files import CAPTURE, DATABASE, HEADS, KEY, Backup, audit_faults, read_backup
 from abbe.service.capture.settings import segment_folder
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import BackupRefused
 from abbe.service.storage.copying import is_locked, prove_copy, sync_file, users_of
 from abbe.service.storage.migrate import known_revisions
@@ -96,7 +96,9 @@ def restore(
         shutil.rmtree(part, ignore_errors=True)
     with Store.open(into.url) as store:
         told = {"from": str(folder), "made_utc": str(backup.doc["made_utc"]), "aside": ", ".join(map(str, aside))}
-        AuditBook(store, into.url).write(Event(this_account(), "abbe restore", str(database), "done", told))
+        AuditBook(store, into.url).write(
+            AuditEvent(who=this_account(), action="abbe restore", target=str(database), outcome="done", doc=told)
+        )
     return Restored(backup, database, records, len(backup.segments), aside)
 
 

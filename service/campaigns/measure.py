@@ -20,6 +20,8 @@ from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.clock_notes import notes_since
 from abbe.service.devices.session import Session
+from abbe.service.domain.measured import DISK_FULL
+from abbe.service.domain.owner import this_process
 from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.events import ProgressSink, ignore_progress
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
@@ -33,8 +35,6 @@ from abbe.service.sequences.resume_plan import Attempt
 from abbe.service.sequences.runner import Runner, Tick
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
 from abbe.service.site import Site
-from abbe.service.storage.owner import this_process
-from abbe.service.storage.records import DISK_FULL
 from abbe.service.storage.store import Store
 
 RUN_STATUS: dict[type[Exception], str] = {Stopped: "stopped", Aborted: "aborted", RunInterrupted: "aborted"}

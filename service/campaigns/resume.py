@@ -23,6 +23,9 @@ from abbe.service.campaigns.campaign_run import (
     read_path,
 )
 from abbe.service.devices.session import Session
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import RUNNING, CampaignRecord, CheckpointRecord
+from abbe.service.domain.owner import Owner
 from abbe.service.errors import PreconditionsChanged, UnsafeToMove
 from abbe.service.runs.codec import decode_json
 from abbe.service.runs.columns import LASER_CHANNEL
@@ -32,8 +35,6 @@ from abbe.service.sequences.preconditions import ExpectedTable, check_expected
 from abbe.service.sequences.resume_plan import anew, remounted
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
-from abbe.service.storage.owner import Owner
-from abbe.service.storage.records import RUNNING, CampaignRecord, CheckpointRecord, Doc
 from abbe.service.storage.store import Store
 
 COMPLETE = "complete"

@@ -12,8 +12,8 @@ from abbe.service.capture.ingest import chunk_of
 from abbe.service.capture.ledger import Ledger, SampleGap
 from abbe.service.capture.records import CHUNK, CLOSE, GAP, Record
 from abbe.service.capture.scan import Scan
+from abbe.service.domain.measured import ChunkRecord
 from abbe.service.runs.codec import decode_bar, decode_json
-from abbe.service.storage.records import ChunkRecord
 from abbe.service.storage.store import Store
 
 DAMAGED = "the segment is damaged here"

@@ -36,10 +36,10 @@ from abbe.service.capture.settings import (
     segment_path,
     set_aside,
 )
+from abbe.service.domain.measured import INTERRUPTED, RUNNING, ChunkRecord, RunRecord
+from abbe.service.domain.owner import this_process
 from abbe.service.errors import AbbeError, CaptureConflict, CaptureFault, StoreError
 from abbe.service.runs.codec import decode_json
-from abbe.service.storage.owner import this_process
-from abbe.service.storage.records import INTERRUPTED, RUNNING, ChunkRecord, RunRecord
 from abbe.service.storage.store import Store
 
 # What becomes of a segment whose run is closed: deleted, kept, or renamed because something in it is damaged.

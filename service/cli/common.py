@@ -13,7 +13,7 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from abbe.service.storage.records import CampaignRecord, RunRecord
+    from abbe.service.domain.measured import CampaignRecord, RunRecord
     from abbe.service.storage.store import Store
 
 ENVIRONMENT = "ABBE_DB"

@@ -19,11 +19,11 @@ from abbe.service.compensation.level_trial import ID_WORD, SEALED, Shown, Trial
 from abbe.service.compensation.level_trial_motion import while_moving
 from abbe.service.compensation.proved_levels import KIND, flags_of, identity, last_proof
 from abbe.service.compensation.recover import recover
+from abbe.service.domain.document import Doc
 from abbe.service.errors import TableMismatch, UnsafeToMove
 from abbe.service.push.book import read_entries
 from abbe.service.push.levels import Capabilities
 from abbe.service.site import Site
-from abbe.service.storage.records import Doc
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 

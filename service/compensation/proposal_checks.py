@@ -13,14 +13,13 @@ from abbe.service.clock import Clock
 from abbe.service.compensation.candidates import scene_of, until_s
 from abbe.service.compensation.proposal_doc import Proposed
 from abbe.service.compensation.proposals import by_whom, login
+from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.errors import TableRefused
 from abbe.service.push.candidate import Candidate, CandidateContext, EvidenceSeal
 from abbe.service.push.operations import Approval
 from abbe.service.push.validate import content_digest, reasons_against
 from abbe.service.site import Site
 from abbe.service.storage.base import utc_text
-from abbe.service.storage.records import ApprovalRecord
-from abbe.service.storage.repositories.decisions import RejectionRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base, read_base
 
@@ -37,8 +36,8 @@ class HoldReason:
     site: Site
     base: Base
     scene: CandidateContext
-    approvals: tuple[ApprovalRecord, ...]
-    rejections: tuple[RejectionRecord, ...] = ()
+    approvals: tuple[ProposalApproval, ...]
+    rejections: tuple[ProposalRejection, ...] = ()
     attended: bool = True
 
     @property
@@ -108,8 +107,8 @@ async def hold(
 
 
 def valid_approval(
-    proposed: Proposed, approvals: Sequence[ApprovalRecord], now_s: float, *, two_people: bool
-) -> tuple[ApprovalRecord | None, str]:
+    proposed: Proposed, approvals: Sequence[ProposalApproval], now_s: float, *, two_people: bool
+) -> tuple[ProposalApproval | None, str]:
     """The last approval that holds now; else None and why there is none."""
     why = "nobody has approved it: abbe comp approve"
     for row in reversed(approvals):
@@ -126,7 +125,7 @@ def valid_approval(
 
 def approve(
     store: Store, number: int, proposed: Proposed, name: str, hours: float, clock: Clock, account: str | None = None
-) -> ApprovalRecord:
+) -> ProposalApproval:
     """Approve a proposal: exactly this table on exactly this base, for this machine, under these limits, for some hours.
 
     The approval ends at the latest when the measurement becomes too old.
@@ -150,11 +149,13 @@ def approve(
     if proposed.two_people and _same(name, proposed.by):
         raise TableRefused(f"{name} proposed it: this machine needs a second person to approve", "let somebody else approve it")
     expiry = utc_text(now + timedelta(seconds=min(hours * 3600.0, left_s)))
-    store.add_approval(ApprovalRecord(0, number, name, account or login(), proposed.binding(expiry), expiry, ""))
+    store.add_approval(
+        ProposalApproval(proposal_id=number, name=name, login=account or login(), digest=proposed.binding(expiry), expiry=expiry)
+    )
     return store.approvals(number)[-1]
 
 
-def reject(store: Store, number: int, name: str, reason: str, account: str | None = None) -> RejectionRecord:
+def reject(store: Store, number: int, name: str, reason: str, account: str | None = None) -> ProposalRejection:
     """Reject a proposal for good: it cannot be approved or pushed any more, whatever approvals it has. Tables have to be proposed anew.
 
     Raises
@@ -164,7 +165,7 @@ def reject(store: Store, number: int, name: str, reason: str, account: str | Non
     """
     if not reason.strip():
         raise TableRefused(f"proposal {number} is not rejected without a reason", "say why; the proposer has to know")
-    store.add_rejection(RejectionRecord(0, number, name, account or login(), reason.strip(), ""))
+    store.add_rejection(ProposalRejection(proposal_id=number, name=name, login=account or login(), reason=reason.strip()))
     return store.rejections(number)[-1]
 
 

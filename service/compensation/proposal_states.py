@@ -8,12 +8,11 @@ from typing import Any
 
 from abbe.service.compensation.proposal_checks import valid_approval
 from abbe.service.compensation.proposal_doc import Proposed
+from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import Journal, JournalEntry, facts
 from abbe.service.push.states import TERMINAL, PushState
-from abbe.service.storage.records import ApprovalRecord
-from abbe.service.storage.repositories.decisions import RejectionRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import KIND, pushes_of
 
@@ -36,11 +35,11 @@ def proposal_status(store: Store, number: int, proposed: Proposed, now_s: float)
 def status_of_proposal(
     number: int,
     proposed: Proposed,
-    approvals: list[ApprovalRecord],
+    approvals: list[ProposalApproval],
     entries: list[JournalEntry],
     docs: dict[int, dict[str, Any]],
     now_s: float,
-    rejections: Sequence[RejectionRecord] = (),
+    rejections: Sequence[ProposalRejection] = (),
 ) -> ProposalStatus:
     """The same from plain values; ``docs``: of the store's tables, by number."""
     journals = pushes_of(entries)

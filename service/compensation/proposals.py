@@ -21,6 +21,7 @@ from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.candidates import Promise, candidate_of, scene_of
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.identification.effect_removal import TakenOut, taken_out
@@ -31,7 +32,6 @@ from abbe.service.push.validate import reasons_against
 from abbe.service.runs.columns import load_run
 from abbe.service.site import Site
 from abbe.service.storage.base import utc_text
-from abbe.service.storage.records import CampaignRecord, RunRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base, read_base
 from abbe.service.tables.nine_tables import added

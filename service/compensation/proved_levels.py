@@ -10,10 +10,10 @@ import asyncio
 from dataclasses import asdict, dataclass, fields
 
 from abbe.drivers.api import Controller, DeviceInfo
+from abbe.service.domain.document import Doc
 from abbe.service.errors import TableRefused
 from abbe.service.push.levels import Capabilities, objection
 from abbe.service.site import Site
-from abbe.service.storage.records import Doc
 from abbe.service.storage.store import Store
 
 KIND = "levels"

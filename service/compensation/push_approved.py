@@ -22,13 +22,13 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
 from abbe.service.events import ProgressSink
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
-from abbe.service.storage.records import AlarmEntryRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_outcome import STOPPED
 from abbe.service.verification.alarm_states import NO_ALARM, AlarmKind

@@ -19,6 +19,7 @@ from abbe.drivers.links.shielded import run_to_end
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import level_status
+from abbe.service.domain.owner import this_process
 from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push import execute
 from abbe.service.push.adapter import ControllerPort, PushActors
@@ -32,7 +33,6 @@ from abbe.service.push.semantic_digest import semantic_digest_of_tables
 from abbe.service.push.states import PushState
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
-from abbe.service.storage.owner import this_process
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.tables.nine_tables import table_image

@@ -10,6 +10,7 @@ from abbe.drivers.links.shielded import run_to_end
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.pushing import pushes_here
+from abbe.service.domain.owner import Owner, this_process
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
 from abbe.service.push import execute
 from abbe.service.push.adapter import ControllerPort, no_actors
@@ -18,7 +19,6 @@ from abbe.service.push.entries import WORD, Journal, facts
 from abbe.service.push.staging import LAID_ASIDE
 from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.site import Site
-from abbe.service.storage.owner import Owner, this_process
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import operator_needed
 from abbe.service.tables.table_gate import accept_strange, check_in_force, said, vouch

@@ -17,7 +17,6 @@ from typing import Final, Literal
 import structlog
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import Event
 from abbe.service.channel.messages import Answer, PushNow, RollBack
 from abbe.service.channel.messages import Outcome as Word
 from abbe.service.clock import Clock
@@ -28,6 +27,7 @@ from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.compensation.rollback import Ordered
 from abbe.service.core.jobs import BY_HAND, ByHand, FullCampaigns, JobRegistry, JobRequest
 from abbe.service.core.rights import person
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, NotStored, TableRefused
@@ -132,7 +132,9 @@ class _OrderJob(Job[JobOutcome]):
     async def record(self, outcome: str, text: str) -> None:
         """Write a line of the audit."""
         order = self._order
-        event = Event(order.who, order.kind, order.target, outcome, order.doc | ({"text": text} if text else {}))
+        event = AuditEvent(
+            who=order.who, action=order.kind, target=order.target, outcome=outcome, doc=order.doc | ({"text": text} if text else {})
+        )
         await asyncio.to_thread(self._audit.write, event)
 
 

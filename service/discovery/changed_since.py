@@ -17,6 +17,7 @@ from abbe.models.solvers.in_force import AppliedTables
 from abbe.models.uncertainty.known_field import KnownField
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import machine_digest
+from abbe.service.domain.results import SolutionRecord
 from abbe.service.effects.known_effects import LASTING, applies
 from abbe.service.effects.model_book import name_of, version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
@@ -24,7 +25,6 @@ from abbe.service.identification.effect_removal import less_effects
 from abbe.service.identification.solution_field import stored_field
 from abbe.service.identification.table_removal import NOTHING, RemovedTable, as_left, less, table_then
 from abbe.service.runs.observations import run_data
-from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, images_of, tables_of
 from abbe.service.tables.nine_tables import tables_from_image

@@ -26,6 +26,7 @@ from abbe.service.campaign_data.provenance import code_digest, machine_digest, r
 from abbe.service.discovery.changed_since import Since
 from abbe.service.discovery.discovery_doc import finding_doc
 from abbe.service.discovery.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering, taken_back
+from abbe.service.domain.results import ModelRecord
 from abbe.service.effects.axis_test import SLOW_DRIFT
 from abbe.service.effects.known_effects import applies, readings_of, without
 from abbe.service.effects.model_book import grown
@@ -35,7 +36,6 @@ from abbe.service.identification.solve import ALL_READINGS
 from abbe.service.identification.table_removal import NO_TABLE, TABLE_OUT, TableThen, as_left, table_line
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.observations import run_data
-from abbe.service.storage.records import ModelRecord
 
 Search = Callable[[Case, tuple[Effect, ...], ProgressSink], Discovery]
 """The computation: case, catalogue, whom to tell how far it is."""

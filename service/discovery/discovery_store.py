@@ -6,8 +6,8 @@ from typing import Any
 
 from abbe.service.campaign_data.campaign_folder import ensure_stored
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
+from abbe.service.domain.results import DiscoveryRecord, NewVersion
 from abbe.service.errors import ModelMovedOn
-from abbe.service.storage.records import DiscoveryRecord, NewVersion
 from abbe.service.storage.store import Store
 
 

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from abbe.service.compensation.proposals import Made
-from abbe.service.storage.records import SolutionRecord
+from abbe.service.domain.results import SolutionRecord
 from abbe.service.storage.store import Store
 
 NAMES = {

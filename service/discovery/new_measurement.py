@@ -13,7 +13,7 @@ from abbe.service.discovery.discover import Thin, prepare
 from abbe.service.discovery.discover_live import joined
 from abbe.service.discovery.discovery_doc import noise_mm_of
 from abbe.service.discovery.simulate import Simulation, simulate
-from abbe.service.storage.records import ModelRecord
+from abbe.service.domain.results import ModelRecord
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,9 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.effects.effect import Effect
 from abbe.service.campaign_data.packed_arrays import unpacked_covariance
+from abbe.service.domain.results import ModelRecord, NewVersion
 from abbe.service.effects.known_effects import applies
 from abbe.service.errors import ModelUnknown
-from abbe.service.storage.records import ModelRecord, NewVersion
 from abbe.service.storage.store import Store
 
 # How large several findings of one label are together: their coefficients add up, a size without a sign (an rms, a length) does not.

@@ -13,10 +13,10 @@ from abbe.models.arrays import F1, F2
 from abbe.models.uncertainty.coverage import apart_from_zero
 from abbe.models.uncertainty.known_field import KnownField, field_map
 from abbe.models.volumetric import volume_grid
+from abbe.service.domain.results import SolutionRecord
 from abbe.service.errors import NotObservable, Unusable
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
-from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.verification.deviations import standard_uncertainty_mm
 

@@ -7,8 +7,9 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Protocol
 
+from abbe.service.domain.decisions import PushEntryRecord
+from abbe.service.domain.service_records import SlotRecord
 from abbe.service.plant.facts import Alarm, Check, Facts, PlantFigure, TableInForce, Verified
-from abbe.service.storage.records import PushEntryRecord, SlotRecord
 
 SHOWN_ALARMS = 20
 _NOT_RUN = {"missed": "SCH-001", "skipped": "SCH-002", "interrupted": "SCH-007"}

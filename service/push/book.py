@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 
 from abbe.service.clock import Clock
+from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.errors import UnsafeToMove
 from abbe.service.push.entries import GENESIS, WORD, Doc, Journal, JournalEntry, follow
 from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.storage.base import utc_text
-from abbe.service.storage.records import PushEntryRecord
 from abbe.service.storage.store import Store
 
 
@@ -90,7 +90,16 @@ class StoreBook:
             Somebody else has written meanwhile, or the database does not take it.
         """
         entry = follow(journal, self._push, state, doc, utc_text(self._clock.utc()), self._head)
-        row = PushEntryRecord(0, self._machine, entry.push, entry.seq, str(entry.state), entry.doc, entry.utc, entry.prev, entry.digest)
+        row = PushEntryRecord(
+            machine=self._machine,
+            push=entry.push,
+            seq=entry.seq,
+            state=str(entry.state),
+            doc=entry.doc,
+            utc=entry.utc,
+            prev=entry.prev,
+            digest=entry.digest,
+        )
         await self._store.write(self._store.add_push_entry, row)
         self._head, self._journal = entry.digest, (*journal, entry)
         return entry

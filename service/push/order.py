@@ -34,7 +34,7 @@ class OperationOrder:
     control : str
         Identity of the control (`abbe.service.devices.urls.control_of`); empty: not known.
     process : dict
-        Which process pushes (`abbe.service.storage.owner.Owner`): nobody recovers while it lives.
+        Which process pushes (`abbe.service.domain.owner.Owner`): nobody recovers while it lives.
     """
 
     machine: str

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
 from abbe.service.config_schema import MachineFile
+from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.errors import FileFormatError, NotStored, StoreError
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.document_data import document_csv, document_json
@@ -20,7 +21,6 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.report.report_table import table_said
 from abbe.service.report.report_then import of_then
 from abbe.service.runs.columns import load_run
-from abbe.service.storage.records import CampaignRecord, RunRecord
 from abbe.service.storage.store import Store
 
 FORMS: dict[str, Callable[[Document], str | bytes]] = {

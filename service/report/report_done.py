@@ -10,6 +10,7 @@ import numpy as np
 
 from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
+from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import NotStored, TableMismatch
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import WORD, JournalBroken, JournalEntry, check_chain, facts
@@ -21,7 +22,6 @@ from abbe.service.report import report_parts as parts
 from abbe.service.report.report_parts import Doc, Rules
 from abbe.service.report.report_table import table_said
 from abbe.service.report.report_then import of_then
-from abbe.service.storage.records import VerificationRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import tables_from_image
 from abbe.service.tables.push_history import push_log

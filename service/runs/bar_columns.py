@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from abbe.drivers.api import BarSample
 from abbe.drivers.flags import bar_is_valid, on_path
+from abbe.service.domain.document import Doc
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.clocks import Edges
-from abbe.service.storage.records import Doc
 
 Array = npt.NDArray[np.float64]
 

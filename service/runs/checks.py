@@ -8,12 +8,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
+from abbe.service.domain.document import Doc
 from abbe.service.errors import FileFormatError
 from abbe.service.explain import expected, shown, where
 from abbe.service.files import NotPlainError, read_plain
 from abbe.service.runs.formats import Columns, RunFile, Setup
 from abbe.service.runs.json_text import strict_json
-from abbe.service.storage.records import Doc
 
 _OF_MOTION = ("mm", "um", "nm", "m", "rad", "urad", "mrad", "deg", "s", "ms", "us", "h", "mm_min", "mm_s", "rpm", "Hz", "kHz")
 _OF_OTHERS = ("C", "K", "Pa", "hPa", "N", "kN", "Nm", "V", "mV", "A", "W", "kW", "percent", "permille", "ppm", "bits")

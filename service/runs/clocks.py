@@ -16,7 +16,8 @@ import numpy as np
 from abbe.models.alignment.breaks import breaks
 from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, fit_clock, relative_rate
 from abbe.models.arrays import F1
-from abbe.service.storage.records import ChunkRecord, Doc
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import ChunkRecord
 
 U_DELAY_S = 2e-3
 """Standard uncertainty of the least delay of a link, which no arrival tells: 0 to 7 ms, an adapter's and the operating system's."""

@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 
 from abbe.drivers.flags import bar_is_valid
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
 from abbe.service.runs.bar_columns import bar_columns, begins_seen, sync_edges
 from abbe.service.runs.clocks import RunClock, run_clock
@@ -30,7 +32,6 @@ from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_js
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.laser_columns import laser_columns
 from abbe.service.runs.pieces import SoFar, joined, pieces_of, read_so_far, up_to
-from abbe.service.storage.records import ChunkRecord, Doc, RunRecord
 from abbe.service.storage.store import Store
 
 # Ball-bar readings at standstill become columns: one row for each point, the mean of the samples that were taken there.

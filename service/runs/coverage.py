@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import RunRecord
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.runs.helix_axis import about_axis, helix_axis
 from abbe.service.runs.pieces import arc_of
-from abbe.service.storage.records import Doc, RunRecord
 
 LEAST = 0.9
 """Share of the commanded path that a run has to have read, to be judged: what is left out may hold the largest deviation."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from abbe.drivers.flags import beam_is_gone
-from abbe.service.storage.records import Doc
+from abbe.service.domain.document import Doc
 
 MM_PER_COUNT = 1e-7
 """The displacement counts tenths of a nanometre."""

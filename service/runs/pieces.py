@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.service.storage.records import Doc, RunRecord
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import RunRecord
 
 STRETCH_S, STRETCH_MM = 0.5, 5.0
 """So long, and at least so far, is what is read twice."""

@@ -11,11 +11,12 @@ from functools import partial
 import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
-from abbe.service.audit.chain import Event
 from abbe.service.clock import Clock
 from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.schedule import Needs, Schedule
+from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.investigate import Note
@@ -25,7 +26,6 @@ from abbe.service.scheduler.ports import Doc, FollowUp, JobWatcher, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
-from abbe.service.storage.records import AlarmEntryRecord
 from abbe.service.tables.push_outcome import OPEN, STOPPED, by_journal, in_force, last_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
@@ -239,7 +239,7 @@ class AlarmManager(RetryingStore):
         if kind is not AlarmKind.HELD:
             target = f"{self._machine}, alarm {entry.alarm}" if entry.alarm != NO_ALARM else self._machine
             try:
-                event = Event(this_account(), "abbe serve", target, str(kind), {"text": doc["text"]})
+                event = AuditEvent(who=this_account(), action="abbe serve", target=target, outcome=str(kind), doc={"text": doc["text"]})
                 await asyncio.to_thread(self._channels.audit.write, event)
             except AbbeError as error:  # the line itself is kept: a service that ends here would warn of nothing more
                 log.error("not in the audit", cause=error.detail)

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any
 
+from abbe.service.domain.results import VerificationRecord
+from abbe.service.domain.service_records import HeartbeatRecord
 from abbe.service.scheduler.heartbeat import SILENT_AFTER
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.records import HeartbeatRecord, VerificationRecord
 from abbe.service.verification.trend_table import FigureTrend, trends
 from abbe.service.verification.verified_by import LOOKED, VerifiedBy, of_push_taken_back, verified_by
 

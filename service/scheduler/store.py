@@ -8,7 +8,8 @@ from datetime import datetime
 
 from sqlalchemy import ColumnElement, Connection, func, insert, or_, select
 
-from abbe.service.storage.records import Doc, SlotRecord
+from abbe.service.domain.document import Doc
+from abbe.service.domain.service_records import SlotRecord
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.repositories.slots import SLOT_COLUMNS, slot_record
 from abbe.service.storage.store import Store

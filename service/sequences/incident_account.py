@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from abbe.service.domain.measured import CheckpointRecord
 from abbe.service.sequences.journal import DETECTED, ENDED, INCIDENT, OUTCOME
-from abbe.service.storage.records import CheckpointRecord
 
 UNKNOWN = "no outcome"
 """The process ended before the trouble did."""

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection, select
 
-from abbe.service.storage.records import Doc, ImportedRun
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import ImportedRun
 from abbe.service.storage.repositories.alarms import AlarmStore
 from abbe.service.storage.repositories.audit import AuditStore
 from abbe.service.storage.repositories.campaigns import insert_campaign, machine_id_of

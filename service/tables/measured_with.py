@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from abbe.service.domain.document import Doc
 from abbe.service.errors import FormatRefused
 from abbe.service.push.book import read_entries
-from abbe.service.storage.records import Doc
 from abbe.service.storage.store import Store
 
 KIND_AT, NO_CORRECTION = slice(4, 6), 0

@@ -11,9 +11,10 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from abbe.service.domain.decisions import PushEntryRecord
+from abbe.service.domain.document import Doc
 from abbe.service.push.entries import JournalEntry
 from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
-from abbe.service.storage.records import Doc, PushEntryRecord
 from abbe.service.storage.store import Store
 
 How = Literal["verified", "accepted", "found in force"]

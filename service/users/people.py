@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from abbe.service.clock import Clock
+from abbe.service.domain.people import TokenRecord, UserRecord
 from abbe.service.errors import UserRefused
 from abbe.service.storage.base import utc_text
-from abbe.service.storage.repositories.people import TokenRecord, UserRecord
 from abbe.service.storage.store import Store
 from abbe.service.users.passwords import Passwords, check_new
 from abbe.service.users.roles import ALLOWED, Permission, Role
@@ -203,7 +203,9 @@ class People:
         prefix, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
         text = f"abbe_{prefix}_{secret}"
         expires = utc_text(self._clock.utc() + timedelta(days=days))
-        self._store.add_token(TokenRecord(0, user.id, title, prefix, digest_of(text), sorted(set(scopes)), "", expires, None))
+        self._store.add_token(
+            TokenRecord(user_id=user.id, name=title, prefix=prefix, digest=digest_of(text), scopes=sorted(set(scopes)), expires_utc=expires)
+        )
         return text
 
     def revoke_token(self, name: str, title: str) -> None:

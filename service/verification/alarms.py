@@ -9,10 +9,12 @@ from datetime import datetime
 import numpy as np
 
 from abbe.models.trend import MIN_CHECKS, MOST_CHECKS, Forecast, jumps, mean_of
+from abbe.service.domain.document import Doc
+from abbe.service.domain.results import VerificationRecord
+from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.push.book import read_entries
 from abbe.service.push.states import PushState
-from abbe.service.storage.records import AlarmEntryRecord, Doc, VerificationRecord
 from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, Signal, after_check, folded, is_open
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, in_words, of_series, trends

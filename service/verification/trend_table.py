@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from abbe.models.trend import CUSUM_H, CUSUM_K, Forecast, Trend, average_run_length, trend
-from abbe.service.storage.records import VerificationRecord
+from abbe.service.domain.results import VerificationRecord
 
 DAY_S = 86400.0
 COVERAGE = 2.0

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import StoreError
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import JournalBroken, JournalEntry, check_chain, facts
 from abbe.service.push.states import PushState
-from abbe.service.storage.records import Doc, VerificationRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import KIND, wanted_by
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict
 
+from abbe.service.domain.audit_event import AuditEntry
+
 
 class _Answer(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -31,18 +33,6 @@ class Users(_Answer):
     """All users."""
 
     users: list[User]
-
-
-class AuditEntry(_Answer):
-    """One record of the audit."""
-
-    id: int
-    utc: str
-    who: str
-    action: str
-    target: str
-    outcome: str
-    digest: str
 
 
 class AuditList(_Answer):

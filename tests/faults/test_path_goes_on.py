@@ -15,6 +15,7 @@ from abbe.service.campaign_data.run_times import times
 from abbe.service.campaigns.campaign_run import decline
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import resume
+from abbe.service.domain.measured import RunRecord
 from abbe.service.errors import Interlock
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import export_folder, import_folder
@@ -22,7 +23,6 @@ from abbe.service.sequences.control import State
 from abbe.service.sequences.interlocks import Suspending, Watching
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import CampaignPlan, RecordPath
-from abbe.service.storage.records import RunRecord
 from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import MACHINE, AtStep, Bench, bench, number
 

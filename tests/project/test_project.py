@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base
-from abbe.service.audit.chain import Event
 from abbe.service.backup.restore import BESIDE
 from abbe.service.capture.settings import CaptureSettings, segment_folder
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.storage.migrate import known_revisions
 from abbe.service.storage.store import Store
 
@@ -70,7 +70,7 @@ def test_what_lies_beside_a_database_is_not_committed(tmp_path: Path, monkeypatc
         beside = [Path(f"{file}{ending}") for ending in (*BESIDE, *(f".before-{revision}" for revision in known_revisions()))]
         names |= {one.name for one in (*beside, key, heads)} | {f"{segment_folder(f'sqlite:///{file}', CaptureSettings()).name}/run-1"}
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        AuditBook(store, f"sqlite:///{tmp_path / 'abbe.sqlite3'}").write(Event("a", "b", "c", "done", {}))
+        AuditBook(store, f"sqlite:///{tmp_path / 'abbe.sqlite3'}").write(AuditEvent(who="a", action="b", target="c", outcome="done"))
         names |= {one.name for one in tmp_path.iterdir()}
     assert len(names) > 12
     done = subprocess.run(["git", "check-ignore", "--no-index", *names], cwd=ROOT, capture_output=True, text=True, check=False)

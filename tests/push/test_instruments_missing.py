@@ -20,6 +20,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation import pushing
 from abbe.service.compensation.push_approved import PushOrder, push_approved
 from abbe.service.config import load_machine
+from abbe.service.domain.owner import this_process
 from abbe.service.events import ignore_progress
 from abbe.service.jobs.check import run_check
 from abbe.service.jobs.guided_campaign import run_guided_campaign
@@ -27,7 +28,6 @@ from abbe.service.jobs.investigate import InvestigationContext
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.site import Site, site_of
-from abbe.service.storage.owner import this_process
 from tests.push.test_whose_table import Left, left_in_probation
 from tests.scenarios.conftest import ABBE
 

@@ -26,6 +26,7 @@ from abbe.service.compensation.proposals import load_runs, login
 from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved, push_approved
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.domain.decisions import ProposalApproval
 from abbe.service.errors import StoreError, TableRefused
 from abbe.service.events import ignore_progress
 from abbe.service.push.book import read_entries
@@ -34,7 +35,6 @@ from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
-from abbe.service.storage.records import ApprovalRecord
 from abbe.service.storage.store import Store
 from tests.pretended import as_if_commissioned
 from tests.scenarios.conftest import Sims, simulated
@@ -196,7 +196,9 @@ def test_an_approval_ends_and_binds_who_and_what(shop):
             try_push(shop, store, own)
 
         other = shop.copy(store)
-        store.add_approval(ApprovalRecord(0, other, "anna", "anna", good.digest, "2099-01-01T00:00:00.000000Z", ""))  # prolonged by hand
+        store.add_approval(
+            ProposalApproval(proposal_id=other, name="anna", login="anna", digest=good.digest, expiry="2099-01-01T00:00:00.000000Z")
+        )  # prolonged by hand
         with pytest.raises(TableRefused, match="APPROVAL: what anna approved is not this table"):
             try_push(shop, store, other)
         assert store.push_entries("sim") == []

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from abbe.service.storage.records import RunRecord
+from abbe.service.domain.measured import RunRecord
 from abbe.service.storage.store import Store
 from tests.patience import within
 

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Route, sync_playwright
 
-from abbe.service.audit.chain import Event
+from abbe.service.domain.audit_event import AuditEvent
 from tests.pages_world import PHRASE, PROPOSER, Filled, Served, fill, screens, served
 from tests.system.serve_bench import require
 from tests.system.test_serve_page import ARTIFACTS, QUIET
@@ -158,7 +158,7 @@ def test_nothing_from_a_store_is_run(chromium, tmp_path) -> None:
     filled = fill(tmp_path, EVIL)
     hits: list[int] = []
     with served(filled) as one, context(chromium) as made:
-        one.door.book.write(Event(EVIL, EVIL, EVIL, EVIL, {"note": EVIL}))
+        one.door.book.write(AuditEvent(who=EVIL, action=EVIL, target=EVIL, outcome=EVIL, doc={"note": EVIL}))
         one.board.job_started(filled.schedules[0], one.door.store._utcnow())
         page = made.new_page()
         page.expose_function("hit", lambda: hits.append(1))

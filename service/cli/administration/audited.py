@@ -16,7 +16,7 @@ import typer
 from abbe.service.cli.declared import is_recorded
 
 if TYPE_CHECKING:
-    from abbe.service.audit.chain import Event
+    from abbe.service.domain.audit_event import AuditEvent
 
 INTERRUPTED = "interrupted"
 
@@ -132,11 +132,11 @@ def _missing(url: str) -> Path | None:
     return None if path.exists() else path
 
 
-def event_of(words: str, given: Mapping[str, Any], outcome: str) -> Event:
+def event_of(words: str, given: Mapping[str, Any], outcome: str) -> AuditEvent:
     """What is recorded of a command: who ran it here, on what, with which options."""
     from abbe.service.audit.book import this_account
-    from abbe.service.audit.chain import Event
+    from abbe.service.domain.audit_event import AuditEvent
 
     target = next((str(given[key]) for key in ("name", "campaign", "file", "out", "folder", "solution", "machine") if given.get(key)), "")
     told = {key: str(value) for key, value in given.items() if value not in (None, False, "", []) and key not in {"db", "as_json"}}
-    return Event(this_account(), f"abbe {words}", target, outcome, told)
+    return AuditEvent(who=this_account(), action=f"abbe {words}", target=target, outcome=outcome, doc=told)

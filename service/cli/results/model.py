@@ -9,7 +9,7 @@ import typer
 from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
 
 if TYPE_CHECKING:
-    from abbe.service.storage.records import ModelRecord
+    from abbe.service.domain.results import ModelRecord
 
 model = typer.Typer(
     help="The model book of a machine: versions with their effects, where each came from, and the way back.", no_args_is_help=True

@@ -9,7 +9,7 @@ import typer
 from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, run_or_campaign
 
 if TYPE_CHECKING:
-    from abbe.service.storage.records import ChunkRecord, RunRecord
+    from abbe.service.domain.measured import ChunkRecord, RunRecord
 
 
 def runs(
@@ -39,9 +39,9 @@ def show(
 ) -> None:
     """Show one run: state, setup and what its columns hold (--json: as an exchange file). Or a campaign: runs and incidents."""
     from abbe.service.cli.results.show_campaign import show_campaign
+    from abbe.service.domain.measured import RunRecord
     from abbe.service.runs.columns import run_document, whole_document
     from abbe.service.runs.coverage import not_judged, with_state
-    from abbe.service.storage.records import RunRecord
 
     with open_store(database_url(db, machine)) as store:
         record = run_or_campaign(store, run)

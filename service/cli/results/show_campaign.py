@@ -9,8 +9,8 @@ import typer
 from abbe.service.cli.common import print_json, print_table
 
 if TYPE_CHECKING:
+    from abbe.service.domain.measured import CampaignRecord
     from abbe.service.sequences.incident_account import Trouble
-    from abbe.service.storage.records import CampaignRecord
     from abbe.service.storage.store import Store
 
 

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, func, insert, select
 from sqlalchemy.exc import IntegrityError
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import StoreError
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import AlarmEntryRecord, Doc
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables import alarm_entries, outbox
 

@@ -3,45 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 
-from sqlalchemy import Connection, insert, select, text
+from sqlalchemy import Connection, insert, text
 
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import StoreError
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import Doc
+from abbe.service.storage.mapping import RecordMapping
 from abbe.service.storage.tables_people import audit
 
-
-@dataclass(frozen=True, slots=True)
-class AuditRecord:
-    """Who did what, when, on what, and how it ended. ``id`` counts from 1 without a gap; ``key`` names the key of ``mac``."""
-
-    id: int
-    utc: str
-    who: str
-    action: str
-    target: str
-    outcome: str
-    doc: Doc
-    prev: str
-    digest: str
-    key: str
-    mac: str
+AUDIT = RecordMapping(AuditEvent, audit)
 
 
 class AuditStore(StoreBase):
     """The audit of this database."""
 
-    def append_audit(self, make: Callable[[AuditRecord | None, str], AuditRecord]) -> AuditRecord:
+    def append_audit(self, make: Callable[[AuditEvent | None, str], AuditEvent]) -> AuditEvent:
         """Append the record that ``make(last record, present UTC)`` makes. Two processes wait for each other: the chain never forks."""
 
-        def work(connection: Connection) -> AuditRecord:
+        def work(connection: Connection) -> AuditEvent:
             if self._engine.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE has shut out the others already
                 connection.execute(text("LOCK TABLE audit IN EXCLUSIVE MODE"))
-            row = connection.execute(select(audit).order_by(audit.c.id.desc()).limit(1)).first()
-            record = make(None if row is None else AuditRecord(*row), self._now())
-            connection.execute(insert(audit).values(**asdict(record)))
+            row = connection.execute(AUDIT.select().order_by(audit.c.id.desc()).limit(1)).first()
+            record = make(None if row is None else AUDIT.read(row), self._now())
+            connection.execute(insert(audit).values(AUDIT.values(record)))
             return record
 
         return self._write(work)
@@ -63,9 +48,9 @@ class AuditStore(StoreBase):
 
         self._write(work)
 
-    def audit(self, last: int | None = None) -> list[AuditRecord]:
+    def audit(self, last: int | None = None) -> list[AuditEvent]:
         """Read the audit, oldest first; only the ``last`` records if given."""
-        query = select(audit).order_by(audit.c.id.desc())
+        query = AUDIT.select().order_by(audit.c.id.desc())
         query = query if last is None else query.limit(last)
         rows = self._read(lambda connection: connection.execute(query).all())
-        return [AuditRecord(*row) for row in reversed(rows)]
+        return [AUDIT.read(row) for row in reversed(rows)]

@@ -8,9 +8,10 @@ from typing import Any
 
 from sqlalchemy import Connection, Insert, Select, insert, select
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import CampaignRecord, MachineRecord
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import CampaignRecord, Doc, MachineRecord
 from abbe.service.storage.tables import campaigns, machines
 
 MOST_DIGITS = 10

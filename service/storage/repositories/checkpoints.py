@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from sqlalchemy import Connection, func, insert, select
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import CheckpointRecord
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import CheckpointRecord, Doc
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables import checkpoints
 

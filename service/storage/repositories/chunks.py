@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, insert, select
 from sqlalchemy.exc import IntegrityError
 
+from abbe.service.domain.measured import RUNNING, ChunkRecord
 from abbe.service.errors import CaptureConflict, StoreError
-from abbe.service.storage.records import RUNNING, ChunkRecord
 from abbe.service.storage.repositories.campaigns import CampaignStore
 from abbe.service.storage.tables import chunks, runs
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import timedelta
 
 from sqlalchemy import Connection, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
+from abbe.service.domain.decisions import ProposalRejection
+from abbe.service.domain.service_records import ReplyRecord
 from abbe.service.storage.base import StoreBase, utc_text
+from abbe.service.storage.mapping import RecordMapping
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables_decisions import rejections, replies
 
@@ -18,40 +20,21 @@ ABANDONED = timedelta(minutes=1)
 """A request without an answer for so long died with its process; the key may be used again."""
 
 
-@dataclass(frozen=True, slots=True)
-class RejectionRecord:
-    """Somebody's no to a proposal. Never changed after writing; ``name``, ``login``: as of an approval."""
-
-    id: int
-    proposal_id: int
-    name: str
-    login: str
-    reason: str
-    utc: str
-
-
-@dataclass(frozen=True, slots=True)
-class ReplyRecord:
-    """What was answered to the request of a key; ``status`` None: it is still being worked on."""
-
-    digest: str
-    status: int | None
-    body: str | None
+REJECTION = RecordMapping(ProposalRejection, rejections)
 
 
 class DecisionStore(StoreBase):
     """Decisions that come over the network."""
 
-    def add_rejection(self, rejection: RejectionRecord) -> int:
+    def add_rejection(self, rejection: ProposalRejection) -> int:
         """Store a rejection; its ``id`` and ``utc`` are given here. Returns the id."""
-        names = ("proposal_id", "name", "login", "reason")
-        values = {name: getattr(rejection, name) for name in names} | {"utc": self._now()}
+        values = REJECTION.values(rejection, "id") | {"utc": self._now()}
         return self._write(lambda connection: new_id(connection, insert(rejections).values(values)))
 
-    def rejections(self, proposal_id: int) -> list[RejectionRecord]:
+    def rejections(self, proposal_id: int) -> list[ProposalRejection]:
         """List rejections of a proposal, oldest first."""
-        query = select(rejections).where(rejections.c.proposal_id == proposal_id).order_by(rejections.c.id)
-        return [RejectionRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
+        query = REJECTION.select().where(rejections.c.proposal_id == proposal_id).order_by(rejections.c.id)
+        return [REJECTION.read(row) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def claim_reply(self, who: str, key: str, digest: str) -> ReplyRecord | None:
         """Take a key for a request; None: it is the caller's now, and he has to `keep_reply` or `drop_reply`. Else what is there.

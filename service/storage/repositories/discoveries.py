@@ -9,9 +9,10 @@ from sqlalchemy import Connection, func, insert, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql import Select
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.results import DiscoveryRecord, ModelRecord, NewVersion, StepRecord
 from abbe.service.errors import ModelMovedOn, NotStored, StoreError
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import DiscoveryRecord, Doc, ModelRecord, NewVersion, StepRecord
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables import discoveries, discovery_steps, machine_models
 

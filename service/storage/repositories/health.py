@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, select, text
 
+from abbe.service.domain.service_records import StoreHealth
 from abbe.service.storage.base import StoreBase
 from abbe.service.storage.migrate import head_revision, revision_of
 from abbe.service.storage.tables import machines, outbox
-
-
-@dataclass(frozen=True, slots=True)
-class StoreHealth:
-    """State of a database. ``file``: of SQLite, else empty; ``size_b``: with the write-ahead log; ``since_utc``: of the first machine."""
-
-    revision: str
-    wanted_revision: str
-    file: str
-    size_b: int
-    since_utc: str | None
-    outbox: int
-    outbox_oldest_utc: str | None
 
 
 class HealthStore(StoreBase):

@@ -6,9 +6,10 @@ from sqlalchemy import Connection, select
 from sqlalchemy.dialects.postgresql import insert as pg_insert
 from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.owner import Owner, this_process
+from abbe.service.domain.service_records import HeartbeatRecord
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.owner import Owner, this_process
-from abbe.service.storage.records import Doc, HeartbeatRecord
 from abbe.service.storage.tables import heartbeats, machines
 
 

@@ -8,9 +8,10 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, FromClause, Select, func, select
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, ChunkRecord
+from abbe.service.domain.owner import Owner
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.owner import Owner
-from abbe.service.storage.records import INCOMPLETE, RUNNING, ChunkRecord, Doc
 from abbe.service.storage.tables import (
     campaigns,
     chunks,
@@ -84,16 +85,6 @@ _DOCUMENTS: dict[str, Any] = {
     "pushes": push_entries,
     "tables": comp_tables,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelRecord:
-    """What a run holds in one channel, without the samples."""
-
-    channel: str
-    codec: str
-    chunks: int
-    samples: int
 
 
 class PageStore(StoreBase):

@@ -2,55 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
+from abbe.service.domain.people import SessionRecord, TokenRecord, UserRecord
 from abbe.service.errors import StoreError
 from abbe.service.storage.base import StoreBase, utc_text
+from abbe.service.storage.mapping import RecordMapping
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables_people import api_tokens, sessions, users
 
-
-@dataclass(frozen=True, slots=True)
-class UserRecord:
-    """A person. ``disabled_utc``: since when he may not log in; users are never deleted, the audit names them."""
-
-    id: int
-    name: str
-    role: str
-    password: str = field(repr=False)
-    disabled_utc: str | None
-    created_utc: str
-
-
-@dataclass(frozen=True, slots=True)
-class SessionRecord:
-    """A login of a person. ``digest``: SHA-256 of the secret in his cookie."""
-
-    id: int
-    user_id: int
-    digest: str = field(repr=False)
-    created_utc: str
-    seen_utc: str
-    ended_utc: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class TokenRecord:
-    """A token of a program, with the rights of the person it belongs to, at most those of its scopes."""
-
-    id: int
-    user_id: int
-    name: str
-    prefix: str
-    digest: str = field(repr=False)
-    scopes: list[str]
-    created_utc: str
-    expires_utc: str
-    revoked_utc: str | None
+USER, SESSION, TOKEN = RecordMapping(UserRecord, users), RecordMapping(SessionRecord, sessions), RecordMapping(TokenRecord, api_tokens)
 
 
 class PeopleStore(StoreBase):
@@ -74,12 +38,12 @@ class PeopleStore(StoreBase):
 
     def users(self) -> list[UserRecord]:
         """List all users, disabled ones too."""
-        return [UserRecord(*row) for row in self._read(lambda connection: connection.execute(select(users).order_by(users.c.id)).all())]
+        return [USER.read(row) for row in self._read(lambda connection: connection.execute(USER.select().order_by(users.c.id)).all())]
 
     def user(self, name: str) -> UserRecord | None:
         """Find a user by name."""
-        row = self._read(lambda connection: connection.execute(select(users).where(users.c.name == name)).first())
-        return None if row is None else UserRecord(*row)
+        row = self._read(lambda connection: connection.execute(USER.select().where(users.c.name == name)).first())
+        return None if row is None else USER.read(row)
 
     def active_admins(self) -> int:
         """Count the admins who may log in: not disabled, and with the hash of a password."""
@@ -111,9 +75,9 @@ class PeopleStore(StoreBase):
 
     def session(self, digest: str) -> tuple[SessionRecord, UserRecord] | None:
         """Find a session, ended ones too, and whose it is."""
-        query = select(sessions, users).join(users, users.c.id == sessions.c.user_id).where(sessions.c.digest == digest)
+        query = select(*SESSION.columns, *USER.columns).join(users, users.c.id == sessions.c.user_id).where(sessions.c.digest == digest)
         row = self._read(lambda connection: connection.execute(query).first())
-        return None if row is None else (SessionRecord(*row[:6]), UserRecord(*row[6:]))
+        return None if row is None else (SESSION.read(row), USER.read(row))
 
     def touch_session(self, session_id: int) -> None:
         """Note that a session was used just now."""
@@ -136,22 +100,21 @@ class PeopleStore(StoreBase):
             same = (api_tokens.c.user_id == token.user_id) & (api_tokens.c.name == token.name)
             if connection.execute(select(api_tokens.c.id).where(same)).first() is not None:
                 raise StoreError(f"this user has a token {token.name!r} already", "give another name; a revoked token keeps its own")
-            names = ("user_id", "name", "prefix", "digest", "scopes", "expires_utc")
-            values = {name: getattr(token, name) for name in names} | {"created_utc": self._now()}
+            values = TOKEN.values(token, "id", "revoked_utc") | {"created_utc": self._now()}
             return new_id(connection, insert(api_tokens).values(values))
 
         return self._write(work)
 
     def token(self, prefix: str) -> tuple[TokenRecord, UserRecord] | None:
         """Find a token by its prefix, revoked ones too, and whose it is."""
-        query = select(api_tokens, users).join(users, users.c.id == api_tokens.c.user_id).where(api_tokens.c.prefix == prefix)
+        query = select(*TOKEN.columns, *USER.columns).join(users, users.c.id == api_tokens.c.user_id).where(api_tokens.c.prefix == prefix)
         row = self._read(lambda connection: connection.execute(query).first())
-        return None if row is None else (TokenRecord(*row[:9]), UserRecord(*row[9:]))
+        return None if row is None else (TOKEN.read(row), USER.read(row))
 
     def tokens(self) -> list[tuple[TokenRecord, str]]:
         """List all tokens with the names of their users."""
-        query = select(api_tokens, users.c.name).join(users, users.c.id == api_tokens.c.user_id).order_by(api_tokens.c.id)
-        return [(TokenRecord(*row[:9]), row[9]) for row in self._read(lambda connection: connection.execute(query).all())]
+        query = select(*TOKEN.columns, users.c.name).join(users, users.c.id == api_tokens.c.user_id).order_by(api_tokens.c.id)
+        return [(TOKEN.read(row), row.name) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def revoke_token(self, token_id: int) -> None:
         """Revoke a token, for ever."""

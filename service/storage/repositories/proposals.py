@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from sqlalchemy import insert, select
 
+from abbe.service.domain.decisions import ProposalApproval, ProposalRecord
+from abbe.service.domain.document import Doc
 from abbe.service.errors import NotStored
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import ApprovalRecord, Doc, ProposalRecord
+from abbe.service.storage.mapping import RecordMapping
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables import approvals, proposals
+
+APPROVAL = RecordMapping(ProposalApproval, approvals)
 
 
 class ProposalStore(StoreBase):
@@ -51,13 +55,12 @@ class ProposalStore(StoreBase):
             query = query.where(proposals.c.machine == machine)
         return [ProposalRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
 
-    def add_approval(self, approval: ApprovalRecord) -> int:
+    def add_approval(self, approval: ProposalApproval) -> int:
         """Store an approval; its ``id`` and ``utc`` are given here. Returns the id."""
-        names = ("proposal_id", "name", "login", "digest", "expiry")
-        values = {name: getattr(approval, name) for name in names} | {"utc": self._now()}
+        values = APPROVAL.values(approval, "id") | {"utc": self._now()}
         return self._write(lambda connection: new_id(connection, insert(approvals).values(values)))
 
-    def approvals(self, proposal_id: int) -> list[ApprovalRecord]:
+    def approvals(self, proposal_id: int) -> list[ProposalApproval]:
         """List approvals of a proposal, oldest first."""
-        query = select(approvals).where(approvals.c.proposal_id == proposal_id).order_by(approvals.c.id)
-        return [ApprovalRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
+        query = APPROVAL.select().where(approvals.c.proposal_id == proposal_id).order_by(approvals.c.id)
+        return [APPROVAL.read(row) for row in self._read(lambda connection: connection.execute(query).all())]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, Row, func, insert, null, select
 
+from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.errors import StoreError
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import PushEntryRecord
+from abbe.service.storage.mapping import RecordMapping
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables import push_entries
 
@@ -45,10 +47,14 @@ def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) 
     return machine if machine not in last else f"{machine} ({control})"[:NAME_LENGTH]
 
 
-def _mark(row: Any) -> PushEntryRecord:
-    number, machine, push, seq, state, utc, prev, digest, *values = row
-    doc = {key: int(value) if key.endswith("crc") else str(value) for key, value in zip(MARKS, values, strict=True) if value is not None}
-    return PushEntryRecord(number, machine, push, seq, state, doc, utc, prev, digest)
+def _mark(row: Row[Any]) -> PushEntryRecord:
+    marks = {key: row._mapping[f"mark_{key}"] for key in MARKS}  # noqa: SLF001 - SQLAlchemy's public name
+    doc = {key: int(value) if key.endswith("crc") else str(value) for key, value in marks.items() if value is not None}
+    return replace(MARK.read(row), doc=doc)
+
+
+PUSH_ENTRY = RecordMapping(PushEntryRecord, push_entries)
+MARK = RecordMapping(PushEntryRecord, push_entries, doc=null())
 
 
 class PushStore(StoreBase):
@@ -81,8 +87,7 @@ class PushStore(StoreBase):
                     f"push {entry.push} of {entry.machine}: somebody else has written into the journal meanwhile",
                     "another process pushes or recovers on this machine: wait until it has ended",
                 )
-            names = ("machine", "push", "seq", "state", "doc", "utc", "prev", "digest")
-            return new_id(connection, insert(push_entries).values({name: getattr(entry, name) for name in names}))
+            return new_id(connection, insert(push_entries).values(PUSH_ENTRY.values(entry, "id")))
 
         return self._write(work)
 
@@ -107,8 +112,8 @@ class PushStore(StoreBase):
 
     def push_marks(self) -> list[PushEntryRecord]:
         """Read what the journals of all machines say of tables, in the order of writing; documents hold `MARKS` only, no images."""
-        columns = [c for c in push_entries.c if c.name != "doc"]
-        query = select(*columns, *(push_entries.c.doc[key].as_string() for key in MARKS)).order_by(push_entries.c.id)
+        marks = [push_entries.c.doc[key].as_string().label(f"mark_{key}") for key in MARKS]
+        query = select(*MARK.columns, *marks).order_by(push_entries.c.id)
         return [_mark(row) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def push_entries(self, machine: str, control: str = "") -> list[PushEntryRecord]:
@@ -117,12 +122,12 @@ class PushStore(StoreBase):
 
     def push_entries_of(self, chain: str) -> list[PushEntryRecord]:
         """Read a journal by its own name."""
-        query = select(push_entries).where(push_entries.c.machine == chain).order_by(push_entries.c.id)
-        return [PushEntryRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
+        query = PUSH_ENTRY.select().where(push_entries.c.machine == chain).order_by(push_entries.c.id)
+        return [PUSH_ENTRY.read(row) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def last_push(self, machine: str, control: str = "") -> list[PushEntryRecord]:
         """Read the journal of the last push of a machine's control (`push_chain`); empty if there was none."""
         chain = self.push_chain(machine, control)
         latest = select(func.max(push_entries.c.push)).where(push_entries.c.machine == chain).scalar_subquery()
-        query = select(push_entries).where(push_entries.c.machine == chain, push_entries.c.push == latest).order_by(push_entries.c.id)
-        return [PushEntryRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
+        query = PUSH_ENTRY.select().where(push_entries.c.machine == chain, push_entries.c.push == latest).order_by(push_entries.c.id)
+        return [PUSH_ENTRY.read(row) for row in self._read(lambda connection: connection.execute(query).all())]

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
+from abbe.service.domain.service_records import OutboxRecord
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import OutboxRecord
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables import outbox
 

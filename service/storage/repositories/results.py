@@ -8,9 +8,10 @@ from typing import Any
 from sqlalchemy import insert, select
 from sqlalchemy.sql import Select
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.results import SolutionRecord, TableRecord, VerificationRecord
 from abbe.service.errors import NotStored
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.records import Doc, SolutionRecord, TableRecord, VerificationRecord
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.tables import comp_tables, machines, solutions, verifications
 

@@ -7,9 +7,10 @@ import zlib
 from sqlalchemy import Connection, Row, Select, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import FINISHED, RUNNING, ChunkRecord, ImportedRun, RunRecord
+from abbe.service.domain.owner import Owner, this_process
 from abbe.service.errors import NotStored, StoreError
-from abbe.service.storage.owner import Owner, this_process
-from abbe.service.storage.records import FINISHED, RUNNING, ChunkRecord, Doc, ImportedRun, RunRecord
 from abbe.service.storage.repositories.campaigns import new_id
 from abbe.service.storage.repositories.chunks import ChunkStore
 from abbe.service.storage.tables import campaigns, chunks, runs
@@ -53,7 +54,7 @@ class RunStore(ChunkStore):
         run_id : int
             Run.
         status : str
-            One of ``abbe.service.storage.records.FINISHED``.
+            One of ``abbe.service.domain.measured.FINISHED``.
         reason : str
             Why, in words; empty for a complete run.
         doc : dict or None

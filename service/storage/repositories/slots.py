@@ -10,10 +10,10 @@ from sqlalchemy import Connection, Row, select, update
 from sqlalchemy.dialects.postgresql import insert as pg_insert
 from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
+from abbe.service.domain.owner import Owner, this_process
+from abbe.service.domain.service_records import SlotRecord
 from abbe.service.errors import StoreError
 from abbe.service.storage.base import StoreBase, utc_text
-from abbe.service.storage.owner import Owner, this_process
-from abbe.service.storage.records import SlotRecord
 from abbe.service.storage.tables import slots
 
 CLAIMED = "claimed"

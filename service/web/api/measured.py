@@ -8,11 +8,11 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
+from abbe.service.domain.measured import ChunkRecord
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, pack_bar
 from abbe.service.runs.columns import IMPORTED_CHANNEL, load_run
 from abbe.service.runs.machine_object import MachineObject
-from abbe.service.storage.records import ChunkRecord
 from abbe.service.storage.repositories.pages import LARGEST, visible_status
 from abbe.service.storage.store import Store
 from abbe.service.users.roles import Permission

@@ -14,7 +14,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from abbe.service.audit.chain import Event
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AbbeError
 from abbe.service.users.people import NOBODY, ONLOOKER, Principal
 from abbe.service.web.bodies import Body
@@ -179,7 +179,13 @@ class _Log:
 
     async def _write(self, outcome: str) -> None:
         visit = self.visit
-        event = Event(visit.who or visit.principal.name, self.action, visit.target or self.path, outcome, {"address": visit.address})
+        event = AuditEvent(
+            who=visit.who or visit.principal.name,
+            action=self.action,
+            target=visit.target or self.path,
+            outcome=outcome,
+            doc={"address": visit.address},
+        )
         await self.door.record(event)
         self.written = True
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import Event
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.storage.store import Store
 from abbe.service.users.lockout import Buckets, Lockout
 from abbe.service.users.people import NOBODY, ONLOOKER, People, Principal
@@ -109,7 +109,7 @@ class Authenticator:
         """
         await asyncio.to_thread(self.book.ready)
 
-    async def record(self, event: Event) -> None:
+    async def record(self, event: AuditEvent) -> None:
         """Write a record; on return it is on disk."""
         await asyncio.to_thread(self.book.write, event)
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from abbe.service.domain.results import SolutionRecord
 from abbe.service.rendering.model import Contribution
 from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, finite, fixed, placed, plain
 from abbe.service.rendering.plots.bars import contribution_bars
-from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 

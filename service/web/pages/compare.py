@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
+from abbe.service.domain.measured import RunRecord
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.numbers import COVERAGE, finite, plain
@@ -14,7 +15,6 @@ from abbe.service.rendering.plots.overlay import difference_plot, overlay_plot
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
-from abbe.service.storage.records import RunRecord
 from abbe.service.storage.store import Store
 from abbe.service.verification.compare_runs import (
     MOST,

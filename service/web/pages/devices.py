@@ -8,9 +8,9 @@ from datetime import date
 
 from abbe.service.compensation.proved_levels import KIND
 from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.measured import CampaignRecord
 from abbe.service.secrets import mask_secrets
 from abbe.service.sequences.incident_account import Trouble, troubles
-from abbe.service.storage.records import CampaignRecord
 from abbe.service.storage.store import Store
 
 CAMPAIGNS = 10

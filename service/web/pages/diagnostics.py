@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from abbe.service.campaign_data.provenance import versions
+from abbe.service.domain.service_records import StoreHealth
 from abbe.service.secrets import mask_secrets
-from abbe.service.storage.repositories.health import StoreHealth
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.schemas import Status
 

@@ -11,7 +11,7 @@ from fastapi.responses import HTMLResponse, Response
 from jinja2 import Environment
 from pydantic import AfterValidator
 
-from abbe.service.audit.chain import Event
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.api.sources import Sources
@@ -105,7 +105,13 @@ def _add_settings(app: FastAPI, desk: PageContext, sources: Sources) -> None:
         log = _lines(sources)
         made = await desk.read(bundle, found, config_of(sources, status, status.mqtt.broker), status, log)
         # It takes what is known of the plant out of the house: that stands in the audit, or it does not happen.
-        event = Event(visit.principal.name, BUNDLE_ACTION, sources.machine, "done", {"address": visit.address, "bytes": len(made)})
+        event = AuditEvent(
+            who=visit.principal.name,
+            action=BUNDLE_ACTION,
+            target=sources.machine,
+            outcome="done",
+            doc={"address": visit.address, "bytes": len(made)},
+        )
         await desk.door.record(event)
         headers = {"Content-Disposition": 'attachment; filename="abbe-support.zip"', "Cache-Control": "no-store"}
         return Response(made, media_type="application/zip", headers=headers)

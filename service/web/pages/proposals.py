@@ -13,11 +13,11 @@ from abbe.service.compensation.proposal_checks import approve
 from abbe.service.compensation.proposal_diff import HEADINGS, compare, largest, rows
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.compensation.proposal_states import ProposalStatus, check_waiting, proposal_status, status_of_proposal
+from abbe.service.domain.decisions import ProposalApproval
 from abbe.service.errors import StoreError
 from abbe.service.push.book import read_entries
 from abbe.service.rendering.plots.table_change import DiffCurve, change_plot
 from abbe.service.storage.base import utc_text
-from abbe.service.storage.records import ApprovalRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 from abbe.service.web.units import INCH
@@ -53,7 +53,7 @@ class ProposalScreen:
     facts: Sequence[tuple[str, str]]
     reasons: Sequence[str]
     not_for_tables: Sequence[str]
-    approvals: Sequence[ApprovalRecord]
+    approvals: Sequence[ProposalApproval]
     two_people: bool
     waits: bool
     largest: str
@@ -147,7 +147,7 @@ def _facts(proposed: Proposed) -> list[tuple[str, str]]:
     ]
 
 
-def approve_as(store: Store, number: int, name: str, account: str, hours: float) -> ApprovalRecord:
+def approve_as(store: Store, number: int, name: str, account: str, hours: float) -> ProposalApproval:
     """Approve by the functions of the command line: same reasons against it, same rule of two people.
 
     Raises

@@ -13,6 +13,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.machine import Machine
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.models.volumetric import volume_grid
+from abbe.service.domain.results import DiscoveryRecord, SolutionRecord, StepRecord
 from abbe.service.errors import AbbeError
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.rendering.document import Document, Sign
@@ -23,7 +24,6 @@ from abbe.service.report.report_discovery import discovery_report
 from abbe.service.report.report_measured import SOLUTION_SIGNS
 from abbe.service.report.report_parts import Rules
 from abbe.service.site import machine_from_doc
-from abbe.service.storage.records import DiscoveryRecord, SolutionRecord, StepRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 

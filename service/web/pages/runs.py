@@ -7,6 +7,7 @@ from typing import Any
 
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.measured import INCOMPLETE, RUNNING, RunRecord
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.document import Document
 from abbe.service.report.report_measured import Measured, run_report
@@ -14,7 +15,6 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.runs.cases import set_once
 from abbe.service.runs.columns import load_run
 from abbe.service.site import Site, machine_from_doc
-from abbe.service.storage.records import INCOMPLETE, RUNNING, RunRecord
 from abbe.service.storage.store import Store
 
 TESTS = ("ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear")

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from abbe.service.storage.records import SlotRecord, VerificationRecord
+from abbe.service.domain.results import VerificationRecord
+from abbe.service.domain.service_records import SlotRecord
 from abbe.service.storage.store import Store
 from abbe.service.verification.trend_table import FigureTrend, in_words
 from abbe.service.verification.trend_table import trends as figure_trends

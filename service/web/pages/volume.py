@@ -11,11 +11,11 @@ import numpy as np
 from markupsafe import Markup
 
 from abbe.models.uncertainty.what_if import expected_rms
+from abbe.service.domain.results import SolutionRecord
 from abbe.service.errors import AbbeError
 from abbe.service.identification.solution_field import NodeMap, StoredField, node_map, stored_field
 from abbe.service.rendering.numbers import placed, tidy
 from abbe.service.rendering.plots.slices import PLANES, SlicePlane, Words, colour_top, magnification, slice_plot, steps
-from abbe.service.storage.records import SolutionRecord
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 

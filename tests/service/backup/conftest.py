@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import Event
 from abbe.service.capture.ingest import chunk_of
 from abbe.service.capture.records import CHUNK
 from abbe.service.capture.scan import scan
 from abbe.service.capture.settings import segment_path
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
 from abbe.service.scheduler.store import ServiceStore
@@ -91,7 +91,7 @@ def _shop(folder: Path) -> Shop:
             store.keep_verification(machine_id, record.found(record.Occasion("VMC-1", schedule, at), result), [])
         book = AuditBook(store, url)
         for k in range(5):
-            book.write(Event("user:ana", f"POST /thing/{k}", "x", "done 200", {"n": k, "why": "µm"}))
+            book.write(AuditEvent(who="user:ana", action=f"POST /thing/{k}", target="x", outcome="done 200", doc={"n": k, "why": "µm"}))
         run_id = new_run(store)
         whole = segment_bytes(run_id, [[batch(first, 25)] for first in range(0, SAMPLES, 25)])
         store.ingest_chunks([chunk_of(one) for one in scan(whole).records if one.kind == CHUNK][:4])

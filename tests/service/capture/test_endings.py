@@ -24,9 +24,9 @@ from abbe.service.capture.recorder import CaptureRecorder, close_run, is_active,
 from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
 from abbe.service.clock import SystemClock
+from abbe.service.domain.measured import ChunkRecord
 from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.runs.codec import decode_bar
-from abbe.service.storage.records import ChunkRecord
 from abbe.service.storage.repositories import chunks as store_chunks
 from abbe.service.storage.store import Store
 from tests.patience import within

@@ -18,9 +18,9 @@ from abbe.service.capture.records import CHUNK, CLOSE, OPEN
 from abbe.service.capture.recovery import ledger_of, read_segment
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
 from abbe.service.clock import SystemClock
+from abbe.service.domain.measured import ChunkRecord
 from abbe.service.errors import CaptureConflict, CaptureFault, ConfigError, DiskFull
 from abbe.service.runs.codec import decode_bar, decode_json
-from abbe.service.storage.records import ChunkRecord
 from abbe.service.storage.store import Store
 from tests.patience import within
 from tests.service.capture.capture_bench import BrokenDisk, JumpingClock, SmallDisk, assert_true, batch, new_run

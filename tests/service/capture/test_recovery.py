@@ -12,8 +12,8 @@ from abbe.service.capture.records import CHUNK, encode
 from abbe.service.capture.recovery import DAMAGED, ledger_of, read_segment, recover_segments
 from abbe.service.capture.scan import scan
 from abbe.service.capture.settings import CaptureSettings, segment_path
+from abbe.service.domain.measured import RunRecord
 from abbe.service.runs.codec import decode_bar
-from abbe.service.storage.records import RunRecord
 from abbe.service.storage.store import Store
 from tests.service.capture.capture_bench import abandon, assert_true, batch, new_run, segment_bytes
 

@@ -23,6 +23,7 @@ from abbe.service.core.jobs import JobRegistry
 from abbe.service.devices.machine_lock import ENVIRONMENT
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.at_start import push_is_open
@@ -36,7 +37,6 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.storage.records import AlarmEntryRecord
 from abbe.service.tables.push_outcome import by_journal, open_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import alarms_of

@@ -14,7 +14,9 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
+from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
@@ -26,7 +28,6 @@ from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.base import utc_text
-from abbe.service.storage.records import PushEntryRecord, VerificationRecord
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, open_alarms, series_begins
 from tests.service.core.fakes import FakeClock, FakeWatcher, Result, utc
@@ -216,7 +217,7 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
     await bench.check(result(1, 25.0))
     await bench.errand()
     at = START + timedelta(days=1, hours=3)
-    entry = PushEntryRecord(0, "mill-7", 1, 0, "KEEP", {}, utc_text(at), GENESIS, "d" * 64)
+    entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="KEEP", utc=utc_text(at), prev=GENESIS, digest="d" * 64)
     bench.store.add_push_entry(entry)
     assert series_begins(bench.store, "mill-7") == at
     last = alarms_of(bench.store, "mill-7")[0].last_seq

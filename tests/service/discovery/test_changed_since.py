@@ -21,11 +21,11 @@ from abbe.service.campaign_data.campaign_folder import from_store, keep
 from abbe.service.discovery.changed_since import since_of
 from abbe.service.discovery.changed_words import changed_lines, changed_words
 from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
+from abbe.service.domain.results import NewVersion
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import solution_doc
 from abbe.service.runs.exchange import import_folder
-from abbe.service.storage.records import NewVersion
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image
 from tests.scenarios.campaign_files import measured, write_folder

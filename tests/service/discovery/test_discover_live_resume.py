@@ -27,11 +27,11 @@ from abbe.service import cli
 from abbe.service.campaign_data import campaign_checks
 from abbe.service.discovery import experiment_recipes
 from abbe.service.discovery.discover_live import rounds
+from abbe.service.domain.owner import Owner
+from abbe.service.domain.results import NewVersion
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns
-from abbe.service.storage.owner import Owner
-from abbe.service.storage.records import NewVersion
 from abbe.service.storage.store import Store
 from tests.pretended_status import READY, controller_status
 from tests.service.discovery.discovery_bench import MACHINE, Search, circle, write_case

@@ -18,11 +18,12 @@ from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.discovery.discover import DiscoveryJob, discover, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
+from abbe.service.domain.document import Doc
+from abbe.service.domain.results import NewVersion
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current, revert
 from abbe.service.errors import ModelMovedOn
 from abbe.service.events import ignore_progress
-from abbe.service.storage.records import Doc, NewVersion
 from abbe.service.storage.store import Store
 from tests.patience import within
 from tests.service.discovery.discovery_bench import Search, write_case
@@ -142,7 +143,7 @@ def test_a_version_is_added_to_the_current_one_and_to_no_other(pair: tuple[Store
 RACER = """
 import sys
 from abbe.service.errors import ModelMovedOn
-from abbe.service.storage.records import NewVersion
+from abbe.service.domain.results import NewVersion
 from abbe.service.storage.store import Store
 
 with Store.open(sys.argv[1]) as store:

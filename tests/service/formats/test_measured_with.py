@@ -11,9 +11,9 @@ import pytest
 
 from abbe.drivers.cnc.tables import TableImage, crc32, encode
 from abbe.service.cli import run
+from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.push.entries import GENESIS, follow
 from abbe.service.push.states import PushState
-from abbe.service.storage.records import PushEntryRecord
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import distinct
 from tests.service.formats.test_choice import _document, _known
@@ -98,7 +98,18 @@ def test_of_older_runs_the_database_knows_what_their_table_was(
             entry = follow(
                 (), 1, PushState.SNAPSHOT, {"base_crc": crc32(image), "base_image": image.hex()}, "2026-06-01T10:00:00Z", GENESIS
             )
-            store.add_push_entry(PushEntryRecord(0, "sim", 1, entry.seq, str(entry.state), entry.doc, entry.utc, entry.prev, entry.digest))
+            store.add_push_entry(
+                PushEntryRecord(
+                    machine="sim",
+                    push=1,
+                    seq=entry.seq,
+                    state=str(entry.state),
+                    doc=entry.doc,
+                    utc=entry.utc,
+                    prev=entry.prev,
+                    digest=entry.digest,
+                )
+            )
     found, said = export(number, "--db", url)
     assert (found, words in said) == (code, True), said
 

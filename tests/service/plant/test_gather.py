@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.plant.facts import UNITS
 from abbe.service.plant.gather import Gatherer, table_in_force
 from abbe.service.plant.opcua.picture import picture_of
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.records import PushEntryRecord
 from abbe.service.web.core_link.board import Board
 from abbe.service.web.view import View
 from tests.service.core.fakes import STEP, FakeClock
@@ -25,7 +25,7 @@ def journal(*states: str, **last: Any) -> list[PushEntryRecord]:
     docs = [SNAPSHOT if state == "SNAPSHOT" else {} for state in states]
     docs[-1] = docs[-1] | last
     return [
-        PushEntryRecord(k, "mill-7", 3, k, state, doc, "2026-06-01T12:00:00.000000Z", "", "")
+        PushEntryRecord(id=k, machine="mill-7", push=3, seq=k, state=state, doc=doc, utc="2026-06-01T12:00:00.000000Z", prev="", digest="")
         for k, (state, doc) in enumerate(zip(states, docs, strict=True))
     ]
 

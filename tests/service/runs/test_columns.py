@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from abbe.drivers.api import BarSample
+from abbe.service.domain.measured import ImportedRun
 from abbe.service.errors import MeasurementFault, StoreError
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from abbe.service.runs.columns import load_run, pack_columns
-from abbe.service.storage.records import ImportedRun
 from abbe.service.storage.store import Store
 
 RATE_HZ = 1000

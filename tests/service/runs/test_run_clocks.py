@@ -10,10 +10,10 @@ import pytest
 from abbe.drivers.api import BarSample
 from abbe.service.campaign_data.run_times import times
 from abbe.service.devices.clock_notes import KEPT, noted, notes_since
+from abbe.service.domain.measured import ChunkRecord, RunRecord
+from abbe.service.domain.owner import Owner
 from abbe.service.runs.codec import BAR_CODEC, encode_bar
 from abbe.service.runs.columns import run_document
-from abbe.service.storage.owner import Owner
-from abbe.service.storage.records import ChunkRecord, RunRecord
 
 RATE_HZ = 100
 FEED_MM_S = 20.0

@@ -16,14 +16,14 @@ from pathlib import Path
 import pytest
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import Event
 from abbe.service.cli import run
+from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.owner import Owner, this_process
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import HeartbeatRecord
 from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, row, stands, state_of
 from abbe.service.scheduler.heartbeat import SILENT_AFTER, Heartbeat
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.owner import Owner, this_process
-from abbe.service.storage.records import HeartbeatRecord
 from tests.experiments.bench.history_case import START, History, build
 from tests.service.core.fakes import FakeClock
 
@@ -120,12 +120,14 @@ def test_computers_with_one_key_prove_one_audit(postgres: Callable[[], str], tmp
         for name in ("pc-1", "pc-2", "pc-3"):
             monkeypatch.setenv("ABBE_AUDIT_FOLDER", str(tmp_path / name))
             books[name] = AuditBook(store, url)
-        books["pc-1"].write(Event("os:a@pc-1", "abbe serve", "mill-1", "begun", {}))
+        books["pc-1"].write(AuditEvent(who="os:a@pc-1", action="abbe serve", target="mill-1", outcome="begun"))
         shutil.copy(books["pc-1"].key_file, books["pc-2"].key_file)
         for k in range(4):
-            books[f"pc-{1 + k % 2}"].write(Event("os:a@pc", "abbe measure", f"{k}", "done", {}))
+            books[f"pc-{1 + k % 2}"].write(AuditEvent(who="os:a@pc", action="abbe measure", target=f"{k}", outcome="done"))
         assert [books[name].verify() for name in ("pc-1", "pc-2")] == [[], []]
-        books["pc-3"].write(Event("os:a@pc-3", "abbe serve", "mill-3", "begun", {}))  # without the key of the others
+        books["pc-3"].write(
+            AuditEvent(who="os:a@pc-3", action="abbe serve", target="mill-3", outcome="begun")
+        )  # without the key of the others
         (fault,) = books["pc-1"].verify()
         assert fault.startswith("record 6 is sealed with a key that is not here")
 

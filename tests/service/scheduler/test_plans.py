@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event
 
+from abbe.service.domain.results import VerificationRecord
 from abbe.service.scheduler.fleet import fleet
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.records import VerificationRecord
 from abbe.service.verification.trend_table import trends
 from tests.experiments.bench.history_case import START, History, build
 

@@ -9,15 +9,17 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.decisions import ProposalApproval, ProposalRejection, PushEntryRecord
+from abbe.service.domain.measured import ChunkRecord, ImportedRun
+from abbe.service.domain.owner import Owner
+from abbe.service.domain.people import TokenRecord
+from abbe.service.domain.results import NewVersion
+from abbe.service.domain.service_records import SlotRecord
 from abbe.service.errors import AbbeError
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.base import StoreBase
-from abbe.service.storage.owner import Owner
-from abbe.service.storage.records import ApprovalRecord, ChunkRecord, ImportedRun, NewVersion, PushEntryRecord, SlotRecord
-from abbe.service.storage.repositories.audit import AuditRecord
-from abbe.service.storage.repositories.decisions import RejectionRecord
 from abbe.service.storage.repositories.pages import LISTINGS
-from abbe.service.storage.repositories.people import TokenRecord
 
 START = datetime(2026, 11, 21, 3, 34, 5, 123456, tzinfo=UTC)
 DOC: dict[str, Any] = {"µm": 0.1, "list": [None, 1e-7, -0.0], "text": "ü'\"\n\\ 工", "large": 2**53 + 1}
@@ -106,7 +108,7 @@ def found(ask: Any) -> None:
         ask.tables(),
         ask.tables(2),
     )
-    entry = PushEntryRecord(0, "mill-7", 1, 0, "SNAPSHOT", DOC, "then", "", "1" * 64)
+    entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="SNAPSHOT", doc=DOC, utc="then", prev="", digest="1" * 64)
     ask.add_push_entry(entry), ask.add_push_entry(entry), ask.add_push_entry(replace(entry, seq=1, prev="1" * 64, digest="2" * 64))
     ask.push_entries("mill-7"), ask.push_entries("MILL-7"), ask.last_push("mill-7"), ask.last_push("none")
     whose = {"machine": "mill-8", "control": "modbus+tcp://a:502", "base_crc": 1, "crc": 2**32 - 1, "image": "00"}
@@ -124,8 +126,16 @@ def found(ask: Any) -> None:
     )
     ask.discovery(77), ask.discovery_steps(1)
     ask.add_proposal("mill-7", 1, DOC, "d" * 64), ask.proposal(1), ask.proposal(77), ask.proposals(), ask.proposals("MILL-7")
-    ask.add_approval(ApprovalRecord(0, 1, "Anna ü", "anna", "d" * 64, "2099-01-01T00:00:00Z", "")), ask.approvals(1), ask.approvals(77)
-    ask.add_rejection(RejectionRecord(0, 1, "Bert", "bert", "too large", "")), ask.rejections(1), ask.rejections(77)
+    (
+        ask.add_approval(ProposalApproval(proposal_id=1, name="Anna ü", login="anna", digest="d" * 64, expiry="2099-01-01T00:00:00Z")),
+        ask.approvals(1),
+        ask.approvals(77),
+    )
+    (
+        ask.add_rejection(ProposalRejection(proposal_id=1, name="Bert", login="bert", reason="too large")),
+        ask.rejections(1),
+        ask.rejections(77),
+    )
     for digest in ("7" * 64, "7" * 64, "8" * 64):
         ask.claim_reply("anna", "order", digest)
     ask.keep_reply("anna", "order", 202, "ü"), ask.claim_reply("anna", "order", "7" * 64), ask.claim_reply("Anna", "order", "7" * 64)
@@ -172,7 +182,7 @@ def allowed(ask: Any) -> None:
         ask.session("6" * 64),
     )
     ask.session("none"), ask.end_session("6" * 64), ask.session("6" * 64), ask.add_session(1, "7" * 64)
-    token = TokenRecord(0, 1, "scada", "abbe_1", "6" * 64, ["read"], "", "2099-01-01T00:00:00Z", None)
+    token = TokenRecord(user_id=1, name="scada", prefix="abbe_1", digest="6" * 64, scopes=["read"], expires_utc="2099-01-01T00:00:00Z")
     (
         ask.add_token(token),
         ask.add_token(token),
@@ -183,7 +193,8 @@ def allowed(ask: Any) -> None:
         ask.tokens(),
     )
     ask.change_user(1, role="viewer", disabled_utc="then"), ask.session("7" * 64), ask.active_admins(), ask.users()
-    record = AuditRecord(1, "then", "anna", "table.push", "mill-7", "done", DOC, "", "1" * 64, "k" * 16, "m" * 64)
+    said = AuditEvent(who="anna", action="table.push", target="mill-7", outcome="done", doc=DOC)
+    record = replace(said, id=1, utc="then", digest="1" * 64, key="k" * 16, mac="m" * 64)
     ask.can_write(), ask.append_audit(lambda _last, _utc: record)
     ask.append_audit(lambda last, utc: replace(record, id=2, utc=utc, prev="" if last is None else last.digest, digest="2" * 64))
     ask.audit(), ask.audit(1)
@@ -208,7 +219,10 @@ def refused(ask: Any) -> None:
     ask.import_campaign(("mill-7", DOC), ("old", DOC), []), ask.add_solution(77, "joint", [], DOC), ask.add_table(77, None, b"", 0, DOC)
     ask.add_discovery_step(1, 0, "BEGUN", DOC), ask.add_model(NewVersion("mill-7", None, DOC))
     ask.add_alarm_entry("mill-7", 1, 1, "held", DOC), ask.add_verification(77, None, "pass", DOC), ask.add_checkpoint(77, "begun", DOC)
-    ask.add_approval(ApprovalRecord(0, 77, "Anna", "anna", "d" * 64, "then", "")), ask.add_discovery(77, "ab" * 32, DOC)
+    (
+        ask.add_approval(ProposalApproval(proposal_id=77, name="Anna", login="anna", digest="d" * 64, expiry="then")),
+        ask.add_discovery(77, "ab" * 32, DOC),
+    )
 
 
 def answers(url: str) -> list[tuple[str, Any]]:

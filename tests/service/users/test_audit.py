@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import Event, anchor_of, digest_of, faults, follow, mac_of
+from abbe.service.audit.chain import anchor_of, digest_of, faults, follow, mac_of
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
 from abbe.service.push.entries import GENESIS
-from abbe.service.storage.repositories.audit import AuditRecord
 from abbe.service.storage.store import Store
 from tests.service.users.conftest import World
 
@@ -28,18 +28,20 @@ KEY = bytes(range(32))
 TAMPERINGS = 10_000 if os.environ.get("ABBE_TEST_LONG") else 1000
 
 
-def event(n: int) -> Event:
-    return Event(f"user:u{n % 3}", f"POST /thing/{n % 5}", f"run {n}", "done 200", {"n": n, "why": "µm & ü"})
+def event(n: int) -> AuditEvent:
+    return AuditEvent(
+        who=f"user:u{n % 3}", action=f"POST /thing/{n % 5}", target=f"run {n}", outcome="done 200", doc={"n": n, "why": "µm & ü"}
+    )
 
 
-def chain(count: int) -> list[AuditRecord]:
-    records: list[AuditRecord] = []
+def chain(count: int) -> list[AuditEvent]:
+    records: list[AuditEvent] = []
     for n in range(count):
         records.append(follow(records[-1] if records else None, f"2026-11-22T09:00:{n:02d}.000000Z", event(n), KEY))
     return records
 
 
-def tampered(records: list[AuditRecord], rng: random.Random) -> tuple[str, list[AuditRecord]]:
+def tampered(records: list[AuditEvent], rng: random.Random) -> tuple[str, list[AuditEvent]]:
     """One change by somebody who can write the database, and who knows how digests are made, but has not the key."""
     out, i = list(records), rng.randrange(len(records))
     kind = rng.choice(["edit", "edit and digest", "rechain", "delete", "swap", "truncate", "insert", "renumber"])
@@ -53,7 +55,7 @@ def tampered(records: list[AuditRecord], rng: random.Random) -> tuple[str, list[
         head = out[i].prev
         for k in range(i, len(out) if kind == "rechain" else i + 1):
             r = out[k]
-            digest = digest_of(r.id, r.utc, Event(r.who, r.action, r.target, r.outcome, r.doc), head, r.key)
+            digest = digest_of(replace(r, prev=head))
             out[k] = replace(r, prev=head, digest=digest, mac=mac_of(b"\0" * 32, digest))
             head = digest
     elif kind == "delete":
@@ -151,10 +153,10 @@ def test_writers_do_not_fork_the_chain(world: World) -> None:
 
 def test_two_processes_do_not_fork_the_chain(world: World) -> None:
     program = (
-        "import sys\nfrom abbe.service.audit.book import AuditBook\nfrom abbe.service.audit.chain import Event\n"
+        "import sys\nfrom abbe.service.audit.book import AuditBook\nfrom abbe.service.domain.audit_event import AuditEvent\n"
         "from abbe.service.storage.store import Store\n"
         "with Store.open(sys.argv[1]) as store:\n    book = AuditBook(store, sys.argv[1])\n"
-        "    for n in range(15): book.write(Event('w', 'a', str(n), 'done', {}))\n"
+        "    for n in range(15): book.write(AuditEvent(who='w', action='a', target=str(n), outcome='done'))\n"
     )
     children = [subprocess.Popen([sys.executable, "-c", program, world.url]) for _ in range(2)]
     assert [child.wait() for child in children] == [0, 0]
@@ -172,7 +174,9 @@ def test_a_torn_line_of_the_heads_does_no_harm(world: World) -> None:
 
 
 def test_passwords_of_addresses_are_masked(world: World) -> None:
-    world.book.write(Event("w", "a", "mqtt://me:topsecret@host", "done", {"db": "postgresql://me:topsecret@host/x"}))
+    world.book.write(
+        AuditEvent(who="w", action="a", target="mqtt://me:topsecret@host", outcome="done", doc={"db": "postgresql://me:topsecret@host/x"})
+    )
     assert "topsecret" not in str(world.store.audit())
 
 

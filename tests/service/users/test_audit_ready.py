@@ -17,10 +17,11 @@ import pytest
 import typer
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import Event, follow
+from abbe.service.audit.chain import follow
 from abbe.service.cli import run
 from abbe.service.cli.administration.audited import record_all
 from abbe.service.cli.common import print_table
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
 from abbe.service.storage.private import private_file, seen_by_others
 from abbe.service.storage.store import Store
@@ -64,8 +65,8 @@ def not_ours(file: Path) -> Iterator[None]:
         os.seteuid(0)
 
 
-def event(n: int) -> Event:
-    return Event("w", "a", str(n), "done", {})
+def event(n: int) -> AuditEvent:
+    return AuditEvent(who="w", action="a", target=str(n), outcome="done")
 
 
 def test_a_key_of_somebody_else_is_refused_in_one_line_before_anything(open_folder: Path) -> None:
@@ -166,10 +167,12 @@ def test_a_database_that_goes_away_during_a_command_is_said(folder: Path) -> Non
 
 def test_nothing_in_the_audit_commands_a_terminal(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     """Neither what is written from now on, nor what an older version, or somebody with the file, has put there."""
-    world.book.write(Event(EVIL, EVIL, EVIL, EVIL, {EVIL: [EVIL, {"k": EVIL}]}))
+    world.book.write(AuditEvent(who=EVIL, action=EVIL, target=EVIL, outcome=EVIL, doc={EVIL: [EVIL, {"k": EVIL}]}))
     raw = EVIL.replace("\udcff", "").replace("\0", "")
     key = world.book.key_file.read_bytes()
-    world.store.append_audit(lambda last, utc: follow(last, utc, Event(raw, raw, raw, raw, {"k": raw}), key))
+    world.store.append_audit(
+        lambda last, utc: follow(last, utc, AuditEvent(who=raw, action=raw, target=raw, outcome=raw, doc={"k": raw}), key)
+    )
     assert not set(EVIL) & set("\x1b\x9b\r\n\0") & set(str(world.store.audit()[0]))
     assert world.store.audit()[0].target.startswith(r"\x1b[2J\x9b1;31m\nrecord 99\r\u202e\udcff\x00")
     assert run(["audit", "show", "--db", world.url]) == 0

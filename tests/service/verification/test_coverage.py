@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.owner import this_process
 from abbe.service.errors import MeasurementFault
 from abbe.service.report.report_measured import Measured, campaign_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.coverage import COMPLETE, LEAST, covered_share, not_judged, with_state
-from abbe.service.storage.owner import this_process
-from abbe.service.storage.records import RunRecord
 from abbe.service.verification.compare_runs import against
 from abbe.service.verification.iso_report import evaluate
 from abbe.service.verification.verify import figures

@@ -12,8 +12,8 @@ import pytest
 from abbe.service.compensation.proposal_checks import reject, valid_approval
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import check_waiting, proposal_status
+from abbe.service.domain.decisions import ProposalRejection
 from abbe.service.errors import TableRefused
-from abbe.service.storage.repositories.decisions import RejectionRecord
 from tests.service.web.api_bench import Plant
 
 BASE = "http://127.0.0.1:8080"
@@ -131,7 +131,7 @@ async def test_a_push_is_told_of_a_rejection(plant, fresh):
     from abbe.service.compensation.proposal_checks import HoldReason
 
     rejection = reject(plant.store, fresh, "somebody", "no", "user:somebody")
-    assert isinstance(rejection, RejectionRecord)
+    assert isinstance(rejection, ProposalRejection)
     held = HoldReason.__new__(HoldReason)
     object.__setattr__(held, "rejections", (rejection,))
     assert list(held._rejected()) == [f"REJECTED: by somebody at {rejection.utc}: no"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.storage.repositories.decisions import RejectionRecord
+from abbe.service.domain.decisions import ProposalRejection
 from abbe.service.storage.repositories.pages import LISTINGS
 from abbe.service.storage.store import Store
 
@@ -33,7 +33,7 @@ def test_pages_of_everything(url: str) -> None:
         assert store.row("campaigns", 1)["doc"] == {"big": "x"}
         solution = store.add_solution(1, "joint", [1], {})
         number = store.add_proposal("m", solution, {"n": 1}, "d")
-        store.add_rejection(RejectionRecord(0, number, "somebody", "user:somebody", "too warm", ""))
+        store.add_rejection(ProposalRejection(proposal_id=number, name="somebody", login="user:somebody", reason="too warm"))
         assert [one.reason for one in store.rejections(number)] == ["too warm"]
         assert store.rejections(number + 1) == []
 

@@ -1,0 +1,67 @@
+"""What is decided on tables: proposals, approvals and rejections, and the journal of pushes, as they are stored. One record is one row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from abbe.service.domain.document import Doc
+
+
+@dataclass(frozen=True, slots=True)
+class ProposalRecord:
+    """Proposed tables with everything they were made from. Never changed; ``digest``: SHA-256 of ``doc``."""
+
+    id: int
+    machine: str
+    solution_id: int
+    doc: Doc
+    digest: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalDecision:
+    """A person's decision on a proposal. Never changed after writing; the database gives ``id`` and ``utc``.
+
+    ``name``: as the person gave it; ``login``: the account.
+    """
+
+    id: int = 0
+    proposal_id: int
+    name: str
+    login: str
+    utc: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalApproval(ProposalDecision):
+    """A yes until ``expiry`` (UTC) to tables of this ``digest``."""
+
+    digest: str
+    expiry: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalRejection(ProposalDecision):
+    """A no, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushEntryRecord:
+    """One transition of a push, chained by ``prev`` to the entry before it in the same journal. Never changed after writing.
+
+    ``machine``: name of the journal (`chain_of`); ``push``: number of the push in it; ``seq``: number of the entry in its push, from 0;
+    ``prev``, ``digest``: SHA-256 of the entry before and of this one. The database gives ``id``.
+    """
+
+    id: int = 0
+    machine: str
+    push: int
+    seq: int
+    state: str
+    doc: Doc
+    utc: str
+    prev: str
+    digest: str

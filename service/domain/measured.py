@@ -1,0 +1,121 @@
+"""What is measured: machines, campaigns, runs and their samples, as they are stored. One record is one row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from abbe.service.domain.document import Doc
+from abbe.service.domain.owner import Owner
+
+RUNNING = "running"
+INCOMPLETE = "incomplete"
+INTERRUPTED = "interrupted"
+DISK_FULL = "disk_full"
+FINISHED = ("complete", "stopped", "aborted", "failed", INTERRUPTED, DISK_FULL)
+
+
+@dataclass(frozen=True, slots=True)
+class MachineRecord:
+    """A machine as it was described at some time; another description is another record."""
+
+    id: int
+    name: str
+    doc: Doc
+    doc_hash: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignRecord:
+    """Runs that belong together: one machine, one clock zero."""
+
+    id: int
+    machine_id: int
+    name: str
+    doc: Doc
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """One measured sequence. ``status``: as written; ``visible_status``: as people see it."""
+
+    id: int
+    campaign_id: int
+    campaign: str
+    label: str
+    test: str
+    role: str
+    status: str
+    reason: str
+    start_doc: Doc
+    end_doc: Doc | None
+    started_utc: str
+    ended_utc: str | None
+    owner: Owner
+
+    @property
+    def visible_status(self) -> str:
+        """``"incomplete"`` when the run was never finished and its process no longer runs, else ``status``."""
+        return visible_status(self.status, self.owner)
+
+
+def visible_status(status: str, owner: Owner) -> str:
+    """State of a run as people see it: one that was never finished is incomplete once its process no longer runs."""
+    return INCOMPLETE if status == RUNNING and owner.is_gone() else status
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkRecord:
+    """Samples as they arrived, checked against their CRC-32. Never changed after writing.
+
+    ``first_host_s``, ``last_host_s``: monotonic host time of the first and last arrival; ``first_device_us``, ``last_device_us``:
+    device time of the first and last sample.
+    """
+
+    run_id: int
+    channel: str
+    seq: int
+    n: int
+    codec: str
+    crc32: int
+    payload: bytes = field(repr=False)
+    first_host_s: float
+    last_host_s: float
+    first_device_us: int
+    last_device_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelRecord:
+    """What a run holds in one channel, without the samples."""
+
+    channel: str
+    codec: str
+    chunks: int
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointRecord:
+    """One line of a campaign's journal. Never changed after writing; ``seq`` counts from 0."""
+
+    id: int
+    campaign_id: int
+    seq: int
+    kind: str
+    doc: Doc
+    utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedRun:
+    """A run from an exchange file that is to be stored, with its channels packed."""
+
+    label: str
+    test: str
+    role: str
+    start_doc: Doc
+    n: int
+    codec: str
+    payload: bytes = field(repr=False)

@@ -1,0 +1,76 @@
+"""What an unattended service keeps of itself: alarms, slots, heartbeats, messages, answers, as they are stored. One record is one row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from abbe.service.domain.document import Doc
+from abbe.service.domain.owner import Owner
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmEntryRecord:
+    """One event of a machine's alarm. Never changed; ``alarm`` counts from 1 for each machine, ``seq`` from 0."""
+
+    id: int
+    machine: str
+    alarm: int
+    seq: int
+    kind: str
+    doc: Doc
+    utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class SlotRecord:
+    """One slot of a schedule and its outcome. ``reason``: the sentence to ``state``; ``finished_utc``: None while it is open."""
+
+    id: int
+    schedule: str
+    slot_utc: str
+    state: str
+    reason: str
+    claimed_utc: str
+    finished_utc: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class HeartbeatRecord:
+    """The latest heartbeat of a machine's service."""
+
+    machine: str
+    doc: Doc
+    seen_utc: str
+    owner: Owner
+
+
+@dataclass(frozen=True, slots=True)
+class OutboxRecord:
+    """A message that waits for the broker."""
+
+    id: int
+    topic: str
+    payload: bytes
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReplyRecord:
+    """The answer to the request of an idempotency key; ``status`` None: the request is still being worked on."""
+
+    digest: str
+    status: int | None
+    body: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class StoreHealth:
+    """State of a database. ``file``: of SQLite, else empty; ``size_b``: with the write-ahead log; ``since_utc``: of the first machine."""
+
+    revision: str
+    wanted_revision: str
+    file: str
+    size_b: int
+    since_utc: str | None
+    outbox: int
+    outbox_oldest_utc: str | None
