@@ -35,7 +35,7 @@ def _scenario(options: argparse.Namespace) -> Scenario:
     """The scenario that the command line names, or the one that a seed stands for."""
     if options.hidden is None:
         return scenarios.load(options.scenario)
-    from abbe.simulators.hidden.picks import picked
+    from abbe.simulators.hidden.suite import picked
 
     scenario = picked(options.hidden)
     scenarios.check(scenario)

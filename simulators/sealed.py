@@ -1,13 +1,113 @@
 """The ``truth`` command: figures and drawn parameters of a scenario's machine under a compensation image."""
 
 import struct
+from collections.abc import Callable
 
+import numpy as np
+
+from abbe.simulators.arrays import F
 from abbe.simulators.cnc import bank
 from abbe.simulators.hidden.live import live_of
 from abbe.simulators.scenario import Scenario, ScenarioError
 from abbe.simulators.truth.draws import describe, draw_machine
-from abbe.simulators.truth.figures import no_correction, report
 from abbe.simulators.truth.machine import Geometry, Machine
+
+Correction = Callable[[F], F]
+"""Commanded positions (n, 3) mm to what is added to them (n, 3) mm."""
+
+DIAGONALS = {"ppp": (1, 1, 1), "npp": (-1, 1, 1), "pnp": (1, -1, 1), "ppn": (1, 1, -1)}
+DIAGONAL_POINTS = 31
+FINE_NODES = 13
+
+
+def no_correction(command_mm: F) -> F:
+    """Add nothing."""
+    return np.zeros_like(command_mm)
+
+
+def grid(machine: Machine, nodes: int) -> F:
+    """Nodes of a cubic grid over the full stroke: (nodes^3, 3) mm, X outermost."""
+    low, high = machine.geometry.low_mm, machine.geometry.high_mm
+    axes = [np.linspace(low[a], high[a], nodes) for a in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def deviation(machine: Machine, command_mm: F, correction: Correction = no_correction) -> F:
+    """Actual - nominal at n commanded positions: (n, 3) mm. Mean of both approach directions (no backlash), no drift."""
+    actual = machine.tool_position(command_mm + correction(command_mm))
+    nominal: F = command_mm + machine.geometry.tool_mm
+    return actual - nominal
+
+
+def without_rigid_motion(points_mm: F, deviation_mm: F) -> F:
+    """Deviations (n, 3) mm less their best-fit rigid motion (translation + small rotation, least squares)."""
+    arm = points_mm - points_mm.mean(axis=0)
+    n = len(arm)
+    design = np.zeros((n, 3, 6))
+    design[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    design[:, 0, 4], design[:, 0, 5] = arm[:, 2], -arm[:, 1]
+    design[:, 1, 3], design[:, 1, 5] = -arm[:, 2], arm[:, 0]
+    design[:, 2, 3], design[:, 2, 4] = arm[:, 1], -arm[:, 0]
+    flat = design.reshape(-1, 6)
+    motion, *_ = np.linalg.lstsq(flat, deviation_mm.reshape(-1), rcond=None)
+    rest: F = deviation_mm - (flat @ motion).reshape(-1, 3)
+    return rest
+
+
+def without_one_axis_functions(deviation_mm: F, nodes: int) -> F:
+    """Deviations on a cubic grid less their best additive part: what nine perfect one-axis tables would leave, (nodes^3, 3) mm.
+
+    On a full product grid the least-squares additive part is the mean plus the main effects.
+    """
+    field = deviation_mm.reshape(nodes, nodes, nodes, 3)
+    mean = field.mean(axis=(0, 1, 2))
+    effects = [field.mean(axis=tuple(b for b in range(3) if b != a), keepdims=True) - mean for a in range(3)]
+    rest: F = field - mean - effects[0] - effects[1] - effects[2]
+    return rest.reshape(-1, 3)
+
+
+def rms_norm(vectors: F) -> float:
+    """Root mean square of the vectors' lengths."""
+    return float(np.sqrt(np.mean(np.sum(vectors * vectors, axis=1))))
+
+
+def body_diagonals_um(machine: Machine, correction: Correction = no_correction) -> dict[str, float]:
+    """Range (max - min) of the deviation along each body diagonal of the stroke box, µm."""
+    low, high = machine.geometry.low_mm, machine.geometry.high_mm
+    result = {}
+    for name, signs in DIAGONALS.items():
+        forward = np.array(signs) > 0
+        begin, end = np.where(forward, low, high), np.where(forward, high, low)
+        points = begin + np.linspace(0.0, 1.0, DIAGONAL_POINTS)[:, None] * (end - begin)
+        along = deviation(machine, points, correction) @ ((end - begin) / np.linalg.norm(end - begin))
+        result[name] = 1000.0 * float(along.max() - along.min())
+    return result
+
+
+def best_nine_tables_rms_um(machine: Machine, nodes: int = FINE_NODES) -> float:
+    """Rms in µm that nine perfect one-axis tables would leave on this machine, rigid motion removed."""
+    points = grid(machine, nodes)
+    rest = without_one_axis_functions(deviation(machine, points), nodes)
+    return 1000.0 * rms_norm(without_rigid_motion(points, rest))
+
+
+def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool = False) -> dict[str, object]:
+    """All figures of the machine under a correction (µm); ``arrows`` adds grid and deviation vectors for plotting."""
+    points = grid(machine, nodes)
+    rest = without_rigid_motion(points, deviation(machine, points, correction))
+    diagonals = body_diagonals_um(machine, correction)
+    figures: dict[str, object] = {
+        "max_body_diagonal_um": max(diagonals.values()),
+        "body_diagonals_um": diagonals,
+        "volumetric_rms_um": 1000.0 * rms_norm(rest),
+        "volumetric_max_um": 1000.0 * float(np.linalg.norm(rest, axis=1).max()),
+        "best_nine_tables_rms_um": best_nine_tables_rms_um(machine),
+        "nodes": nodes,
+    }
+    if arrows:
+        figures["grid_mm"] = points.tolist()
+        figures["deviation_um"] = (1000.0 * rest).tolist()
+    return figures
 
 
 def truth(scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool = False) -> dict[str, object]:

@@ -12,10 +12,41 @@ from abbe.simulators.cnc.log import Command, TableAccess
 from abbe.simulators.cnc.wire import CncRegisters
 from abbe.simulators.fixture import Fixture
 from abbe.simulators.laser.wire import LaserRegisters
-from abbe.simulators.modbus_wire import ModbusTcp
-from abbe.simulators.rtu_line import RtuLine
+from abbe.simulators.modbus_wire import ModbusRtu, ModbusTcp, RegisterMap
+from abbe.simulators.pseudo_serial import PseudoSerial
 from abbe.simulators.scenario import Scenario
 from abbe.simulators.world import LASER_CLOCK_US, World
+
+BAUD = 115200
+
+
+class RtuLine:
+    """A Modbus RTU device at a path. pymodbus opens a terminal by its name, so it gets one of its own."""
+
+    def __init__(self, registers: RegisterMap, link: Path | None) -> None:
+        self._server = ModbusRtu(registers)
+        self._link = link
+        self._host: PseudoSerial | None = None
+        self._device: PseudoSerial | None = None
+
+    async def start(self) -> str:
+        """Open both terminals and serve; gives the URL."""
+        host = self._host = PseudoSerial(self._to_device, self._link)
+        self._device = PseudoSerial(host.send)
+        await self._server.start(self._device.path, BAUD)
+        return f"modbus+rtu://{host.path}?baud={BAUD}&unit=1"
+
+    async def stop(self) -> None:
+        """Hang up."""
+        await self._server.stop()
+        for terminal in (self._host, self._device):
+            if terminal is not None:
+                terminal.close()
+
+    def _to_device(self, data: bytes) -> None:
+        if self._device is not None:
+            self._device.send(data)
+
 
 TICK_S = 0.005
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"

@@ -1,14 +1,46 @@
 """Bytes of the ball-bar's box (docs/protocols/ballbar.md), little-endian, and the conversation over them."""
 
+import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from abbe.simulators.ballbar.device import MAX_RATE_HZ, OVERRUN, BallbarDevice, Samples, Settings
-from abbe.simulators.ballbar.ledger import CORRUPTED, SENT, SUPPRESSED, BoxLedger
 from abbe.simulators.ballbar.port import BytePort
+
+SENT, SUPPRESSED, CORRUPTED = "sent", "suppressed", "corrupted"
+
+
+class BoxLedger:
+    """Fates of sequence numbers, as runs of equal fate: (stream, first, last, fate). Streams count from 0 at the first START."""
+
+    def __init__(self) -> None:
+        self.runs: list[list[int | str]] = []
+        self.stream = -1
+
+    def start(self) -> None:
+        """A new stream begins, numbered from 0."""
+        self.stream += 1
+
+    def note(self, seqs: Sequence[int], fate: str) -> None:
+        """Successive numbers of the present stream have this fate."""
+        if not len(seqs):
+            return
+        first, last = int(seqs[0]), int(seqs[-1])
+        if self.runs and self.runs[-1][0] == self.stream and self.runs[-1][3] == fate and self.runs[-1][2] == first - 1:
+            self.runs[-1][2] = last
+        else:
+            self.runs.append([self.stream, first, last, fate])
+
+    def write(self, path: Path) -> None:
+        """Write everything so far as JSON, in one step: a reader never sees half of it."""
+        part = path.with_name(path.name + ".part")
+        part.write_text(json.dumps(self.runs), encoding="ascii")
+        part.replace(path)
+
 
 SYNC_BYTES = b"\xa5\x5a"
 SAMPLE, INFO, ACK, SETTINGS = 0x01, 0x02, 0x03, 0x04

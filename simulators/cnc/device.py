@@ -7,9 +7,157 @@ import numpy as np
 
 from abbe.simulators.arrays import B, F
 from abbe.simulators.cnc.compensation import Compensation
-from abbe.simulators.cnc.motion import Motion
-from abbe.simulators.cnc.timetable import Timetable
 from abbe.simulators.truth.machine import Geometry
+
+
+class Motion:
+    """One polyline under way: the commanded point runs from the first to the last vertex at constant speed.
+
+    Start and stop are instantaneous. Between two changes of speed the travelled length is linear in time, so any number of
+    instants can be evaluated at once; a change of speed (hold, override) only moves the reference instant.
+    """
+
+    def __init__(self, vertices_mm: F, speed_mm_s: float, start_s: float) -> None:
+        self._vertices = vertices_mm
+        self._length = _lengths(vertices_mm)
+        self._ref_s = start_s
+        self._ref_mm = 0.0
+        self._speed = speed_mm_s
+        self._factor = 1.0
+
+    @property
+    def total_mm(self) -> float:
+        """Length of the whole polyline."""
+        return float(self._length[-1])
+
+    @property
+    def target_mm(self) -> F:
+        """Last vertex, (3,) mm."""
+        last: F = self._vertices[-1]
+        return last
+
+    @property
+    def vertex_count(self) -> int:
+        """Vertices without the starting point."""
+        return len(self._vertices) - 1
+
+    def set_factor(self, factor: float, now_s: float) -> None:
+        """Change the speed to ``factor`` times the feed from ``now_s`` on (0 = feed hold)."""
+        self._ref_mm = float(self.travelled(np.array([now_s]))[0])
+        self._ref_s = now_s
+        self._factor = factor
+
+    def extend(self, vertices_mm: F) -> None:
+        """Append vertices (n, 3) to the running polyline."""
+        added = _lengths(np.vstack([self._vertices[-1:], vertices_mm]))[1:]
+        self._length = np.concatenate([self._length, self.total_mm + added])
+        self._vertices = np.vstack([self._vertices, vertices_mm])
+
+    def travelled(self, times_s: F) -> F:
+        """Length run at n instants, mm."""
+        run = self._ref_mm + self._speed * self._factor * (times_s - self._ref_s)
+        clipped: F = np.clip(run, 0.0, self.total_mm)
+        return clipped
+
+    def position(self, times_s: F) -> F:
+        """Commanded point at n instants: (n, 3) mm."""
+        run = self.travelled(times_s)
+        return np.stack([np.interp(run, self._length, self._vertices[:, a]) for a in range(3)], axis=1)
+
+    def end_s(self) -> float:
+        """Instant of arrival at the present speed; infinity on hold."""
+        rest = self.total_mm - self._ref_mm
+        speed = self._speed * self._factor
+        if rest <= 0.0:
+            return self._ref_s
+        return self._ref_s + rest / speed if speed > 0.0 else float("inf")
+
+    def vertex_times(self, from_s: float, to_s: float) -> F:
+        """Instants in (from_s, to_s] at which a vertex is passed: where an axis can turn round."""
+        speed = self._speed * self._factor
+        if speed <= 0.0:
+            return np.empty(0)
+        begin, end = self.travelled(np.array([from_s, to_s]))
+        first, last = np.searchsorted(self._length, [begin, end], side="right")
+        times: F = self._ref_s + (self._length[first:last] - self._ref_mm) / speed
+        return times
+
+    def vertices_reached(self, now_s: float) -> int:
+        """Vertices reached, the starting point not counted."""
+        run = float(self.travelled(np.array([now_s]))[0])
+        # a thousandth of a nanometre forgives the rounding of an arrival computed from its own instant
+        return int(np.searchsorted(self._length[1:], run + 1e-9, side="right"))
+
+
+def _lengths(vertices_mm: F) -> F:
+    """Length from the first vertex to each: (n,) mm."""
+    steps = np.linalg.norm(np.diff(vertices_mm, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+class Timetable:
+    """What `Motion` is for one command, for a whole program: knots of program time and position, straight in between.
+
+    ``set_factor`` (feed hold, override) changes how fast program time runs; rests run with it.
+    """
+
+    def __init__(self, start_mm: F, blocks: list[tuple[F, float]], start_s: float) -> None:
+        """``blocks``: place (3,) and the seconds that it takes to get there; a rest is its own place again."""
+        self._knots = np.concatenate([[0.0], np.cumsum([seconds for _, seconds in blocks])])
+        self._places = np.stack([start_mm, *(place for place, _ in blocks)])
+        self._ref_s, self._ref, self._factor = start_s, 0.0, 1.0
+
+    @property
+    def total_mm(self) -> float:
+        """Way of the whole program."""
+        return float(np.linalg.norm(np.diff(self._places, axis=0), axis=1).sum())
+
+    @property
+    def target_mm(self) -> F:
+        """Where it ends, (3,) mm."""
+        last: F = self._places[-1]
+        return last
+
+    @property
+    def vertex_count(self) -> int:
+        """Blocks."""
+        return len(self._places) - 1
+
+    def set_factor(self, factor: float, now_s: float) -> None:
+        """Let program time run ``factor`` times as fast from now on."""
+        self._ref = self._program_s(now_s)
+        self._ref_s, self._factor = now_s, factor
+
+    def extend(self, vertices_mm: F) -> None:
+        """A program cannot be extended."""
+        raise ValueError("an NC program runs")
+
+    def position(self, times_s: F) -> F:
+        """Commanded point at n instants: (n, 3) mm."""
+        program = np.clip(self._ref + self._factor * (times_s - self._ref_s), 0.0, self._knots[-1])
+        return np.stack([np.interp(program, self._knots, self._places[:, a]) for a in range(3)], axis=1)
+
+    def end_s(self) -> float:
+        """Instant at which it ends at the present factor; infinity on hold."""
+        rest = float(self._knots[-1]) - self._ref
+        if rest <= 0.0:
+            return self._ref_s
+        return self._ref_s + rest / self._factor if self._factor > 0.0 else float("inf")
+
+    def vertex_times(self, from_s: float, to_s: float) -> F:
+        """Instants in (from_s, to_s] at which a block ends: where an axis can turn round."""
+        if self._factor <= 0.0:
+            return np.empty(0)
+        times: F = self._ref_s + (self._knots - self._ref) / self._factor
+        return times[(times > from_s) & (times <= to_s)]
+
+    def vertices_reached(self, now_s: float) -> int:
+        """Blocks done."""
+        return int(np.searchsorted(self._knots[1:], self._program_s(now_s) + 1e-12, side="right"))
+
+    def _program_s(self, now_s: float) -> float:
+        return float(np.clip(self._ref + self._factor * (now_s - self._ref_s), 0.0, self._knots[-1]))
+
 
 FIFO_SIZE = 8192
 _TOLERANCE_MM = 1e-9

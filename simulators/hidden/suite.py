@@ -2,7 +2,9 @@
 
 import argparse
 import json
+import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,60 @@ from abbe.simulators.arrays import F
 from abbe.simulators.hidden.cases import Case, make_case
 from abbe.simulators.hidden.draws import KINDS
 from abbe.simulators.hidden.effect import Hidden
-from abbe.simulators.hidden.instrument import DEAD_PATH_MM
+from abbe.simulators.hidden.instrument import DEAD_PATH_MM, air_rise
 from abbe.simulators.hidden.plans import Run
-from abbe.simulators.hidden.sensors import temperatures
+from abbe.simulators.hidden.thermal import rise, warmth
+from abbe.simulators.scenario import DEFAULT_PATH, Scenario, load
+
+STREAM_PICK = 61
+
+
+def packaged() -> list[Path]:
+    """Scenarios that keep a secret, and the one in which nothing is hidden, by name."""
+    return sorted(DEFAULT_PATH.parent.glob("hidden-*.toml"))
+
+
+def picked(seed: int) -> Scenario:
+    """The scenario of a seed; the machine is drawn by the same seed.
+
+    Every scenario draws a lot of its own, the highest wins: one more scenario takes over the seeds that it wins and changes no other.
+
+    Raises
+    ------
+    ScenarioError
+        The seed is negative.
+    """
+    return replace(load(winner(seed, packaged())), seed=seed)
+
+
+def winner(seed: int, paths: list[Path]) -> Path:
+    """The scenario that draws the highest lot with a seed."""
+
+    def lot(path: Path) -> float:
+        return float(np.random.default_rng([STREAM_PICK, abs(seed), zlib.crc32(path.name.encode())]).random())
+
+    return max(paths, key=lot)
+
+
+ROOM_C = 20.0
+SENSORS = ("x", "y", "z", "spindle", "air")
+
+
+def temperatures(effects: tuple[Hidden, ...], seed: int, t_s: F) -> dict[str, F]:
+    """What the sensors at the axes, the spindle and in the air really have, degree C, (n,) each: everything warms up, guilty or not."""
+    rng = np.random.default_rng([44, seed])
+    out: dict[str, F] = {}
+    for i, name in enumerate(SENSORS[:4]):
+        size = rng.uniform(2.0, 12.0) if name == "spindle" else rng.uniform(0.5, 4.0)
+        tau = rng.uniform(1200.0, 7200.0)
+        guilty = next((e for e in effects if e.name == "axis_thermal_growth" and e.axis == i), None)
+        idle = size * warmth(t_s, tau)
+        out[name] = ROOM_C + (idle if guilty is None else guilty["strength"] * rise(guilty, t_s) + 0.15 * idle)
+    swing, period, phase = rng.uniform(0.2, 1.5), rng.uniform(5000.0, 14000.0), rng.uniform(0.0, 2.0 * np.pi)
+    air = next((e for e in effects if e.name == "air_refraction"), None)
+    out["air"] = ROOM_C + (swing * np.sin(2.0 * np.pi * t_s / period + phase) if air is None else air_rise(air, t_s))
+    return out
+
 
 SENSOR_NOISE_C = 0.03
 

@@ -17,7 +17,7 @@ from abbe.service.demo.demo_hidden import ANEW, CAMPAIGN, run_hidden_demo
 from abbe.service.demo.demo_hidden_words import judged, story
 from abbe.service.events import ignore_progress
 from abbe.service.storage.store import Store
-from abbe.simulators.hidden.picks import packaged, picked
+from abbe.simulators.hidden.suite import packaged, picked
 from tests.scenarios.test_demo import bar_run_under_way
 from tests.scenarios.world import interrupt, simulators_of, wait_for
 

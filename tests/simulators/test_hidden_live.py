@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from abbe.simulators.hidden.picks import packaged, picked, winner
+from abbe.simulators.hidden.suite import packaged, picked, winner
 from abbe.simulators.scenario import Scenario, ScenarioError, from_dict, load
 from abbe.simulators.sealed import truth
 from abbe.simulators.world import World

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+from abbe.simulators import sealed as figures
 from abbe.simulators.scenario import from_dict
-from abbe.simulators.truth import figures
 from abbe.simulators.truth.draws import draw_machine
 from abbe.simulators.truth.machine import Geometry, Machine
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.simulators.scenario import Scenario, from_dict
-from abbe.simulators.truth.figures import deviation
+from abbe.simulators.sealed import deviation
 from abbe.simulators.world import World
 
 OWNER = 7

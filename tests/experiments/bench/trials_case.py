@@ -16,7 +16,7 @@ from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import perpendicular, run_design, setup_unknowns, with_tool
 from abbe.models.solvers.priors import Priors, term_prior_sd
-from abbe.models.uncertainty.helix_trials import HelixTask
+from tests.experiments.mathematics.helix_trials import HelixTask
 
 TRIALS = 100_000
 COMMON = 100

@@ -11,10 +11,9 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.solvers.helix import linear_field
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.uncertainty.helix_trials import fit_trials, helix_trials
-from abbe.models.uncertainty.linear_trials import linear_estimator, linear_trials
 from tests.experiments.bench import trials_case as cases
 from tests.experiments.bench.trials_case import COMMON, TRIALS, HelixCase, LinearCase
+from tests.experiments.mathematics.helix_trials import fit_trials, helix_trials, linear_estimator, linear_trials
 
 Result = dict[str, np.ndarray]
 

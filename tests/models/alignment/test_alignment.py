@@ -6,7 +6,7 @@ import pytest
 from abbe.models.alignment.breaks import breaks
 from abbe.models.alignment.clock import LEAST_PAIRS, across, fit_clock, lower_envelope, relative_rate
 from abbe.models.alignment.lag import fit_lag, lag_between_ways
-from abbe.models.alignment.position import position_in_stream, position_on_path
+from tests.experiments.mathematics.position import position_in_stream, position_on_path
 
 LEAST_DELAY_S = 5e-4
 

@@ -6,8 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from abbe.models.alignment.dwell import PlannedDwell, detect, named
-from abbe.models.alignment.matching import match, places_reach
+from abbe.models.alignment.dwell import PlannedDwell, detect, match, named, places_reach
 from tests.models.alignment.dwell_world import SETTLE_S, ZERO_MM, case, wrong_readings
 
 

@@ -10,13 +10,13 @@ from abbe.models.compensation.achievable import achievable, cross_only, position
 from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import quantisation_mm
 from abbe.models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
-from abbe.models.compensation.stages import Stage, applied, at_corrected_position, of_corrected_position, second_order_mm
 from abbe.models.compensation.summary import SQUARENESS, mean_linear
 from abbe.models.compensation.tables import NineTables, nine_tables, quantise
 from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
+from tests.experiments.mathematics.stages import Stage, applied, at_corrected_position, of_corrected_position, second_order_mm
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 
 COUNTS = (25, 21, 19)

@@ -10,9 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from abbe.models.functions.legendre import Legendre
-from abbe.models.functions.motions import PLACES, SQUARENESS, ErrorMotions
+from abbe.models.functions.motions import PLACES, SQUARENESS, ErrorMotions, least_squares_line
 from abbe.models.functions.polynomial import Polynomial
-from abbe.models.functions.rules import least_squares_line
 from abbe.models.functions.table import Table
 from abbe.models.geometry import propagation
 from abbe.models.geometry.bases import Term, smooth_terms, term_values

@@ -12,11 +12,11 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
 from abbe.models.functions.bspline import BSpline, clamped_knots
-from abbe.models.functions.convert import convert, fit, form
 from abbe.models.functions.legendre import Legendre
+from abbe.models.functions.motions import as_angle, as_positioning, as_straightness, least_squares_line
 from abbe.models.functions.polynomial import Polynomial
-from abbe.models.functions.rules import as_angle, as_positioning, as_straightness, least_squares_line
 from abbe.models.functions.table import Table
+from tests.experiments.mathematics.convert import convert, fit, form
 
 LO, HI = -120.0, 580.0
 LENGTH = HI - LO

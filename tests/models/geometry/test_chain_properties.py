@@ -11,9 +11,15 @@ from scipy.spatial.distance import pdist
 
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import all_chains, design, deviation_mm, exact_deviation_mm
-from abbe.models.geometry.datum import change_datum, datum_slopes, lines_from_squareness, squareness_from_lines, turned_deviation_mm
 from abbe.models.geometry.jacobian import exact_jacobian, motion_jacobian, squareness_jacobian, squareness_motions
 from abbe.models.machine import Machine
+from tests.experiments.mathematics.datum import (
+    change_datum,
+    datum_slopes,
+    lines_from_squareness,
+    squareness_from_lines,
+    turned_deviation_mm,
+)
 
 CHAINS = all_chains()
 DATUMS = ["".join(p) for p in permutations("XYZ", 2)]

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abbe.models.papers.probe.calibration import calibrate, fit_sphere, master_sphere_pattern, without_absorbed
+from abbe.models.papers.probe.calibration import calibrate, fit_sphere, map_of_pattern, master_sphere_pattern, without_absorbed
 from abbe.models.papers.probe.combined import combined_deviation_mm, contact_point_mm, printed_eq17_mm, probe_error_mm
 from abbe.models.papers.probe.frame import direction, direction_angles, probe_frame, to_machine, to_probe
 from abbe.models.papers.probe.lobing import LobingMap
-from abbe.models.papers.probe.pattern import map_of_pattern
 
 ANGLE = st.floats(-10.0, 10.0)
 PATTERN = master_sphere_pattern()

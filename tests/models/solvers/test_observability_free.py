@@ -15,9 +15,9 @@ from abbe.models.machine import Machine
 from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.assessment import motions_of, observability, observability_of
 from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observability.rank import as_meant
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import Priors
-from abbe.models.solvers.rounding import as_meant
 from tests.models.solvers.observability_cases import FXYZ, ONE, STEPS, TEN, YANG, helix, laser
 
 BOX = np.array([[0.0, 500.0], [0.0, 400.0], [0.0, 300.0]])

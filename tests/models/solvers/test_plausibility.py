@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from abbe.models.solvers.evidence import Part, conditional, scatter, together
-from abbe.models.solvers.plausibility import suspects
+from abbe.models.solvers.plausibility import Part, conditional, scatter, suspects, together
 from tests.models.solvers.truth import MACHINE, Truth
 
 CONSTANT = 0.5 * np.log(2 * np.pi)

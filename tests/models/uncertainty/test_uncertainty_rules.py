@@ -10,7 +10,7 @@ from abbe.models.uncertainty.budget import budget_at, budget_over, worst_point
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.mask import compensable_mask
 from abbe.models.uncertainty.prediction import Prediction
-from abbe.models.uncertainty.repeatability import machine_repeatability
+from tests.experiments.mathematics.repeatability import machine_repeatability
 
 
 def prediction(deviation, variances, dof=np.inf, names=("bar_noise", "prior")):

@@ -5,11 +5,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from abbe.models.paths.helix import helix_points
-from abbe.models.uncertainty import helix_trials as module
-from abbe.models.uncertainty import linear_trials as linear
 from abbe.models.uncertainty.distributions import Distribution
-from abbe.models.uncertainty.helix_trials import HelixTask, fit_trials, helix_trials
-from abbe.models.uncertainty.linear_trials import linear_estimator, linear_trials
+from tests.experiments.mathematics import helix_trials as module
+from tests.experiments.mathematics.helix_trials import HelixTask, fit_trials, helix_trials, linear_estimator, linear_trials
 
 RADIUS, SIGMA = 150.0, 5e-4
 POINTS = helix_points(np.zeros(3), RADIUS, turns=3, n=63, law="angle", axis=2)
@@ -66,7 +64,7 @@ def test_chunks_do_not_change_linear_trials(monkeypatch):
     a, sigma, theta = problem()
     estimator = linear_estimator(a, sigma)
     whole = linear_trials(estimator, a @ theta, np.random.default_rng(5), 1000)
-    monkeypatch.setattr(linear, "CHUNK_VALUES", 777)
+    monkeypatch.setattr(module, "CHUNK_VALUES", 777)
     parts = linear_trials(estimator, a @ theta, np.random.default_rng(5), 1000)
     u = np.sqrt(np.diag(estimator.covariance))
     assert np.abs((whole.mean - parts.mean) / u).max() < 1e-6
