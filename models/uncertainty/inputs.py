@@ -31,8 +31,8 @@ class StatedInputs:
     u_bar_temperature_k, bar_expansion_per_k : float
         The same of the ball-bar against the temperature of its calibration; one thermometer for all bar runs.
     repeatability_mm : float
-        Standard deviation of the machine from one approach of a point to the next, per component. It is part of the scatter of the readings: the budget takes its share out of theirs, at most all of it. Default 0:
-        not told apart.
+        Standard deviation of the machine from one approach of a point to the next, per component. It is part of the scatter of the
+        readings: the budget takes its share out of theirs, at most all of it. Default 0: not known apart.
     repeatability_dof : float
         Degrees of freedom of that figure; inf when it is stated.
     single_approach : bool
