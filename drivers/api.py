@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
-from enum import Flag, auto
+from enum import Flag, StrEnum, auto
 from typing import NamedTuple, Protocol
 
 Point = tuple[float, float, float]
@@ -100,24 +100,21 @@ NOTHING_HOLDS = Condition(0)
 
 @dataclass(frozen=True, slots=True)
 class ControllerStatus:
-    """One coherent status block of the controller (docs/protocols/cnc.md)."""
+    """One coherent look at a controller. ``_us``: its own clock, in microseconds.
+
+    ``path_start_us`` and ``path_end_us``: of the last path; the end is the smaller one while a path is followed. ``in_position_us``: when
+    the axes came to stand where they are.
+    """
 
     host_s: float
     ctrl_us: int
     conditions: Condition
-    alarm_code: int
-    motion_ack_seq: int
-    motion_result: int
-    motion_done_seq: int
     position_mm: Point
-    fifo_free: int
     path_points_done: int
     path_start_us: int
     path_end_us: int
     override_percent: int
     in_position_us: int
-    fifo_ack_seq: int
-    fifo_result: int
 
     @property
     def moving(self) -> bool:
@@ -145,15 +142,30 @@ class ControllerStatus:
         return Condition.REMOTE in self.conditions
 
 
+class BankState(StrEnum):
+    """What a bank for compensation tables holds. A driver maps its own numbers on these."""
+
+    EMPTY = "empty"
+    WRITING = "being written"
+    SEALED = "sealed"
+    LAID_ASIDE = "laid aside"
+    """Sealed, and acts after the control's next start."""
+    UNKNOWN = "unknown"
+    """The controller says something that its driver does not know."""
+
+
 @dataclass(frozen=True, slots=True)
 class CompStatus:
-    """One coherent compensation status block, with the generation counter and boot id read around it (seqlock)."""
+    """One coherent look at the compensation banks, with the generation counter and boot id read around it (seqlock).
+
+    ``bank_crc`` is 0 for a bank that is not sealed.
+    """
 
     boot_id: int
     gen: int
     active_bank: int
     bank_crc: tuple[int, int]
-    bank_state: tuple[int, int]
+    bank_state: tuple[BankState, BankState]
     lease_owner: int
     lease_left_ms: int
 
@@ -191,32 +203,56 @@ class DisplacementMeter(Protocol):
     async def close(self) -> None: ...
 
 
-class Controller(Protocol):
-    """Motion, status and compensation banks of a CNC controller."""
+class Identity(Protocol):
+    """Who a controller is and how it is: everything that can be asked without changing anything."""
 
     async def identify(self) -> DeviceInfo: ...
     async def status(self) -> ControllerStatus: ...
-    async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus: ...
-    async def load_path(self, points_mm: Sequence[Point]) -> None: ...
-    async def start_path(self, *, feed_mm_min: float) -> None: ...
-    async def hold(self) -> None: ...
-    async def resume(self) -> None: ...
-    async def abort(self) -> None: ...
-    async def table_format(self) -> TableFormat: ...
     async def comp_status(self) -> CompStatus: ...
-    async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None: ...
-    async def release(self, owner: int, *, anyway: bool = False) -> None: ...
-    async def write_bank(self, bank: int, image: bytes) -> None: ...
-    async def read_bank(self, bank: int, n_bytes: int | None = None) -> bytes: ...
-    async def write_part(self, bank: int, first: int, data: bytes) -> None: ...
-    async def read_part(self, bank: int, first: int, n_bytes: int) -> bytes: ...
-    async def seal(self, bank: int, owner: int) -> None: ...
-    async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None: ...
+    async def table_format(self) -> TableFormat: ...
     async def close(self) -> None: ...
 
 
+class Motion(Protocol):
+    """Straight moves, and stopping whatever moves."""
+
+    async def status(self) -> ControllerStatus: ...
+    async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus: ...
+    async def hold(self) -> None: ...
+    async def abort(self) -> None: ...
+
+
+class Paths(Motion, Protocol):
+    """Paths followed at constant feed."""
+
+    async def load_path(self, points_mm: Sequence[Point]) -> None: ...
+    async def start_path(self, *, feed_mm_min: float) -> None: ...
+
+
+class Tables(Protocol):
+    """Two banks for compensation tables, and the lease that permits to change them.
+
+    A bank holds an image (`abbe.drivers.tables`); ``first`` and sizes count its 16-bit words.
+    """
+
+    async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None: ...
+    async def release(self, owner: int, *, anyway: bool = False) -> None: ...
+    async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes: ...
+    async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None: ...
+    async def seal(self, bank: int, owner: int) -> None: ...
+    async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None: ...
+
+
+class TableController(Identity, Tables, Protocol):
+    """What a push needs: it looks and it changes banks, but moves nothing."""
+
+
+class Controller(Identity, Paths, Tables, Protocol):
+    """Everything that an open session can do with a controller. Functions ask for the part that they need."""
+
+
 class Fixture(Protocol):
-    """Whoever mounts bars and mirrors: the operator at the console, or a remote fixture (docs/protocols/fixture.md)."""
+    """Mounts bars and mirrors: the operator at the console, or a remote fixture (docs/protocols/fixture.md)."""
 
     async def identify(self) -> str: ...
     async def mount_ballbar(self, radius_mm: float) -> None: ...

@@ -18,8 +18,8 @@ import httpx
 import numpy as np
 
 from abbe.drivers.api import CompStatus, TableFormat
-from abbe.drivers.cnc.tables import crc32, encode
 from abbe.drivers.errors import LinkDown
+from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables, nine_tables, predict_residual, quantise
 from abbe.service.audit.book import AuditBook
 from abbe.service.campaign_data.campaign_folder import from_folder

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from abbe.drivers.cnc.tables import crc32
+from abbe.drivers.tables import crc32
 from abbe.service.clock import Clock
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import PushState, S

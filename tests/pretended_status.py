@@ -12,19 +12,12 @@ _AT_REST = ControllerStatus(
     host_s=0.0,
     ctrl_us=0,
     conditions=READY,
-    alarm_code=0,
-    motion_ack_seq=0,
-    motion_result=0,
-    motion_done_seq=0,
     position_mm=(0.0, 0.0, 0.0),
-    fifo_free=8192,
     path_points_done=0,
     path_start_us=0,
     path_end_us=0,
     override_percent=100,
     in_position_us=0,
-    fifo_ack_seq=0,
-    fifo_result=0,
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from abbe.drivers.api import CompStatus
+from abbe.drivers.api import BankState, CompStatus
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.errors import BadFrame, DeviceFault, Refused
@@ -18,7 +18,7 @@ _HEADER_WORDS = 24
 _LENGTH_WORD = 3
 _MAGIC = 0xABBE
 _TRIES = 4
-_SEALED = (2, 3)
+_SEALED = (BankState.SEALED, BankState.LAID_ASIDE)
 _LEASED = 7
 
 
@@ -47,38 +47,26 @@ class Banks:
         detail = f"the generation changed during each of {_SEQLOCK_TRIES} reads"
         raise DeviceFault(self._name, "read compensation status", detail, "is another program or the operator editing tables?")
 
-    async def write(self, bank: int, image: bytes) -> None:
+    async def write(self, bank: int, data: bytes, *, first: int = 0) -> None:
         """See ``ModbusController.write_bank``."""
         base = self._base(bank, "write bank")
-        if len(image) % 2 or not 0 < len(image) <= 2 * reg.BANK_REGISTERS:
-            raise Refused(self._name, "write bank", f"{len(image)} bytes are not an image of 1..{reg.BANK_REGISTERS} registers")
-        words = words_of(image)
-        for first in range(0, len(words), _WINDOW):
-            await self._session.link.write(base + first, words[first : first + _WINDOW], ModbusOperation.NUMBERED)
+        self._within("write bank", first, len(data))
+        words = words_of(data)
+        for at in range(0, len(words), _WINDOW):
+            await self._session.link.write(base + first + at, words[at : at + _WINDOW], ModbusOperation.NUMBERED)
 
-    async def read(self, bank: int, n_bytes: int | None) -> bytes:
+    async def read(self, bank: int, n_bytes: int | None, *, first: int = 0) -> bytes:
         """See ``ModbusController.read_bank``."""
         base = self._base(bank, "read bank")
         if n_bytes is None:
-            count = await self._length(bank, base)
-        elif n_bytes % 2 or not 0 < n_bytes <= 2 * reg.BANK_REGISTERS:
-            raise Refused(self._name, "read bank", f"{n_bytes} bytes are not 1..{reg.BANK_REGISTERS} registers")
+            end = await self._length(bank, base)
         else:
-            count = n_bytes // 2
+            self._within("read bank", first, n_bytes)
+            end = first + n_bytes // 2
         words: list[int] = []
-        for first in range(0, count, _WINDOW):
-            words += await self._session.link.read(base + first, min(_WINDOW, count - first), lead=first)
+        for at in range(first, end, _WINDOW):
+            words += await self._session.link.read(base + at, min(_WINDOW, end - at), lead=at)
         return bytes_of(words)
-
-    async def write_part(self, bank: int, first: int, data: bytes) -> None:
-        """See ``ModbusController.write_part``."""
-        base = self._part(bank, "write part of bank", first, len(data))
-        await self._session.link.write(base + first, words_of(data), ModbusOperation.NUMBERED)
-
-    async def read_part(self, bank: int, first: int, n_bytes: int) -> bytes:
-        """See ``ModbusController.read_part``."""
-        base = self._part(bank, "read part of bank", first, n_bytes)
-        return bytes_of(await self._session.link.read(base + first, n_bytes // 2, lead=first))
 
     async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
         """See ``ModbusController.lease``."""
@@ -161,11 +149,11 @@ class Banks:
             raise BadFrame(self._name, "read bank", detail, "empty or half written: give the number of bytes to read it all the same")
         return length
 
-    def _part(self, bank: int, operation: str, first: int, n_bytes: int) -> int:
-        base = self._base(bank, operation)
-        if n_bytes % 2 or first % 2 or not 0 < n_bytes <= 2 * _WINDOW or not 0 <= first <= reg.BANK_REGISTERS - n_bytes // 2:
-            raise Refused(self._name, operation, f"registers {first}.. with {n_bytes} bytes are not 1..{_WINDOW} registers of a bank")
-        return base
+    def _within(self, operation: str, first: int, n_bytes: int) -> None:
+        """Refuse what is not registers of a bank, or begins within a 32-bit value."""
+        if n_bytes % 2 or n_bytes <= 0 or first % 2 or not 0 <= first <= reg.BANK_REGISTERS - n_bytes // 2:
+            detail = f"{n_bytes} bytes from register {first} on are not within the {reg.BANK_REGISTERS} registers of a bank"
+            raise Refused(self._name, operation, detail)
 
     def _base(self, bank: int, operation: str) -> int:
         if bank not in (0, 1):
@@ -181,5 +169,5 @@ def _passed_over(command: int, result: int, counts: dict[str, int], fields: dict
     if result:
         return False
     if command == reg.SEAL:
-        return counts[f"BANK_STATE_{fields['bank']}"] not in _SEALED
+        return reg.bank_state(counts[f"BANK_STATE_{fields['bank']}"]) not in _SEALED
     return (holder != owner) if command == reg.LEASE else (command == reg.RELEASE and holder == owner)

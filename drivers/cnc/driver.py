@@ -163,39 +163,29 @@ class ModbusController:
         """
         await self._banks.release(owner, anyway=anyway)
 
-    async def write_bank(self, bank: int, image: bytes) -> None:
-        """Write an image into the inactive bank, in windows that never split a value. Read it back before trusting it.
+    async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None:
+        """Write into the inactive bank from register ``first`` (even) on, in windows that never split a value.
+
+        Up to 100 registers travel in one request. Read them back before trusting them.
 
         Raises
         ------
         Refused
-            The bank is active, or the image does not fit.
+            The bank is active, or the data does not fit.
         """
-        await self._banks.write(bank, image)
+        await self._banks.write(bank, data, first=first)
 
-    async def read_bank(self, bank: int, n_bytes: int | None = None) -> bytes:
-        """Read a bank's image: ``n_bytes``, or as many as its header says.
+    async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes:
+        """Read a bank from register ``first`` (even) on: ``n_bytes``, or to the end of the image that its header states.
 
         Raises
         ------
         BadFrame
             The bank holds no image and no length was given.
-        """
-        return await self._banks.read(bank, n_bytes)
-
-    async def write_part(self, bank: int, first: int, data: bytes) -> None:
-        """Write the registers of the inactive bank from ``first`` on, in one request: at most 100, an even number.
-
-        Raises
-        ------
         Refused
-            The bank is active, or the registers are not within it.
+            Not within the bank.
         """
-        await self._banks.write_part(bank, first, data)
-
-    async def read_part(self, bank: int, first: int, n_bytes: int) -> bytes:
-        """Read the registers of a bank from ``first`` on, whatever they hold, in one request: at most 100."""
-        return await self._banks.read_part(bank, first, n_bytes)
+        return await self._banks.read(bank, n_bytes, first=first)
 
     async def seal(self, bank: int, owner: int) -> None:
         """Let the controller check the bank's image and compute its CRC.

@@ -61,9 +61,9 @@ class MotionCommands:
         await self._command(reg.PATH_CLEAR, "clear path")
         for first in range(0, len(points), reg.MAX_CHUNK):
             await self._chunk(points[first : first + reg.MAX_CHUNK], f"load path points {first}..")
-        status = await self._session.status()
-        if status.fifo_free != self._session.fifo_size - len(points):
-            detail = f"{self._session.fifo_size - status.fifo_free} points arrived instead of {len(points)}"
+        block = await self._session.block()
+        if block.fifo_free != self._session.fifo_size - len(points):
+            detail = f"{self._session.fifo_size - block.fifo_free} points arrived instead of {len(points)}"
             raise DeviceFault(self._name, "load path", detail, "is another program loading a path? load it again")
 
     async def start_path(self, *, feed_mm_min: float) -> None:
@@ -131,11 +131,11 @@ class MotionCommands:
 
     async def _command(self, command: int, operation: str, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> int:
         async with self._commands:
-            status = await self._session.status()
-            reasons = reg.interlocks(status.conditions)  # an open door may show as feed hold too: people have to hear of the door
-            if Condition.FEED_HOLD in status.conditions and not reasons and command in (reg.MOVE, reg.PATH_START):
+            block = await self._session.block()
+            reasons = reg.interlocks(block.status.conditions)  # an open door may show as feed hold too: people have to hear of the door
+            if Condition.FEED_HOLD in block.status.conditions and not reasons and command in (reg.MOVE, reg.PATH_START):
                 raise Refused(self._name, operation, "feed hold is on", "call resume or abort first, when it is safe")
-            number = next_number(status.motion_ack_seq)
+            number = next_number(block.motion_ack_seq)
             try:
                 words = reg.encode_motion(number, command, target, feed_mm_min)
             except ValueError as error:
@@ -145,7 +145,7 @@ class MotionCommands:
                 await self._session.link.write(reg.MOTION_ADDRESS, words, ModbusOperation.NUMBERED)
 
             async def acknowledge() -> tuple[int, int]:
-                now = await self._session.status()
+                now = await self._session.block()
                 return now.motion_ack_seq, now.motion_result
 
             result = await run_numbered(self._name, operation, number, write, acknowledge)
@@ -158,36 +158,37 @@ class MotionCommands:
 
     async def _done(self, number: int) -> ControllerStatus:
         while True:
-            status = await self._session.status()
+            block = await self._session.block()
             # Trouble first: after an alarm the controller may well count the command as done.
-            self._check(status)
-            if status.motion_done_seq == number:
-                return status
-            if Condition.FEED_HOLD in status.conditions:
+            self._check(block)
+            if block.motion_done_seq == number:
+                return block.status
+            if Condition.FEED_HOLD in block.status.conditions:
                 raise _MotionStopped(self._name, "move", "stopped by feed hold", "resume or abort when it is safe")
-            if status.motion_ack_seq != number:
-                detail = f"command {number} was overtaken by {status.motion_ack_seq}"
+            if block.motion_ack_seq != number:
+                detail = f"command {number} was overtaken by {block.motion_ack_seq}"
                 raise DeviceFault(self._name, "move", detail, "is another program moving this machine?")
             await asyncio.sleep(_POLL_S)
 
-    def _check(self, status: ControllerStatus) -> None:
-        if Condition.ESTOP in status.conditions:
+    def _check(self, block: reg.StatusBlock) -> None:
+        conditions = block.status.conditions
+        if Condition.ESTOP in conditions:
             raise DeviceFault(self._name, "move", "e-stop pressed", "release it, reset the alarm, reference if asked, start again")
-        if Condition.ALARM in status.conditions or status.alarm_code:
-            what = reg.ALARM.get(status.alarm_code, f"code {status.alarm_code}")
+        if Condition.ALARM in conditions or block.alarm_code:
+            what = reg.ALARM.get(block.alarm_code, f"code {block.alarm_code}")
             raise DeviceFault(self._name, "move", f"alarm: {what}", "clear its cause and reset it at the controller")
-        if Condition.DOOR_OPEN in status.conditions:
+        if Condition.DOOR_OPEN in conditions:
             raise DeviceFault(self._name, "move", "door opened", "close it and start again")
 
     async def _chunk(self, points: list[tuple[int, int, int]], operation: str) -> None:
         async with self._commands:
-            number = next_number((await self._session.status()).fifo_ack_seq)
+            number = next_number((await self._session.block()).fifo_ack_seq)
 
             async def write() -> None:
                 await self._session.link.write(reg.FIFO_ADDRESS, reg.encode_fifo(number, points), ModbusOperation.NUMBERED)
 
             async def acknowledge() -> tuple[int, int]:
-                now = await self._session.status()
+                now = await self._session.block()
                 return now.fifo_ack_seq, now.fifo_result
 
             result = await run_numbered(self._name, operation, number, write, acknowledge)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntFlag
 
-from abbe.drivers.api import NOTHING_HOLDS, CompStatus, Condition, ControllerStatus, Point
+from abbe.drivers.api import NOTHING_HOLDS, BankState, CompStatus, Condition, ControllerStatus, Point
 from abbe.drivers.links.words import Register, RegisterBlock, words_of
 
+MAP_VERSION = 1
 COUNTS_PER_MM = 100_000  # 10 nm
 FEED_PER_MM_MIN = 100  # 0.01 mm/min
 MAX_CHUNK = 19
@@ -98,6 +100,7 @@ COMP_RESULT = {
     7: "the lease is held by another owner, or by nobody",
     8: "staged: it acts after the control's restart, until then the other bank does",
 }
+BANK_STATES = {0: BankState.EMPTY, 1: BankState.WRITING, 2: BankState.SEALED, 3: BankState.LAID_ASIDE}
 ALARM = {1: "e-stop", 2: "stroke limit", 3: "path ran empty"}
 
 
@@ -162,7 +165,24 @@ def interlocks(conditions: Condition) -> list[str]:
     return wrong + [text for one, text in _MUST_BE_SET.items() if one not in conditions]
 
 
-def decode_status(words: Sequence[int], host_s: float) -> ControllerStatus:
+@dataclass(frozen=True, slots=True)
+class StatusBlock:
+    """Registers 16..63: the controller's status, and what became of the commands sent to it.
+
+    ``fifo_free``: points that its path still takes.
+    """
+
+    status: ControllerStatus
+    alarm_code: int
+    motion_ack_seq: int
+    motion_result: int
+    motion_done_seq: int
+    fifo_free: int
+    fifo_ack_seq: int
+    fifo_result: int
+
+
+def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
     """Turn registers 16..63 of one request into a status.
 
     Parameters
@@ -174,24 +194,32 @@ def decode_status(words: Sequence[int], host_s: float) -> ControllerStatus:
     """
     counts = STATUS.counts(words)
     x, y, z = (STATUS.physical(name, counts[name]) for name in ("POSITION_X", "POSITION_Y", "POSITION_Z"))
-    return ControllerStatus(
+    status = ControllerStatus(
         host_s=host_s,
         ctrl_us=counts["CTRL_TIME_US"],
         conditions=conditions_of(counts["STATUS_BITS"]),
-        alarm_code=counts["ALARM_CODE"],
-        motion_ack_seq=counts["MOTION_ACK_SEQ"],
-        motion_result=counts["MOTION_RESULT"],
-        motion_done_seq=counts["MOTION_DONE_SEQ"],
         position_mm=(x, y, z),
-        fifo_free=counts["FIFO_FREE"],
         path_points_done=counts["PATH_POINTS_DONE"],
         path_start_us=counts["PATH_START_US"],
         path_end_us=counts["PATH_END_US"],
         override_percent=counts["OVERRIDE"],
         in_position_us=counts["IN_POSITION_US"],
+    )
+    return StatusBlock(
+        status=status,
+        alarm_code=counts["ALARM_CODE"],
+        motion_ack_seq=counts["MOTION_ACK_SEQ"],
+        motion_result=counts["MOTION_RESULT"],
+        motion_done_seq=counts["MOTION_DONE_SEQ"],
+        fifo_free=counts["FIFO_FREE"],
         fifo_ack_seq=counts["FIFO_ACK_SEQ"],
         fifo_result=counts["FIFO_RESULT"],
     )
+
+
+def bank_state(number: int) -> BankState:
+    """What BANK_STATE_0 or BANK_STATE_1 says."""
+    return BANK_STATES.get(number, BankState.UNKNOWN)
 
 
 def decode_comp_status(words: Sequence[int], *, boot_id: int, gen: int) -> CompStatus:
@@ -202,7 +230,7 @@ def decode_comp_status(words: Sequence[int], *, boot_id: int, gen: int) -> CompS
         gen=gen,
         active_bank=counts["ACTIVE_BANK"],
         bank_crc=(counts["BANK_CRC_0"], counts["BANK_CRC_1"]),
-        bank_state=(counts["BANK_STATE_0"], counts["BANK_STATE_1"]),
+        bank_state=(bank_state(counts["BANK_STATE_0"]), bank_state(counts["BANK_STATE_1"])),
         lease_owner=counts["LEASE_OWNER"],
         lease_left_ms=counts["LEASE_LEFT_MS"],
     )

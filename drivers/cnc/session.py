@@ -6,7 +6,6 @@ import time
 
 from abbe.drivers.api import ControllerStatus, DeviceInfo, TableFormat
 from abbe.drivers.cnc import registers as reg
-from abbe.drivers.cnc.tables import MAP_VERSION
 from abbe.drivers.errors import Rebooted, WrongDevice
 from abbe.drivers.links.identity import check_clock, check_identity
 from abbe.drivers.links.modbus_link import ModbusLink
@@ -42,7 +41,7 @@ class ControllerSession:
         """
         self._map = ""
         counts = await self._identity()
-        status = reg.decode_status(await self.link.read_block(reg.STATUS), time.monotonic())
+        status = reg.decode_status(await self.link.read_block(reg.STATUS), time.monotonic()).status
         try:
             check_clock(self.name, status.ctrl_us)
         except WrongDevice as error:
@@ -75,6 +74,10 @@ class ControllerSession:
         self._connection = self.link.connections
 
     async def status(self) -> ControllerStatus:
+        """How the controller is; see `block`."""
+        return (await self.block()).status
+
+    async def block(self) -> reg.StatusBlock:
         """Read the status block in one request.
 
         Raises
@@ -85,12 +88,12 @@ class ControllerSession:
             The wire.
         """
         words = await self.link.read_block(reg.STATUS)
-        status = reg.decode_status(words, time.monotonic())
+        block = reg.decode_status(words, time.monotonic())
         # The boot id is not in this block: a clock that went back, or a new connection, is the reason to ask for it.
-        if self._boot_id is None or status.ctrl_us < self._last_us or self._connection != self.link.connections:
+        if self._boot_id is None or block.status.ctrl_us < self._last_us or self._connection != self.link.connections:
             await self.check_boot()
-        self._last_us = status.ctrl_us
-        return status
+        self._last_us = block.status.ctrl_us
+        return block
 
     async def table_format(self) -> TableFormat:
         """Read in which unit and how large this controller stores tables."""
@@ -100,7 +103,7 @@ class ControllerSession:
     async def _identity(self) -> dict[str, int]:
         counts = reg.IDENTITY.counts(await self.link.read_block(reg.IDENTITY))
         try:
-            check_identity(self.name, counts, MAP_VERSION)
+            check_identity(self.name, counts, reg.MAP_VERSION)
             self._check_map(counts)
         except WrongDevice as error:
             self.link.incidents.note(error, latched=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from abbe.drivers.api import TableFormat
-from abbe.drivers.cnc.tables import MAP_VERSION
+from abbe.drivers.tables import FORMAT_VERSION
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
 from abbe.service.clock import Clock
@@ -56,7 +56,7 @@ def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: Tab
         The runs that were solved, ``abbe-run/1``.
     """
     columns = tuple(_column(promise, a, i) for a in range(3) for i in range(3))
-    blank = Candidate(site.name, MAP_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
+    blank = Candidate(site.name, FORMAT_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
     digest = content_digest(blank)
     return replace(blank, digest=digest, seal=EvidenceSeal(SIGNER, digest))
 
@@ -111,7 +111,7 @@ async def scene_of(
     month_ago = {} if attended else _on_grid(await asyncio.to_thread(_month_ago, store, site, base, clock), grid)
     travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}
     return CandidateContext(
-        site.name, mark_of([base.status.boot_id]), MAP_VERSION, form.lsb_nm, form.bank_registers, travel, {}, base.crc,
+        site.name, mark_of([base.status.boot_id]), FORMAT_VERSION, form.lsb_nm, form.bank_registers, travel, {}, base.crc,
         _on_grid(base.tables, grid), month_ago, clock.utc().timestamp(), attended=attended, last_push_s=last_s,
     )  # fmt: skip
 

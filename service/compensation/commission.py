@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import Identity
 from abbe.models.arrays import F2
 from abbe.models.compensation.sign_proof import Shift, SignProof, bar_shift, sign_proof, step_tables
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
@@ -191,7 +191,7 @@ def _doc(proof: SignProof) -> dict[str, Any]:
     }
 
 
-async def commissioned(controller: Controller, store: Store, site: Site) -> bool | None:
+async def commissioned(controller: Identity, store: Store, site: Site) -> bool | None:
     """Whether the last commissioning of this machine's control has proved sign, axis and unit.
 
     None: there was none, or since then another control or another firmware was put in.
@@ -209,7 +209,7 @@ def _last(store: Store, site: Site) -> dict[str, Any] | None:
     return dict(last[0].doc) if last else None
 
 
-async def check_commissioned(controller: Controller, store: Store, site: Site) -> None:
+async def check_commissioned(controller: Identity, store: Store, site: Site) -> None:
     """Refuse a table for a control of which nobody knows what it does with one.
 
     Raises

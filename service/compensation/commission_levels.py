@@ -11,11 +11,11 @@ import secrets
 from contextlib import suppress
 from dataclasses import dataclass, fields
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import BankState, Controller
 from abbe.drivers.errors import Refused
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.level_trial import ID_WORD, SEALED, Shown, Trial
+from abbe.service.compensation.level_trial import ID_WORD, Shown, Trial
 from abbe.service.compensation.level_trial_motion import while_moving
 from abbe.service.compensation.proved_levels import KIND, flags_of, identity, last_proof
 from abbe.service.compensation.recover import recover
@@ -149,10 +149,10 @@ async def _two_banks(t: Trial) -> bool:
     t.judge(
         "two_banks", apart, "a write into the bank at rest is read from there and nowhere else", "a write into one bank is not kept apart"
     )
-    why = await t.accepts(c.write_part(now.active_bank, ID_WORD, number))
+    why = await t.accepts(c.write_bank(now.active_bank, number, first=ID_WORD))
     t.judge("two_banks", bool(why), "the bank in force takes no writes", "the bank in force takes writes")
     if not apart:  # the number is put back wherever it went
-        await t.accepts(c.write_part(now.active_bank, ID_WORD, number))
+        await t.accepts(c.write_bank(now.active_bank, number, first=ID_WORD))
     why = await t.accepts(c.write_bank(1 - now.active_bank, image))
     return not why and apart
 
@@ -210,7 +210,7 @@ async def _right(t: Trial) -> None:
     if after.active_bank == other:
         t.note("swap_compares", "what is right is taken")
         t.counted(now.gen, after.gen, "an activation")
-    elif after.bank_state[other] not in (0, 1, SEALED):
+    elif after.bank_state[other] in (BankState.LAID_ASIDE, BankState.UNKNOWN):
         t.note("swap_compares", "what is right is taken, to act after the next start")
         await t.accepts(t.write_again())  # given up
     else:

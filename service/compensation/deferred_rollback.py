@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import TableController
 from abbe.service.clock import Clock
 from abbe.service.compensation.recover import READY, finish_push
 from abbe.service.errors import StillActive
@@ -23,7 +23,7 @@ POLL_S, REMIND_S, AGAIN_S = 0.1, 30.0, 2.0
 Say = Callable[[str], None]
 
 
-async def finish_when_safe(controller: Controller, store: Store, site: Site, *, limit_s: float, clock: Clock, say: Say) -> str | None:
+async def finish_when_safe(controller: TableController, store: Store, site: Site, *, limit_s: float, clock: Clock, say: Say) -> str | None:
     """Wait until the machine is safe and the controller answers, then take the old table back at once.
 
     Nothing is reset and nothing moves: a person makes the machine ready. May be cancelled at any time; the next start of any command

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
 
-from abbe.drivers.api import CompStatus, Controller
+from abbe.drivers.api import BankState, CompStatus, Controller
 from abbe.drivers.errors import DeviceFault, Refused
 from abbe.service.clock import Clock
 from abbe.service.tables.base_table import Base
 
-SEALED = 2
 LEASE_MS = 60_000
 ID_WORD = 4
 
@@ -92,7 +91,7 @@ class Trial:
     async def write_again(self) -> None:
         """Write into the bank at rest, in one request, what it holds."""
         other = 1 - (await self.status()).active_bank
-        await self.controller.write_part(other, ID_WORD, self.base.image[2 * ID_WORD : 2 * ID_WORD + 4])
+        await self.controller.write_bank(other, self.base.image[2 * ID_WORD : 2 * ID_WORD + 4], first=ID_WORD)
 
     async def hold(self) -> None:
         """Have the lease, also where a controller let a second owner take it."""
@@ -105,7 +104,7 @@ class Trial:
         await self.hold()
         now = await self.status()
         other = 1 - now.active_bank
-        if now.bank_state[other] != SEALED or now.bank_crc[other] != self.base.crc:
+        if now.bank_state[other] is not BankState.SEALED or now.bank_crc[other] != self.base.crc:
             if await self.controller.read_bank(other, len(self.base.image)) != self.base.image:
                 await self.controller.write_bank(other, self.base.image)
             gen = (await self.status()).gen

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import TableController
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
 from abbe.service.compensation.deferred_rollback import LIMIT_S, finish_when_safe
@@ -45,7 +45,7 @@ async def ordered_rollback(site: Site, store: Store, order: BackOrder, *, clock:
         return JobOutcome("failed", _told(error))
 
 
-async def _heard(controller: Controller, store: Store, site: Site, order: BackOrder, clock: Clock) -> JobOutcome:
+async def _heard(controller: TableController, store: Store, site: Site, order: BackOrder, clock: Clock) -> JobOutcome:
     control = order.ordered.control
     try:
         await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
@@ -80,7 +80,9 @@ def check_unchanged(store: Store, machine: str, order: BackOrder, control: str =
         )
 
 
-async def _finished(controller: Controller, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock) -> JobOutcome:
+async def _finished(
+    controller: TableController, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock
+) -> JobOutcome:
     """The rollback broke off, and the way back from it is not open now: go it as soon as it is."""
     finish = finish_when_safe(controller, store, site, limit_s=LIMIT_S, clock=clock, say=lambda _: None)
     try:

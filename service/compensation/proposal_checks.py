@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import TableController
 from abbe.service.clock import Clock
 from abbe.service.compensation.candidates import scene_of, until_s
 from abbe.service.compensation.proposal_doc import Proposed
@@ -97,7 +97,7 @@ class HoldReason:
 
 
 async def hold(
-    controller: Controller, store: Store, site: Site, number: int, proposed: Proposed, clock: Clock, *, attended: bool = True
+    controller: TableController, store: Store, site: Site, number: int, proposed: Proposed, clock: Clock, *, attended: bool = True
 ) -> HoldReason:
     """Read what a proposal is held against. Nothing is written."""
     base = await read_base(controller)

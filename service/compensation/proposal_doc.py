@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.cnc.tables import encode
+from abbe.drivers.tables import encode
 from abbe.models.arrays import F2
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from abbe.drivers.api import Controller, TableFormat
+from abbe.drivers.api import TableController, TableFormat
 from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.clock import Clock, SystemClock
@@ -69,7 +69,7 @@ class Made:
     solved: Solved
 
 
-async def gather(controller: Controller, store: Store, site: Site, campaign: str | int) -> Gathered:
+async def gather(controller: TableController, store: Store, site: Site, campaign: str | int) -> Gathered:
     """Read a campaign and the table in force.
 
     Raises

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import asdict, dataclass, fields
 
-from abbe.drivers.api import Controller, DeviceInfo
+from abbe.drivers.api import BankState, DeviceInfo, Identity
 from abbe.service.domain.document import Doc
 from abbe.service.errors import TableRefused
 from abbe.service.push.levels import Capabilities, objection
@@ -50,7 +50,7 @@ def last_proof(store: Store, site: Site) -> Doc | None:
     return dict(last[0].doc) if last else None
 
 
-async def level_status(controller: Controller, store: Store, site: Site) -> LevelStatus:
+async def level_status(controller: Identity, store: Store, site: Site) -> LevelStatus:
     """Find out what counts for a push into this controller, as it is now."""
     info = await controller.identify()
     doc = await asyncio.to_thread(last_proof, store, site)
@@ -59,14 +59,14 @@ async def level_status(controller: Controller, store: Store, site: Site) -> Leve
     return LevelStatus(await _visible(controller), HINT.format("" if doc is None else " since it is another one, or has another firmware"))
 
 
-async def _visible(controller: Controller) -> Capabilities:
+async def _visible(controller: Identity) -> Capabilities:
     """What can be seen without a test: two banks, a generation and a boot id in the status block. Nothing of it is proved."""
     now = await controller.comp_status()
-    banks = now.active_bank in (0, 1) and now.bank_state[now.active_bank] != 0
+    banks = now.active_bank in (0, 1) and now.bank_state[now.active_bank] is not BankState.EMPTY
     return Capabilities(two_banks=banks, generation=now.gen != 0, boot_id=now.boot_id != 0)
 
 
-async def check_level(controller: Controller, store: Store, site: Site, *, attended: bool = True) -> str:
+async def check_level(controller: Identity, store: Store, site: Site, *, attended: bool = True) -> str:
     """Refuse before anything is measured for a table that could not be pushed; gives the hint that has to be said.
 
     Raises

@@ -12,10 +12,10 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 
-from abbe.drivers.api import Controller
-from abbe.drivers.cnc.tables import crc32, encode
+from abbe.drivers.api import TableController
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import level_status
@@ -112,7 +112,7 @@ class PushResult:
 class Pushing:
     """Brings one table into a controller."""
 
-    controller: Controller
+    controller: TableController
     store: Store
     site: Site
     clock: Clock = field(default_factory=SystemClock)

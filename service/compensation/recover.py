@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import BankState, TableController
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.capture.recovery import recover_segments
@@ -16,7 +16,6 @@ from abbe.service.push import execute
 from abbe.service.push.adapter import ControllerPort, no_actors
 from abbe.service.push.book import StoreBook
 from abbe.service.push.entries import WORD, Journal, facts
-from abbe.service.push.staging import LAID_ASIDE
 from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -28,7 +27,7 @@ from abbe.service.tables.whose_push import check_own, is_own
 READY = "make the machine ready (interlocks, link), then start again"
 
 
-async def recover(controller: Controller, store: Store, site: Site, *, accept_by: str = "") -> str | None:
+async def recover(controller: TableController, store: Store, site: Site, *, accept_by: str = "") -> str | None:
     """Finish what the last push left open, and take over what interrupted runs left; returns what was done in a sentence or two, or None.
 
     Everything that moves the machine, or builds on its table, calls this first (tests/service/devices/test_every_session.py).
@@ -57,7 +56,9 @@ async def recover(controller: Controller, store: Store, site: Site, *, accept_by
     return "; ".join([*([pushed] if pushed else []), *(run.text for run in runs)]) or None
 
 
-async def finish_push(controller: Controller, store: Store, site: Site, clock: Clock | None = None, *, accept_by: str = "") -> str | None:
+async def finish_push(
+    controller: TableController, store: Store, site: Site, clock: Clock | None = None, *, accept_by: str = ""
+) -> str | None:
     """Bring the last push into this machine's control to its end, from its journal and from what the controller says; then look at the
     table in force (`check_in_force`).
 
@@ -82,7 +83,7 @@ async def finish_push(controller: Controller, store: Store, site: Site, clock: C
     return "; ".join(filter(None, (told, accepted))) or None
 
 
-async def _ended(controller: Controller, store: Store, site: Site, clock: Clock) -> str | None:
+async def _ended(controller: TableController, store: Store, site: Site, clock: Clock) -> str | None:
     """The same without the look at the table: what was done of the last push."""
     book = await StoreBook.last(store, site.name, clock, site.control)
     journal: Journal = () if book is None else await book.entries()
@@ -113,7 +114,7 @@ def _told(ended: execute.Ended, before: PushState) -> str | None:
     raise StillActive(f"the unverified table of push {number} is still active: {known.get('pending', ended.why)}", READY)
 
 
-async def accept(controller: Controller, store: Store, site: Site, by: str = "a person") -> str:
+async def accept(controller: TableController, store: Store, site: Site, by: str = "a person") -> str:
     """A person vouches for the table that is active now: every push that is open with it is closed, under whatever name it was begun.
 
     An interrupted push that can be finished is finished instead, and nothing is accepted: the person has looked at another table then.
@@ -151,10 +152,10 @@ async def accept(controller: Controller, store: Store, site: Site, by: str = "a 
     return await _accepted(controller, store, site, by)
 
 
-async def _accepted(controller: Controller, store: Store, site: Site, by: str) -> str:
+async def _accepted(controller: TableController, store: Store, site: Site, by: str) -> str:
     now = await controller.comp_status()
     crc, other = now.bank_crc[now.active_bank], 1 - now.active_bank
-    if now.bank_state[other] == LAID_ASIDE and now.bank_crc[other] != crc:
+    if now.bank_state[other] is BankState.LAID_ASIDE and now.bank_crc[other] != crc:
         raise TableMismatch(
             f"the control has another table laid aside (bank {other}, CRC {now.bank_crc[other]:08X}) and uses it after its next start",
             "take that one away at the control first; nothing was accepted",

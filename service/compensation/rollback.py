@@ -10,8 +10,8 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 
-from abbe.drivers.api import Controller
-from abbe.drivers.cnc.tables import crc32
+from abbe.drivers.api import TableController
+from abbe.drivers.tables import crc32
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposals import by_whom
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedAgain
@@ -56,7 +56,9 @@ class Ordered:
     control: Control = field(default_factory=Control)
 
 
-async def rollback(controller: Controller, store: Store, site: Site, to: int | None = None, ordered: Ordered | None = None) -> Back | None:
+async def rollback(
+    controller: TableController, store: Store, site: Site, to: int | None = None, ordered: Ordered | None = None
+) -> Back | None:
     """Make a table active again that was in force before.
 
     Parameters

@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from abbe.drivers.api import Condition, Controller
+from abbe.drivers.api import Condition, TableController
 from abbe.drivers.errors import DriverError, Rebooted, Refused
 from abbe.service.clock import Clock
 from abbe.service.push import operations as o
@@ -52,7 +52,7 @@ class ControllerPort:
 
     Parameters
     ----------
-    controller : Controller
+    controller : TableController
         Identified.
     people : PushActors
         Whom to ask.
@@ -60,7 +60,7 @@ class ControllerPort:
         Monotonic time of the approval.
     """
 
-    def __init__(self, controller: Controller, people: PushActors, clock: Clock) -> None:
+    def __init__(self, controller: TableController, people: PushActors, clock: Clock) -> None:
         self._c, self._people, self._clock = controller, people, clock
         self._map = ""
 
@@ -82,7 +82,7 @@ class ControllerPort:
             case OperationKind.READ_AGAIN:
                 return o.Done(semantic_digest_of_image(await self._c.read_bank(op.bank, 2 * op.count or None)))
             case OperationKind.READ_CHUNK:
-                return o.Done(await self._c.read_part(op.bank, op.first, 2 * op.count))
+                return o.Done(await self._c.read_bank(op.bank, 2 * op.count, first=op.first))
             case OperationKind.VALIDATE | OperationKind.APPROVE | OperationKind.PROBE | OperationKind.VERIFY:
                 return await self._ask(op.kind, journal)
             case _:
@@ -96,7 +96,7 @@ class ControllerPort:
             case OperationKind.RELEASE:
                 await self._c.release(op.owner)
             case OperationKind.WRITE:
-                await self._c.write_part(op.bank, op.first, op.data)
+                await self._c.write_bank(op.bank, op.data, first=op.first)
             case OperationKind.SEAL:
                 await self._c.seal(op.bank, op.owner)
             case OperationKind.ACTIVATE:

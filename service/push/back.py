@@ -5,10 +5,11 @@ It is taken by the process that began the push and by any later one; it may be b
 
 from __future__ import annotations
 
+from abbe.drivers.api import BankState
 from abbe.service.push.entries import Doc
 from abbe.service.push.learn import BACK
 from abbe.service.push.operations import Knowledge, Operation, OperationKind, Refused, Truth
-from abbe.service.push.staging import BRACKETS, EMPTY, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
+from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
 from abbe.service.push.states import PushState
 
 DOUBTS = 3
@@ -27,7 +28,7 @@ def record(state: PushState, **doc: object) -> Operation:
 def in_force(f: Doc, truth: Truth) -> str:
     """Which table is active: ``"base"``, ``"candidate"`` or ``"neither"``, by the CRC that the controller states."""
     crc = truth.crc[truth.active]
-    if truth.states[truth.active] == SEALED and crc in (f["base_crc"], f["crc"]):
+    if truth.states[truth.active] is BankState.SEALED and crc in (f["base_crc"], f["crc"]):
         return "base" if crc == f["base_crc"] else "candidate"
     return "neither"
 
@@ -86,7 +87,7 @@ def _switch(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
     assert truth is not None
     if truth.unsafe:
         return _pending(state, f"not safe now: {truth.unsafe}")
-    if truth.states[1 - truth.active] == LAID_ASIDE and truth.crc[1 - truth.active] == f["base_crc"]:
+    if truth.states[1 - truth.active] is BankState.LAID_ASIDE and truth.crc[1 - truth.active] == f["base_crc"]:
         return _pending(state, "the old table acts after the control's next start: start it anew, and move nothing before")
     if state is PushState.ACTIVATING_BACK:
         text = known.verdict.text if isinstance(known.verdict, Refused) else "the activation of the old table did not happen"
@@ -121,7 +122,7 @@ def _lease(f: Doc, known: Knowledge, truth: Truth, state: PushState, seq: int) -
 def _with_old_bank(f: Doc, known: Knowledge, truth: Truth) -> Operation:
     """Use the old table where it still stands, restore it from the journal where the controller lost it, never over a person's work."""
     other, base = 1 - truth.active, bytes.fromhex(f["base_image"])
-    if truth.states[other] == SEALED and truth.crc[other] == f["base_crc"]:
+    if truth.states[other] is BankState.SEALED and truth.crc[other] == f["base_crc"]:
         step = bracket(known, other, len(base) // 2, again=False)
         if isinstance(step, Operation):
             return step
@@ -129,7 +130,7 @@ def _with_old_bank(f: Doc, known: Knowledge, truth: Truth) -> Operation:
             return _armed(step.truth, other, PushState.ROLLBACK)
         if known.brackets < BRACKETS:
             return Operation(OperationKind.LOOK, mark=True)
-    if truth.states[other] == EMPTY:  # the controller forgot it
+    if truth.states[other] is BankState.EMPTY:  # the controller forgot it
         return _begin_restaging(truth, other)
     if f.get("restaged"):  # by this push, which was interrupted: what stands there may be ours
         step = bracket(known, other, len(base) // 2, again=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 
+from abbe.drivers.api import BankState
 from abbe.service.push.approval import approval_digest
 from abbe.service.push.back import DOUBTS, OWNERS, go_back, in_force, record, seen
 from abbe.service.push.entries import Doc, Journal, facts
@@ -16,7 +17,7 @@ from abbe.service.push.learn import FORGET
 from abbe.service.push.levels import objection
 from abbe.service.push.operations import Approval, Done, Knowledge, Operation, OperationKind, Refused, Truth, Verdict
 from abbe.service.push.order import OperationOrder
-from abbe.service.push.staging import BRACKETS, LAID_ASIDE, SEALED, Coherent, Failed, Image, bracket, stage
+from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
 from abbe.service.push.states import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, PushState
 
 STILL_S = 1.0
@@ -82,7 +83,7 @@ def _begin(known: Knowledge, order: OperationOrder) -> Operation:
     if isinstance(step, Operation):
         return step
     image = known.image or b""
-    if step is None or step.truth.states[active] != SEALED or zlib.crc32(image) != step.truth.crc[active]:
+    if step is None or step.truth.states[active] is not BankState.SEALED or zlib.crc32(image) != step.truth.crc[active]:
         if known.brackets < BRACKETS:
             return Operation(OperationKind.LOOK, mark=True)
         return Operation(OperationKind.END, text="the table in force does not have the CRC that the controller states, or keeps changing")
@@ -142,7 +143,7 @@ def _precheck(f: Doc, known: Knowledge) -> Operation:
     if truth is None:
         return Operation(OperationKind.LOOK)
     why = _changed(f, truth, f["gen"]) or ("the axes have not stood long enough" if truth.still_s < STILL_S else "")
-    if not why and truth.states[f["target"]] == LAID_ASIDE:
+    if not why and truth.states[f["target"]] is BankState.LAID_ASIDE:
         why = "a table is laid aside for the control's next start: start it anew, or take that table away first"
     if why:
         return _abandon(f, known, PushState.LEASED, why)
@@ -234,7 +235,7 @@ def _unconfirmed(f: Doc, known: Knowledge) -> Operation:
 
 def _not_in_force(f: Doc, known: Knowledge, truth: Truth) -> Operation:
     """The old table acts. A control that laid the new one aside for its next start has to forget it: nobody will have verified it."""
-    if truth.states[f["target"]] == LAID_ASIDE and truth.crc[f["target"]] == f["crc"]:
+    if truth.states[f["target"]] is BankState.LAID_ASIDE and truth.crc[f["target"]] == f["crc"]:
         return _forget(f, known, truth)
     if known.forgets:
         return record(PushState.ABORTED, why="this control uses a new table only after its next start: it cannot be verified in a push")

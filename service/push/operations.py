@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
 
+from abbe.drivers.api import BankState
 from abbe.service.push.entries import Doc
 from abbe.service.push.states import PushState
 
@@ -67,16 +68,15 @@ class Operation:
 class Truth:
     """What the controller says of itself in one coherent look.
 
-    ``crc`` is 0 for a bank that is not sealed; ``states``: 0 empty, 1 being written, 2 sealed, 3 sealed and laid
-    aside for the control's next start. ``unsafe``: why nothing may be activated
-    now, empty when interlocks hold and nothing moves. ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
+    ``crc`` is 0 for a bank that is not sealed. ``unsafe``: why nothing may be activated now, empty when interlocks hold and nothing moves.
+    ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
     """
 
     boot: int
     gen: int
     active: int
     crc: tuple[int, int]
-    states: tuple[int, int]
+    states: tuple[BankState, BankState]
     owner: int
     lease_ms: int
     unsafe: str

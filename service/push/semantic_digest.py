@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 
-from abbe.drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
+from abbe.drivers.second_decoder import UnreadableImage, read_axis_tables
 from abbe.models.compensation.tables import NineTables
 from abbe.service.push.entries import canonical
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from abbe.drivers.api import BankState
 from abbe.service.push.operations import Knowledge, Operation, OperationKind, Refused, Truth
 
 BRACKETS = 4
 REWRITES_PER_CHUNK = 2
 REWRITES = 5
 SEALS = 2
-EMPTY, SEALED, LAID_ASIDE = 0, 2, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +117,12 @@ def _read_back(image: Image, known: Knowledge, words: int) -> Operation | Failed
         return Failed("the controller restarted during staging")
     if truth.crc[1 - image.bank] != image.in_force or truth.active == image.bank:
         return Failed("the table in force changed during staging")
-    if truth.states[image.bank] != SEALED and known.sealed < SEALS:
+    if truth.states[image.bank] is not BankState.SEALED and known.sealed < SEALS:
         return Operation(OperationKind.SEAL, bank=image.bank, owner=image.owner)
     if known.image != image.data or known.meaning != image.meaning:
         what = "bytes" if known.image != image.data else "meaning (independent decoder)"
         return _again(known, f"the bank does not hold what was sent: {what}")
-    if truth.states[image.bank] != SEALED or truth.crc[image.bank] != image.crc:
+    if truth.states[image.bank] is not BankState.SEALED or truth.crc[image.bank] != image.crc:
         return Failed(f"sealed with CRC {truth.crc[image.bank]:08X}, sent {image.crc:08X}")
     return step
 

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import Motion
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.errors import AbbeError
@@ -18,7 +18,7 @@ UNDELIVERED = "the stop could not be delivered: press e-stop"
 
 
 @asynccontextmanager
-async def motion_guard(controller: Controller, spare: Spare | None = None) -> AsyncIterator[None]:
+async def motion_guard(controller: Motion, spare: Spare | None = None) -> AsyncIterator[None]:
     """Whatever ends this block early also stops the axes: abort is sent although the task is being cancelled.
 
     Parameters
@@ -49,7 +49,7 @@ async def motion_guard(controller: Controller, spare: Spare | None = None) -> As
         raise told from error
 
 
-async def _stop(controller: Controller, stopped: asyncio.Event, spare: Spare | None) -> None:
+async def _stop(controller: Motion, stopped: asyncio.Event, spare: Spare | None) -> None:
     try:
         async with asyncio.timeout(STOP_S):
             if spare is None or not await spare():

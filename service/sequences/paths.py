@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 
-from abbe.drivers.api import BarBatch, Condition, Controller, ControllerStatus
+from abbe.drivers.api import BarBatch, Condition, ControllerStatus, Motion, Paths
 from abbe.drivers.flags import bar_is_out, bar_is_valid, on_path
 from abbe.service.devices.session import Session
 from abbe.service.errors import BarOutOfRange, MeasurementFault, RunInterrupted
@@ -65,7 +65,7 @@ async def record_path(
     return found if stretch is None or stretch.off_mm is None else found | {"stretch_off_nm": round(stretch.off_mm * 1e6)}
 
 
-async def follow_path(controller: Controller, step: FollowPath, control: Control) -> None:
+async def follow_path(controller: Paths, step: FollowPath, control: Control) -> None:
     """Run a path that nothing is recorded on."""
     await controller.load_path(step.points_mm)
     async with motion_guard(controller):
@@ -73,7 +73,7 @@ async def follow_path(controller: Controller, step: FollowPath, control: Control
         await follow(controller, control)
 
 
-async def follow(controller: Controller, control: Control, way: Way | None = None) -> ControllerStatus:
+async def follow(controller: Motion, control: Control, way: Way | None = None) -> ControllerStatus:
     """Poll until the path has ended; an interlock, a feed hold, a stall or a person ends the run."""
     loop = asyncio.get_running_loop()
     points, since = -1, loop.time()
@@ -99,7 +99,7 @@ async def follow(controller: Controller, control: Control, way: Way | None = Non
         await asyncio.sleep(POLL_S)
 
 
-async def hold(controller: Controller) -> None:
+async def hold(controller: Motion) -> None:
     """Feed hold, and wait until the axes stand: a real machine brakes along its path, which an abort need not do."""
     await controller.hold()
     until_s, last = asyncio.get_running_loop().time() + STAND_S, None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from abbe.drivers.api import CompStatus, Controller
-from abbe.drivers.cnc.tables import crc32
+from abbe.drivers.api import CompStatus, TableController
+from abbe.drivers.tables import crc32
 from abbe.models.compensation.tables import NineTables
 from abbe.service.errors import TableMismatch
 from abbe.service.tables.nine_tables import tables_from_image
@@ -29,7 +29,7 @@ class Base:
         return tables_from_image(self.image)
 
 
-async def read_base(controller: Controller) -> Base:
+async def read_base(controller: TableController) -> Base:
     """Read the active bank and prove it against its CRC.
 
     Raises

@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import TableController
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import TableMismatch
@@ -72,7 +72,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
     return look
 
 
-async def _seen(controller: Controller, known: KnownState, chain: str, corrects: dict[int, bool]) -> InForceNow:
+async def _seen(controller: TableController, known: KnownState, chain: str, corrects: dict[int, bool]) -> InForceNow:
     """The gate's look. A table without the CRC that is stated for it is strange."""
     try:
         return await table_gate.look(controller, known, chain, corrects)

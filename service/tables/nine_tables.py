@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from abbe.drivers.cnc.second_decoder import UnreadableImage, read_axis_tables
-from abbe.drivers.cnc.tables import TableImage
+from abbe.drivers.second_decoder import UnreadableImage, read_axis_tables
+from abbe.drivers.tables import TableImage
 from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 from abbe.service.errors import TableMismatch, TableRefused

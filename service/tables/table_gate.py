@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abbe.drivers.api import CompStatus, Controller
+from abbe.drivers.api import BankState, CompStatus, TableController
 from abbe.service.clock import SystemClock
 from abbe.service.errors import TableMismatch
 from abbe.service.push.book import StoreBook
 from abbe.service.push.entries import Doc
-from abbe.service.push.staging import SEALED
 from abbe.service.push.states import PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -46,7 +45,7 @@ class InForceNow:
         return self.status.bank_crc[self.status.active_bank]
 
 
-async def look(controller: Controller, known: KnownState, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
+async def look(controller: TableController, known: KnownState, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
     """Ask the controller which table acts, and the journals which that is. Its content is read only where ``chain``, the journal of this
     control, does not say that it is right, and once for each CRC where ``corrects`` keeps what was read.
 
@@ -66,9 +65,9 @@ async def look(controller: Controller, known: KnownState, chain: str, corrects: 
     return InForceNow(now, unverified, acts and crc not in known.seen, elsewhere if acts else None)
 
 
-async def _corrects(controller: Controller, now: CompStatus) -> bool:
+async def _corrects(controller: TableController, now: CompStatus) -> bool:
     """Whether the active bank holds any correction. What cannot be read is taken for one."""
-    if now.bank_state[now.active_bank] != SEALED:
+    if now.bank_state[now.active_bank] is not BankState.SEALED:
         return False
     base = await read_base(controller)
     try:
@@ -78,7 +77,7 @@ async def _corrects(controller: Controller, now: CompStatus) -> bool:
     return tables is not None and any(bool(np.any(curve)) for curve in tables.correction_mm)
 
 
-async def check_in_force(controller: Controller, store: Store, site: Site) -> None:
+async def check_in_force(controller: TableController, store: Store, site: Site) -> None:
     """Refuse a table in force that no measurement has verified and no person has vouched for, under whatever name it was pushed.
 
     Raises
@@ -115,7 +114,7 @@ def _remedy(site: Site, push: PushedTable) -> str:
     return LOOK
 
 
-async def accept_strange(controller: Controller, store: Store, site: Site, by: str) -> str | None:
+async def accept_strange(controller: TableController, store: Store, site: Site, by: str) -> str | None:
     """Vouch for the table in force if this database did not push it, or only into other controls; returns what was done.
 
     A table that a push of this database brought and did not verify is not accepted in passing: that is `abbe accept-table`.

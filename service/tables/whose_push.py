@@ -4,13 +4,13 @@ another machine's by now.
 
 from __future__ import annotations
 
-from abbe.drivers.api import Controller
+from abbe.drivers.api import Identity
 from abbe.service.errors import TableMismatch
 from abbe.service.push.entries import Journal, facts
 from abbe.service.site import Site
 
 
-async def is_own(controller: Controller, site: Site, journal: Journal) -> bool:
+async def is_own(controller: Identity, site: Site, journal: Journal) -> bool:
     """Whether a push was begun on this control, by what proves it: address and name, address and start of the control, or its table.
 
     A table carries a number drawn by lot, so the table of the push in force is the proof that this is its control. The table from before
@@ -18,7 +18,7 @@ async def is_own(controller: Controller, site: Site, journal: Journal) -> bool:
 
     Parameters
     ----------
-    controller : Controller
+    controller : Identity
         Only read, and only where address and name do not match.
     site : Site
         The machine as its file names it now.
@@ -33,7 +33,7 @@ async def is_own(controller: Controller, site: Site, journal: Journal) -> bool:
     return (here and now.boot_id == known.get("boot")) or now.bank_crc[now.active_bank] == known.get("crc")
 
 
-async def check_own(controller: Controller, site: Site, journal: Journal) -> None:
+async def check_own(controller: Identity, site: Site, journal: Journal) -> None:
     """Refuse to end a push of which nothing proves that it was begun on this control. Nothing is written.
 
     Raises

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abbe.drivers.cnc import second_decoder as second
-from abbe.drivers.cnc import tables
-from abbe.drivers.cnc.tables import TableCodecError, TableImage
+from abbe.drivers import second_decoder as second
+from abbe.drivers import tables
+from abbe.drivers.tables import TableCodecError, TableImage
 
 positions = st.integers(-(2**31), 2**31 - 1).map(lambda n: n / 100_000)
 pitches = st.integers(1, 2**31 - 1).map(lambda n: n / 100_000)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from abbe.drivers.api import BarSample, Condition
+from abbe.drivers.api import BankState, BarSample, Condition
 from abbe.drivers.ballbar import frames
 from abbe.drivers.ballbar.frames import Ack, FrameDecoder, Info
 from abbe.drivers.cnc import registers as cnc
@@ -91,20 +91,21 @@ def test_status_layout():
     put(43, 100)
     put(44, 0, 0, 1, 0)
     put(48, 4, 1)
-    status = cnc.decode_status(words, 1.5)
+    block = cnc.decode_status(words, 1.5)
+    status = block.status
     assert status.host_s == 1.5
     assert status.ctrl_us == (1 << 32) + (2 << 16) + 3
     assert status.conditions == Condition.SPINDLE | Condition.ALARM
-    assert (status.alarm_code, status.motion_ack_seq, status.motion_result, status.motion_done_seq) == (2, 11, 3, 10)
+    assert (block.alarm_code, block.motion_ack_seq, block.motion_result, block.motion_done_seq) == (2, 11, 3, 10)
     assert status.position_mm == (-0.00001, 0.00001, 0.65536)
-    assert (status.fifo_free, status.path_points_done, status.path_start_us, status.path_end_us) == (8000, 65538, 5, 6)
-    assert (status.override_percent, status.in_position_us, status.fifo_ack_seq, status.fifo_result) == (100, 65536, 4, 1)
+    assert (block.fifo_free, status.path_points_done, status.path_start_us, status.path_end_us) == (8000, 65538, 5, 6)
+    assert (status.override_percent, status.in_position_us, block.fifo_ack_seq, block.fifo_result) == (100, 65536, 4, 1)
 
 
 def test_comp_status_layout():
     words = (1, 0x1111, 0x2222, 0x3333, 0x4444, 2, 1, 6, 0, 0, 77, 0, 5000, 0, 0, 0)
     status = cnc.decode_comp_status(words, boot_id=8, gen=9)
-    assert (status.active_bank, status.bank_crc, status.bank_state) == (1, (0x11112222, 0x33334444), (2, 1))
+    assert (status.active_bank, status.bank_crc, status.bank_state) == (1, (0x11112222, 0x33334444), (BankState.SEALED, BankState.WRITING))
     assert (status.lease_owner, status.lease_left_ms, status.boot_id, status.gen) == (77, 5000, 8, 9)
 
 

@@ -19,9 +19,9 @@ import pytest
 
 from abbe.drivers.api import Condition
 from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.cnc.second_decoder import read_axis_tables
-from abbe.drivers.cnc.tables import TableImage, encode
 from abbe.drivers.errors import Refused
+from abbe.drivers.second_decoder import read_axis_tables
+from abbe.drivers.tables import TableImage, encode
 from abbe.models.compensation.grid import GridTable, grid_table, nodes_mm, quantise_grid
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.paths.helix import helix_points

@@ -11,12 +11,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from abbe.drivers.api import Condition
+from abbe.drivers.api import BankState, Condition
 from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.cnc.second_decoder import read_axis_tables
-from abbe.drivers.cnc.tables import TableImage, crc32, encode
 from abbe.drivers.errors import DeviceFault, Refused
 from abbe.drivers.registry import open_controller
+from abbe.drivers.second_decoder import read_axis_tables
+from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
@@ -108,7 +108,7 @@ async def test_it_is_one_of_ours_moves_and_runs_a_path(machine):
         assert (await cnc.identify()).firmware.startswith("map 1, 3 axes, table unit 100 nm")
         status = await cnc.status()
         assert status.conditions & READY == READY
-        assert status.alarm_code == 0
+        assert (await cnc._session.block()).alarm_code == 0
         target = (300.0, 100.12345, 50.0)
         assert (await cnc.move(target, feed_mm_min=FEED, timeout_s=20)).position_mm == target
         assert await machine.drives() == pytest.approx(target, abs=1e-9)
@@ -173,7 +173,7 @@ async def test_a_table_acts_at_once(machine):
         assert await machine.drives() == (250.0, 130.0, 170.0)
         bank = await push(cnc, image)
         now = await cnc.comp_status()
-        assert (now.active_bank, now.bank_state[bank]) == (bank, 2)
+        assert (now.active_bank, now.bank_state[bank]) == (bank, BankState.SEALED)
         for target in ((250.0, 130.0, 170.0), (17.0, 499.0, 3.0), (599.0, 1.0, 449.0)):
             await cnc.move(target, feed_mm_min=FEED, timeout_s=20)
             added = [d - t for d, t in zip(await machine.drives(), target, strict=True)]

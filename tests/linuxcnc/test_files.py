@@ -6,9 +6,10 @@ import math
 
 import pytest
 
-from abbe.drivers.cnc.second_decoder import read_axis_tables
-from abbe.drivers.cnc.tables import TableImage, crc32, encode
+from abbe.drivers.api import BankState
 from abbe.drivers.errors import Refused
+from abbe.drivers.second_decoder import read_axis_tables
+from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.recover import accept
 from abbe.service.storage.store import Store
@@ -41,7 +42,7 @@ async def test_a_table_of_files_is_staged_until_the_control_starts_anew_and_then
         with pytest.raises(Refused, match="staged"):
             await push(cnc, image)
         now = await cnc.comp_status()
-        assert (now.active_bank, now.bank_state, now.bank_crc[1]) == (0, (2, 3), crc32(image))
+        assert (now.active_bank, now.bank_state, now.bank_crc[1]) == (0, (BankState.SEALED, BankState.LAID_ASIDE), crc32(image))
         await cnc.move((100.0, 0.0, 0.0), feed_mm_min=FEED, timeout_s=20)
         assert await settled(machine, 0) == 0.0  # staged is not active
     await machine.stop()
@@ -49,7 +50,7 @@ async def test_a_table_of_files_is_staged_until_the_control_starts_anew_and_then
     async with controller(machine) as cnc:
         now = await cnc.comp_status()
         assert now.boot_id != boot
-        assert (now.active_bank, now.bank_state, now.bank_crc[0]) == (0, (2, 0), crc32(image))
+        assert (now.active_bank, now.bank_state, now.bank_crc[0]) == (0, (BankState.SEALED, BankState.EMPTY), crc32(image))
         assert await cnc.read_bank(0) == image
         for x in (100.0, 5.0, 335.0, 600.0, 0.0):
             await cnc.move((x, 0.0, 0.0), feed_mm_min=FEED, timeout_s=20)
@@ -70,7 +71,7 @@ async def test_a_table_of_files_is_staged_until_the_control_starts_anew_and_then
         assert (await cnc.comp_status()).active_bank == 0
         # Given up: what is written anew is staged no longer.
         await cnc.write_bank(1, encode(nine(2)))
-        assert (await cnc.comp_status()).bank_state == (2, 1)
+        assert (await cnc.comp_status()).bank_state == (BankState.SEALED, BankState.WRITING)
     assert (machine.run / "tables").resolve().name == f"set-{crc32(image):08x}"
 
 
@@ -89,6 +90,6 @@ async def test_what_the_control_cannot_reproduce_is_not_sealed(machine):
         with pytest.raises(Refused, match="valid image"):
             await push(cnc, encode(swapped))
         status = await cnc.comp_status()
-        assert (status.active_bank, status.bank_state) == (0, (2, 1))
+        assert (status.active_bank, status.bank_state) == (0, (BankState.SEALED, BankState.WRITING))
         await cnc.release(OWNER)
         await until(cnc, lambda s: not s.compensation_on)

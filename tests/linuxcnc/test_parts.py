@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from abbe.drivers.cnc.tables import TableImage, crc32, decode, encode
+from abbe.drivers.tables import TableImage, crc32, decode, encode
 from tests.linuxcnc.instance import DEPLOY
 
 

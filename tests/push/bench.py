@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from abbe.drivers.cnc.tables import encode
+from abbe.drivers.tables import encode
 from abbe.service.tables.nine_tables import table_image
 from tests.patience import within
 from tests.push.pushing_child import tables

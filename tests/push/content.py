@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.cnc.tables import NO_CORRECTION, TableImage, encode
+from abbe.drivers.tables import NO_CORRECTION, TableImage, encode
 from abbe.models.compensation.tables import NineTables
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass, field
 
-EMPTY, WRITING, SEALED, STAGED = 0, 1, 2, 3
+from abbe.drivers.api import BankState
+
+EMPTY, WRITING, SEALED, STAGED = BankState.EMPTY, BankState.WRITING, BankState.SEALED, BankState.LAID_ASIDE
 OK, BAD, INTERLOCK, CRC, GEN, ACTIVE, IMAGE, LEASED, RESTART = range(9)
 SEAL, ACTIVATE, LEASE, RELEASE = 1, 2, 3, 4
 
@@ -30,7 +32,7 @@ class Controller:
 
     banks: list[bytes]
     factory: bytes
-    states: list[int] = field(default_factory=lambda: [SEALED, EMPTY])
+    states: list[BankState] = field(default_factory=lambda: [SEALED, EMPTY])
     crc: list[int] = field(default_factory=lambda: [0, 0])
     active: int = 0
     gen: int = 1

@@ -14,7 +14,7 @@ NAMES = (
     "machine", "execute", "semantic_digest",
 )  # fmt: skip
 """In the order of their imports."""
-OUTSIDE = {"second_decoder": "drivers/cnc/second_decoder.py", "codec": "service/tables/nine_tables.py"}
+OUTSIDE = {"second_decoder": "drivers/second_decoder.py", "codec": "service/tables/nine_tables.py"}
 _counter = itertools.count()
 
 Edits = tuple[tuple[str, str, str], ...]
@@ -39,9 +39,7 @@ def edited(edits: Edits) -> SimpleNamespace:
     made = {}
     for name in ("second_decoder", *NAMES, "codec"):
         text = (
-            sources[name]
-            .replace("abbe.service.push.", f"{package}.")
-            .replace("abbe.drivers.cnc.second_decoder", f"{package}.second_decoder")
+            sources[name].replace("abbe.service.push.", f"{package}.").replace("abbe.drivers.second_decoder", f"{package}.second_decoder")
         )
         module = ModuleType(f"{package}.{name}")
         sys.modules[f"{package}.{name}"] = module

@@ -46,7 +46,7 @@ MUTANTS: dict[str, Edits] = {
     "approval without the base": (("approval", 'known["image"], known["base_image"], ', 'known["image"], '),),
     "approval never ends": (("machine", "truth.now_s >= known.approved_until_s", "False"),),
     "way back without the old table": (
-        ("back", 'if truth.states[other] == SEALED and truth.crc[other] == f["base_crc"]:', "if True:"),
+        ("back", 'if truth.states[other] is BankState.SEALED and truth.crc[other] == f["base_crc"]:', "if True:"),
         ("back", "if step is not None and known.image == base:", "if step is not None:"),
     ),
     "late command not shut out": (("machine", "if not known.fenced:\n        return Operation(OperationKind.RELEASE", "if False:\n        return Operation(OperationKind.RELEASE"),),

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.cnc.tables import encode
 from abbe.drivers.registry import open_controller
+from abbe.drivers.tables import encode
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError

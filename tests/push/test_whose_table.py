@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.drivers.cnc.tables import crc32
+from abbe.drivers.tables import crc32
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable

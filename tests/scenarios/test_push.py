@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.drivers.cnc.tables import crc32, encode
 from abbe.drivers.errors import LinkDown
+from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.service.campaigns.measure import measure
 from abbe.service.compensation import pushing
@@ -70,11 +70,11 @@ class Noisy:
     def __getattr__(self, name):
         return getattr(self._real, name)
 
-    async def write_part(self, bank: int, first: int, data: bytes) -> None:
+    async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None:
         damaged = bytearray(data)
         if first == 100:
             damaged[0] ^= 0x04
-        await self._real.write_part(bank, first, bytes(damaged))
+        await self._real.write_bank(bank, bytes(damaged), first=first)
 
 
 class CutAfterActivate:

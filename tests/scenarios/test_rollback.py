@@ -14,7 +14,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from abbe.drivers.cnc.tables import crc32, encode
+from abbe.drivers.tables import crc32, encode
 from abbe.service.cli import run
 from abbe.service.compensation import rollback as workflow
 from abbe.service.compensation.recover import recover

@@ -14,8 +14,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from abbe.drivers.cnc.tables import crc32, encode
 from abbe.drivers.registry import open_controller
+from abbe.drivers.tables import crc32, encode
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.tables.nine_tables import table_image
 from tests.push.pushing_child import tables
@@ -56,7 +56,7 @@ async def put_in_force(url: str) -> None:
         bank, owner, image = 1 - now.active_bank, 77, encode(table_image(tables(40), 100, 9))
         await controller.lease(owner, 60_000)
         for first in range(0, len(image) // 2, 100):
-            await controller.write_part(bank, first, image[2 * first : 2 * first + 200])
+            await controller.write_bank(bank, image[2 * first : 2 * first + 200], first=first)
         await controller.seal(bank, owner)
         now = await controller.comp_status()
         await controller.activate(bank, expect_crc=crc32(image), expect_gen=now.gen, owner=owner)

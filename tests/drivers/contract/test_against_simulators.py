@@ -13,15 +13,15 @@ from itertools import pairwise
 
 import pytest
 
-from abbe.drivers.api import Condition
+from abbe.drivers import second_decoder, tables
+from abbe.drivers.api import BankState, Condition
 from abbe.drivers.ballbar.driver import BarCounters, SerialBallBar
-from abbe.drivers.cnc import second_decoder, tables
 from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.cnc.tables import TableImage
 from abbe.drivers.errors import DeviceFault, LinkDown, Rebooted, Refused
 from abbe.drivers.fixture.driver import RemoteFixture
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.registry import open_ballbar, open_controller, open_fixture, open_laser
+from abbe.drivers.tables import TableImage
 from tests.patience import within
 
 OWNER = 0xABBE0001
@@ -251,7 +251,7 @@ async def test_bank_write_read_seal_activate(world):
     assert second_decoder.read_axis_tables(read_back)["X", "Y"][1] == (100.0, 0.0005)
     await cnc.seal(1, OWNER)
     sealed = await cnc.comp_status()
-    assert sealed.bank_state == (2, 2)
+    assert sealed.bank_state == (BankState.SEALED, BankState.SEALED)
     assert sealed.bank_crc[1] == tables.crc32(image) == second_decoder.plain_crc32(image)
     assert sealed.lease_owner == OWNER
     with pytest.raises(Refused, match="CRC"):

@@ -7,6 +7,7 @@ import zlib
 
 import pytest
 
+from abbe.drivers.api import BankState
 from abbe.drivers.cnc import banks as banks_module
 from abbe.drivers.errors import BadFrame, DeviceFault, LinkDown, Rebooted, Refused, ReplyTimeout
 from tests.drivers.contract.cnc_peer import hang_up, honest, silent
@@ -101,7 +102,7 @@ async def test_comp_status(controller, cnc):
     cnc.peer.put(208, "HIIHHHHII", 1, 0x11112222, 0x33334444, 2, 1, 5, 0, 77, 9000)
     status = await controller.comp_status()
     assert (status.boot_id, status.gen, status.active_bank) == (100, 1, 1)
-    assert (status.bank_crc, status.bank_state) == ((0x11112222, 0x33334444), (2, 1))
+    assert (status.bank_crc, status.bank_state) == ((0x11112222, 0x33334444), (BankState.SEALED, BankState.WRITING))
     assert (status.lease_owner, status.lease_left_ms) == (77, 9000)
 
 

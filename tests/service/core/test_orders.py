@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from abbe.drivers.cnc.tables import crc32
+from abbe.drivers.tables import crc32
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, RollBack, StartJob
 from abbe.service.compensation.ordered_rollback import BackOrder

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from abbe.drivers.cnc.tables import crc32, encode
+from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.models.discovery.changed import comparison as changed
 from abbe.service.campaign_data.campaign_folder import from_store, keep

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from abbe.drivers.cnc.tables import TableImage, crc32, encode
+from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.service.cli import run
 from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.push.entries import GENESIS, follow

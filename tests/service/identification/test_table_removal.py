@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from abbe.drivers.cnc.tables import crc32, encode
+from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.models.solvers.in_force import AppliedTables
 from abbe.service import cli

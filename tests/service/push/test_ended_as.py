@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.drivers.cnc.tables import crc32
+from abbe.drivers.tables import crc32
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.rollback import known_images, table_after
 from abbe.service.errors import TableRefused

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from abbe.drivers.cnc.tables import encode
+from abbe.drivers.tables import encode
 from abbe.models.compensation.tables import NineTables, quantise
 from abbe.service.errors import TableRefused
 from abbe.service.push.limits import PushLimits

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from abbe.drivers.cnc.tables import crc32
+from abbe.drivers.tables import crc32
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.domain.schedule import Schedule

@@ -14,7 +14,7 @@ from typing import Any
 from fastapi import FastAPI
 
 from abbe.drivers.api import BarSample, CompStatus, TableFormat
-from abbe.drivers.cnc.tables import TableImage, crc32, encode
+from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.service.audit.book import AuditBook
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.compensation.proposal_doc import digest_of_doc, doc_of, load

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from abbe.drivers.api import Point
 
-MAP_VERSION = 1
-"""Of the register map (docs/protocols/cnc.md); what is signed for a controller names it."""
+FORMAT_VERSION = 1
+"""What is signed for a controller names it."""
 MAGIC = 0xABBE
 FORMAT = 1
 NO_CORRECTION, NINE_TABLES, GRID_3D = 0, 1, 2
