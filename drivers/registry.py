@@ -1,6 +1,15 @@
-"""From a device URL to a driver that is connected and has proven that it talks to the right kind of device."""
+"""From a device URL to a driver that is connected and has proven that it talks to the right kind of device.
+
+A package adds another protocol by an entry point named as its URL scheme::
+
+    [project.entry-points."abbe.cnc"]
+    "acme+tcp" = "acme_driver:open_controller"      # async def open_controller(url: str) -> abbe.drivers.api.Controller
+"""
 
 from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+from typing import cast
 
 from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture
 from abbe.drivers.ballbar.driver import SerialBallBar
@@ -11,14 +20,14 @@ from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.links.modbus_line import Canary
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.serial_link import ByteLink
-from abbe.drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
+from abbe.drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, installed, parse_url
 
 HEARTBEAT_S = 1.0
 """A controller or laser that nobody asks anything is asked for its canary so often, so that a lost one is known within 3 s."""
 
 
 async def open_ballbar(url: str) -> BallBar:
-    """Open the ball-bar behind a ``serial://`` or ``socket://`` URL.
+    """Open the ball-bar behind a ``serial://`` or ``socket://`` URL, or one of an installed driver.
 
     Raises
     ------
@@ -27,6 +36,8 @@ async def open_ballbar(url: str) -> BallBar:
     LinkDown, ReplyTimeout
         Nobody there, or no answer.
     """
+    if (entry := installed("ballbar", url)) is not None:
+        return cast(BallBar, await _opened(entry, url))
     parsed = parse_url(url)
     if not isinstance(parsed, SerialUrl | SocketUrl):
         raise _wrong_scheme(url, "a ball-bar", "serial:// or socket://")
@@ -36,7 +47,7 @@ async def open_ballbar(url: str) -> BallBar:
 
 
 async def open_laser(url: str) -> DisplacementMeter:
-    """Open the laser behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL.
+    """Open the laser behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, or one of an installed driver.
 
     Raises
     ------
@@ -47,13 +58,15 @@ async def open_laser(url: str) -> DisplacementMeter:
     LinkDown, ReplyTimeout, BadFrame
         The wire.
     """
+    if (entry := installed("laser", url)) is not None:
+        return cast(DisplacementMeter, await _opened(entry, url))
     laser = ModbusLaser(await _modbus(url, "a laser"))
     await _identify_or_close(laser)
     return laser
 
 
 async def open_controller(url: str, *, commissioned: str = "") -> Controller:
-    """Open the controller behind a ``modbus+tcp://`` (or ``modbus+rtu://``) URL.
+    """Open the controller behind a ``modbus+tcp://`` (or ``modbus+rtu://``) URL, or one of an installed driver.
 
     Parameters
     ----------
@@ -71,12 +84,15 @@ async def open_controller(url: str, *, commissioned: str = "") -> Controller:
     LinkDown, ReplyTimeout, BadFrame
         The wire.
     """
-    controller = ModbusController(await _modbus(url, "a controller"))
+    if (entry := installed("cnc", url)) is not None:
+        controller = cast(Controller, await _opened(entry, url))
+    else:
+        controller = ModbusController(await _modbus(url, "a controller"))
     info = await _identify_or_close(controller)
     if commissioned and info.firmware != commissioned:
         await controller.close()
         detail = f"its register map is not the commissioned one: {info.firmware} instead of {commissioned}"
-        raise WrongDevice(controller.name, "identify", detail, "another firmware or another machine: commission it anew")
+        raise WrongDevice(ascii(url), "identify", detail, "another firmware or another machine: commission it anew")
     return controller
 
 
@@ -105,6 +121,16 @@ async def open_fixture(url: str, ask: Ask) -> Fixture:
     fixture = RemoteFixture(parsed)
     await fixture.open()
     return fixture
+
+
+async def _opened(entry: EntryPoint, url: str) -> object:
+    """Let an installed package's driver open its device."""
+    try:
+        opener = entry.load()
+    except Exception as fault:  # whatever a stranger's module does on import
+        detail = f"the driver {entry.value} cannot be loaded: {type(fault).__name__}: {fault}"
+        raise BadUrl(ascii(url), "open device", detail, "repair or remove the package that offers it") from fault
+    return await opener(url)
 
 
 async def _modbus(url: str, what: str) -> ModbusLink:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from abbe.drivers.errors import DriverError
-from abbe.drivers.links import urls
+from abbe.drivers.links.urls import is_url_of
 from abbe.service.channel.messages import PAGE_MEMORY_MB
 from abbe.service.config_timetable import AlarmSection, ScheduleEntry, Section, WindowEntry
 from abbe.service.errors import AbbeError
@@ -72,27 +72,19 @@ class Devices(Section):
 
     @model_validator(mode="after")
     def _urls(self) -> Self:
-        for kind, allowed in _SCHEMES.items():
+        for kind in type(self).model_fields:
             text = getattr(self, kind)
             if text is not None:
-                _check_device(kind, text, allowed)
+                _check_device(kind, text)
         return self
 
 
-_SCHEMES: dict[str, tuple[type[object], ...]] = {
-    "ballbar": (urls.SerialUrl, urls.SocketUrl),
-    "laser": (urls.ModbusTcpUrl, urls.ModbusRtuUrl),
-    "cnc": (urls.ModbusTcpUrl, urls.ModbusRtuUrl),
-    "fixture": (urls.FixtureTcpUrl, urls.FixtureConsoleUrl),
-}
-
-
-def _check_device(kind: str, text: str, allowed: tuple[type[object], ...]) -> None:
+def _check_device(kind: str, text: str) -> None:
     try:
-        parsed = urls.parse_url(text)
+        right = is_url_of(kind, text)
     except DriverError as err:
         raise ValueError(f"{kind} = {text!r}: {err.detail}" + (f" ({err.remedy})" if err.remedy else "")) from None
-    if not isinstance(parsed, allowed):
+    if not right:
         hint = Devices.model_fields[kind].description
         raise ValueError(f"{kind} = {text!r} is not an address of this kind of device, expected {hint}")
 

@@ -9,12 +9,15 @@
 ``fixture+tcp://10.0.0.7:9000``                         a remote fixture (docs/protocols/fixture.md)
 ``fixture+console:``                                    the operator at the console
 ======================================================  =======================================================
+
+Installed packages add devices with other protocols and other schemes: `installed`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
 from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
 
 from abbe.drivers.errors import BadUrl
@@ -134,6 +137,39 @@ def parse_url(text: str) -> DeviceUrl:
     if parts.fragment or parts.username is not None or parts.password is not None:
         raise _bad(text, "user names and #fragments mean nothing here")
     return builder(text, parts)
+
+
+_ROLES: Mapping[str, tuple[type[DeviceUrl], ...]] = {
+    "ballbar": (SerialUrl, SocketUrl),
+    "laser": (ModbusTcpUrl, ModbusRtuUrl),
+    "cnc": (ModbusTcpUrl, ModbusRtuUrl),
+    "fixture": (FixtureTcpUrl, FixtureConsoleUrl),
+}
+
+
+def is_url_of(role: str, text: str) -> bool:
+    """Whether a URL leads to a device of this role: ballbar, laser, cnc or fixture.
+
+    Of a URL with an installed driver's scheme the rest is checked by that driver, when it opens the device.
+
+    Raises
+    ------
+    BadUrl
+        As `parse_url`.
+    """
+    return installed(role, text) is not None or isinstance(parse_url(text), _ROLES[role])
+
+
+def installed(role: str, text: str) -> EntryPoint | None:
+    """The driver that an installed package offers for a URL; None: none does, or the scheme is one of ours.
+
+    It is an entry point of the group ``abbe.cnc``, ``abbe.laser`` or ``abbe.ballbar``, its name is the scheme, its object a coroutine
+    function that opens and identifies the device behind such a URL (`abbe.drivers.api`). Nothing is loaded here.
+    """
+    scheme = text.partition(":")[0].lower()
+    if scheme in _BUILDERS:
+        return None
+    return next(iter(entry_points(group=f"abbe.{role}", name=scheme)), None)
 
 
 def _serial(text: str, parts: SplitResult) -> SerialUrl:
