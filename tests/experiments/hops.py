@@ -1,7 +1,7 @@
 """How many product files a command enters: one hop less is one file less to read for whoever follows it.
 
     python -m tests.experiments.hops quick-check            # against a simulated machine
-    python -m tests.experiments.hops solve [FOLDER]         # a campaign folder, else one that is written for this
+    python -m tests.experiments.hops solve FOLDER           # a campaign folder
 
 A file is entered when a function of it is called after it was loaded (module and class bodies do not count). Prints each file with its
 calls, then the sum; ``--edges`` also prints which file calls into which.
@@ -141,15 +141,9 @@ def quick_check() -> Hops:
         return command("measure", str(machine), "--recipe", "quick-check", "--name", "hops")
 
 
-def solve(given: str | None = None) -> Hops:
-    """`abbe solve FOLDER`; without a folder one of the campaign of an identification is written first."""
-    with tempfile.TemporaryDirectory() as folder:
-        return command("solve", given or str(campaign(Path(folder))), "--json")
-
-
-def campaign(folder: Path) -> Path:
-    """A campaign folder with the plan of an identification of a machine that has errors."""
-    raise SystemExit("name a folder")
+def solve(folder: str) -> Hops:
+    """`abbe solve FOLDER`."""
+    return command("solve", folder, "--json")
 
 
 PATHS: dict[str, Callable[..., Hops]] = {"quick-check": quick_check, "solve": solve}
@@ -159,7 +153,7 @@ def main() -> None:
     """Count one command and print."""
     parser = argparse.ArgumentParser(prog="python -m tests.experiments.hops", description=__doc__)
     parser.add_argument("path", choices=PATHS)
-    parser.add_argument("words", nargs="*", help="of solve: the campaign folder")
+    parser.add_argument("words", nargs="*", help="what the command needs: the campaign folder")
     parser.add_argument("--edges", action="store_true")
     options = parser.parse_args()
     hops = PATHS[options.path](*options.words)
