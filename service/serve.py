@@ -25,6 +25,7 @@ from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.campaigns.builtin_recipes import parted
 from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
+from abbe.service.core.board import Board
 from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Ground, Hands, Orders, full_campaigns
@@ -42,6 +43,8 @@ from abbe.service.jobs.at_start import push_is_open
 from abbe.service.mqtt.outbox import StoreOutbox
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.plant.gather import Gatherer
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
 from abbe.service.scheduler.heartbeat import Heartbeat
 from abbe.service.scheduler.job import CheckJob
@@ -54,9 +57,7 @@ from abbe.service.storage.private import database_seen_by_others
 from abbe.service.tables.push_outcome import open_push
 from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.listening import bind, check_certificate, check_exposure
-from abbe.service.web.view import View
 
 if TYPE_CHECKING:
     from abbe.service.plant.opcua.server import OpcUaServer
@@ -152,7 +153,8 @@ class Service:
         from abbe.service.plant.opcua.server import OpcUaServer  # an extra, and slow to import
 
         broker = "" if setup.broker is None else str(setup.broker)
-        view = View(setup.machine, version("abbe"), self.board, self._store, self._scheduler.next_due, broker, self._clock, setup.control)
+        reader = Reader(self._store, setup.machine, self._clock, setup.control)
+        view = StatusReader(reader, version("abbe"), self.board, self._scheduler.next_due, broker)
         return OpcUaServer(setup.opcua, Gatherer(view.status, self._store, setup.control), self._clock, setup.machine, version("abbe"))
 
     def _make_alarms(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmManager | None:

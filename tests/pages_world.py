@@ -26,6 +26,7 @@ from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.candidates import Promise, candidate_of
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.schedule import Schedule
@@ -33,6 +34,8 @@ from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler import record
@@ -45,13 +48,11 @@ from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.core_link.logtail import LogTail
 from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.process.serving import make_server
-from abbe.service.web.view import View
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.scenarios.campaign_files import measured
 from tests.service.discovery.discovery_bench import Search, write_case
@@ -238,10 +239,10 @@ def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
         door = Authenticator(store, people, AuditBook(store, filled.url), rate_hz=1e6, burst=1e6)
         board = Board(filled.devices, clock)
         soon = datetime.now(UTC) + timedelta(hours=30)
-        view = View(filled.machine, "0.1.0", board, store, lambda: [(s, soon) for s in filled.schedules], "", clock)
+        view = StatusReader(Reader(store, filled.machine, clock), "0.1.0", board, lambda: [(s, soon) for s in filled.schedules], "")
         tail = LogTail()
         rules = Rules({"circularity": 20.0}, {"ballbar": (soon + timedelta(days=90)).date(), "laser": date(2026, 1, 1)})
-        sources = Sources(store, filled.machine, clock, filled.schedules, lambda: board.devices, rules, tail)
+        sources = Sources(reader=view.reader, schedules=filled.schedules, devices=lambda: board.devices, rules=rules, tail=tail)
         listening = bind("127.0.0.1", 0)
         server = make_server(create_app(view, version="0.1.0", door=door, api=sources))
         thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listening])))

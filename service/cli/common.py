@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import os
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from abbe.service.domain.measured import CampaignRecord, RunRecord
+    from abbe.service.queries.reader import Reader
     from abbe.service.storage.store import Store
 
 ENVIRONMENT = "ABBE_DB"
@@ -94,6 +96,25 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
     ):
         raise StoreError(f"there is no database {parsed.database}", f"give --db URL, --machine FILE or set {ENVIRONMENT}")
     return Store.open(url)
+
+
+@contextmanager
+def reader_of(machine: Path) -> Iterator[Reader]:
+    """The read model of a machine file: its database and its control. A missing database is an error, and none is made."""
+    from abbe.service.config import load_machine
+    from abbe.service.devices.urls import control_of
+
+    loaded = load_machine(machine)
+    with open_store(loaded.database_url) as store:
+        yield reader(store, loaded.machine.name, control_of(loaded.machine.devices.cnc))
+
+
+def reader(store: Store, machine: str = "", control: str = "") -> Reader:
+    """The read model of an open database, now."""
+    from abbe.service.clock import SystemClock
+    from abbe.service.queries.reader import Reader
+
+    return Reader(store, machine, SystemClock(), control)
 
 
 def warn_of_readers(url: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -103,19 +102,6 @@ def largest(found: TableDifference) -> str:
     size, expanded = c.change_mm[k] * 1e3, 2e3 * c.u_mm[k]
     where = f"in the table of {c.corrected} over {c.moved} at {c.position_mm[k]:g} mm"
     return f"largest change: {size:+.2f} µm (U = {expanded:.2f} µm, k = 2) {where}"
-
-
-def diff_json(found: TableDifference) -> dict[str, Any]:
-    """For programs: every number of every curve."""
-    tables = [
-        {
-            "table": f"{c.corrected} over {c.moved}", "moved": c.moved, "corrected": c.corrected, "position_mm": c.position_mm.tolist(),
-            "old_um": (c.old_mm * 1e3).tolist(), "new_um": (c.new_mm * 1e3).tolist(), "u_um": (c.u_mm * 1e3).tolist(),
-            "largest_change_um": float(c.change_mm[c.worst] * 1e3), "at_mm": float(c.position_mm[c.worst]),
-        }
-        for c in found.curves
-    ]  # fmt: skip
-    return {"new": found.new, "old": found.old, "tables": tables}
 
 
 def diff_html(found: TableDifference, proposed: Proposed) -> str:

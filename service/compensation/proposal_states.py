@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from abbe.service.compensation.proposal_checks import valid_approval
-from abbe.service.compensation.proposal_doc import Proposed
+from abbe.service.clock import Clock
+from abbe.service.compensation.proposal_checks import approve, reject, valid_approval
+from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.errors import TableRefused
 from abbe.service.push.book import read_entries
@@ -96,3 +97,16 @@ def check_waiting(store: Store, number: int, proposed: Proposed, now_s: float) -
     now = proposal_status(store, number, proposed, now_s)
     if now.word not in ("proposed", "approved", "refused"):  # what speaks against a refused one is told by `approve`
         raise TableRefused(f"proposal {number} is {now.word}: {now.text}", "propose again")
+
+
+def approve_waiting(store: Store, number: int, name: str, hours: float, clock: Clock, account: str | None = None) -> ProposalApproval:
+    """Approve a proposal that still waits for a push; parameters and errors as of `approve`, and TableRefused where it does not wait."""
+    proposed = load(store, number)
+    check_waiting(store, number, proposed, clock.utc().timestamp())
+    return approve(store, number, proposed, name, hours, clock, account)
+
+
+def reject_waiting(store: Store, number: int, name: str, reason: str, clock: Clock, account: str | None = None) -> ProposalRejection:
+    """Reject a proposal that still waits for a push; parameters and errors as of `reject`, and TableRefused where it does not wait."""
+    check_waiting(store, number, load(store, number), clock.utc().timestamp())
+    return reject(store, number, name, reason, account)

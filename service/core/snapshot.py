@@ -11,11 +11,11 @@ from pathlib import Path
 
 from abbe.service.channel.messages import Snapshot
 from abbe.service.clock import Clock
+from abbe.service.core.board import Board
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.domain.bounds import TEXT, WORD
 from abbe.service.domain.running_check import RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
-from abbe.service.web.core_link.board import Board
 
 AGAIN = timedelta(minutes=1)
 """The timetable is looked at no more often than this, unless a slot has come: it changes only then."""

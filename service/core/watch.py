@@ -8,13 +8,13 @@ from contextlib import suppress
 from datetime import datetime
 
 from abbe.service.clock import Clock
+from abbe.service.core.board import Board
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.events import Progress
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.scheduler.ports import Doc
 from abbe.service.verification.verified_by import VerifiedBy
-from abbe.service.web.core_link.board import Board
 
 LOOK_S = 5.0
 

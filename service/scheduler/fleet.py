@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
@@ -117,10 +116,10 @@ def fleet(store: ServiceStore, now: datetime) -> list[MachineLine]:
 def _line(store: ServiceStore, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
     stand = _stand(store, name, said, checks, now)
     found = trends(checks, stand.verified.since)
-    soonest = min((one for one in found if not one.trend.forecast.reason), key=lambda one: one.trend.forecast.days, default=None)
+    soonest = min((one for one in found if one.days_until_limit is not None), key=lambda one: one.days_until_limit or 0.0, default=None)
     return MachineLine(
         **{one.name: getattr(stand, one.name) for one in fields(stand)},
-        drifting=tuple(one.figure for one in found if one.trend.state == "drifting"),
+        drifting=tuple(one.figure for one in found if one.state == "drifting"),
         limit_figure="" if soonest is None else soonest.figure,
         limit_days=None if soonest is None else _days(soonest),
     )
@@ -165,9 +164,10 @@ def figures_of(doc: Mapping[str, Any]) -> tuple[FleetFigure, ...]:
     return tuple(FleetFigure(name, values[name], expanded.get(name), limit) for name, limit in judged.items())
 
 
-def _days(one: FigureTrend) -> tuple[float, float, float]:
-    ahead = one.trend.forecast
-    return (ahead.days, ahead.low, ahead.high)
+def _days(one: FigureTrend) -> tuple[float, float, float] | None:
+    if one.days_until_limit is None or one.days_until_limit_95 is None:
+        return None
+    return (one.days_until_limit, *one.days_until_limit_95)
 
 
 def row(line: MachineLine) -> tuple[str, ...]:
@@ -201,7 +201,7 @@ def as_doc(lines: Sequence[MachineLine]) -> dict[str, Any]:
 
 
 def _doc(one: MachineLine) -> dict[str, Any]:
-    days = None if one.limit_days is None else [v if math.isfinite(v) else None for v in one.limit_days]
+    days = one.limit_days
     return {
         "machine": one.machine,
         "state": one.state,

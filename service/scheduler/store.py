@@ -89,11 +89,6 @@ class ServiceStore(Store):
         query = select(slots.c.state, func.count()).where(_timetable_of(machine)).group_by(slots.c.state)
         return {str(state): int(count) for state, count in self._read(lambda connection: connection.execute(query).all())}
 
-    def waiting_messages(self) -> int:
-        """Return how many messages wait for the broker."""
-        query = select(func.count()).select_from(outbox).where(outbox.c.sent_utc.is_(None))
-        return int(self._read(lambda connection: connection.execute(query).scalar_one()))
-
 
 def _timetable_of(machine: str) -> ColumnElement[bool]:
     """Slots of a machine. Not by LIKE: SQLite's takes mill-7 and MILL-7 for the same machine."""

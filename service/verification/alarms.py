@@ -8,7 +8,7 @@ from datetime import datetime
 
 import numpy as np
 
-from abbe.models.trend import MIN_CHECKS, MOST_CHECKS, Forecast, jumps, mean_of
+from abbe.models.trend import MIN_CHECKS, MOST_CHECKS, jumps, mean_of
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.service_records import AlarmEntryRecord
@@ -17,7 +17,7 @@ from abbe.service.push.book import read_entries
 from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, Signal, after_check, folded, is_open
-from abbe.service.verification.trend_table import COVERAGE, FigureTrend, in_words, of_series, trends
+from abbe.service.verification.trend_table import COVERAGE, FigureTrend, of_series, trends
 from abbe.service.verification.verify import judge
 
 # Which signals a machine's checks give: above a limit, a jump, a drift, few days until the limit. From stored verifications alone.
@@ -59,26 +59,22 @@ def found_in(records: Sequence[VerificationRecord], terms: AlarmTerms) -> FiredR
 def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> Iterator[Signal]:
     if one.limit is None or records[0].doc["values"].get(one.figure) is None:
         return
-    limit, value, u = one.limit, one.latest, one.expanded / COVERAGE
+    limit, value, u = one.limit, one.latest, one.expanded_uncertainty / COVERAGE
     name, unit = NAMES.get(one.figure, one.figure), " µm" if one.figure.endswith("_um") else ""
-    said = f"{name} {value:.1f} ± {one.expanded:.1f}{unit} (U, k = 2)"
+    said = f"{name} {value:.1f} ± {one.expanded_uncertainty:.1f}{unit} (U, k = 2)"
     if judge(value, u, limit) == "fail":
-        yield Signal(one.figure, "limit", value, one.expanded, limit, f"{said} is above its limit of {limit:g}{unit}")
+        yield Signal(one.figure, "limit", value, one.expanded_uncertainty, limit, f"{said} is above its limit of {limit:g}{unit}")
     before = _before(one, records, terms)
     if before is not None and jumps(value - before[0], float(np.hypot(u, before[1])), limit):
         expanded = COVERAGE * float(np.hypot(u, before[1]))
         text = f"{said} is {value - before[0]:+.1f} ± {expanded:.1f}{unit} from the checks before"
-        yield Signal(one.figure, "jump", value, one.expanded, limit, text, *before)
-    ahead = one.trend.forecast
-    if one.trend.direction > 0:
+        yield Signal(one.figure, "jump", value, one.expanded_uncertainty, limit, text, *before)
+    if one.direction > 0:
         since = "" if one.since_utc is None else f" since {one.since_utc:%Y-%m-%d %H:%M} UTC"
-        yield Signal(one.figure, "drift", value, one.expanded, limit, f"{said} drifts up{since}")
-    if terms.warn_days and not ahead.reason and ahead.low < terms.warn_days:
-        yield Signal(one.figure, "days", value, one.expanded, limit, _days_text(name, limit, unit, ahead))
-
-
-def _days_text(name: str, limit: float, unit: str, ahead: Forecast) -> str:
-    return f"{name} reaches its limit of {limit:g}{unit} in {in_words(ahead)} days (95 %)"
+        yield Signal(one.figure, "drift", value, one.expanded_uncertainty, limit, f"{said} drifts up{since}")
+    if terms.warn_days and one.days_until_limit_95 is not None and one.days_until_limit_95[0] < terms.warn_days:
+        text = f"{name} reaches its limit of {limit:g}{unit} in {one.ahead} days (95 %)"
+        yield Signal(one.figure, "days", value, one.expanded_uncertainty, limit, text)
 
 
 def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.models.trend import CUSUM_H, CUSUM_K, Forecast, Trend, average_run_length, trend
+from abbe.models.trend import CUSUM_H, CUSUM_K, average_run_length, trend
 from abbe.service.domain.results import VerificationRecord
 
 DAY_S = 86400.0
@@ -20,18 +20,40 @@ COVERAGE = 2.0
 HEADINGS = ("figure", "checks", "latest", "U (k = 2)", "limit", "state", "since (UTC)", "change a day", "days until limit (95 %)")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FigureTrend:
-    """One figure of a machine over its checks. Units as in the figure's name; ``since_utc``: first check of a drift."""
+    """Trend of one figure of a machine over its checks, in the figure's unit. Uncertainties have k = 2; what is not known is None.
+
+    ``state``, ``direction``: of the control chart (`abbe.models.trend.Trend`), whose latest values are the last four fields; ``since_utc``:
+    first check of a drift; ``found_utc``: the check at which it was certain; ``reason``: why the days until the limit are not known.
+    """
 
     figure: str
     checks: int
     latest: float
-    expanded: float
+    expanded_uncertainty: float
     limit: float | None
+    state: str
+    direction: int
     since_utc: datetime | None
     found_utc: datetime | None
-    trend: Trend
+    change_per_day: float | None
+    change_per_day_u: float | None
+    days_until_limit: float | None
+    days_until_limit_95: tuple[float, float] | None
+    reason: str
+    cusum_high: float | None
+    cusum_low: float | None
+    ewma: float | None
+    ewma_limit: float | None
+
+    @property
+    def ahead(self) -> str:
+        """The days until the limit with their interval, or why they are not known."""
+        if self.days_until_limit is None or self.days_until_limit_95 is None:
+            return self.reason
+        low, high = self.days_until_limit_95
+        return f"{_days(self.days_until_limit)} ({_days(low)} to {_days(high)})"
 
 
 def trends(records: Sequence[VerificationRecord], after_utc: datetime | None = None) -> list[FigureTrend]:
@@ -84,57 +106,49 @@ def _of_figure(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> Fig
     days = np.array([(at - rows[0][0]).total_seconds() / DAY_S for at, _, _ in rows])
     found = trend(days, np.array([v for _, v, _ in rows]), np.array([u / COVERAGE for _, _, u in rows]), limit)
     since, certain = (None if k is None else rows[k][0] for k in (found.since, found.found))
-    return FigureTrend(key, len(rows), rows[-1][1], rows[-1][2], limit, since, certain, found)
+    ahead = found.forecast
+    return FigureTrend(
+        figure=key,
+        checks=len(rows),
+        latest=rows[-1][1],
+        expanded_uncertainty=rows[-1][2],
+        limit=limit,
+        state=found.state,
+        direction=found.direction,
+        since_utc=since,
+        found_utc=certain,
+        change_per_day=_known(ahead.slope),
+        change_per_day_u=_known(ahead.slope_u),
+        days_until_limit=_known(ahead.days),
+        days_until_limit_95=None if ahead.reason else (float(ahead.low), float(ahead.high)),
+        reason=ahead.reason,
+        cusum_high=_known(found.high[-1]),
+        cusum_low=_known(found.low[-1]),
+        ewma=_known(found.ewma[-1]),
+        ewma_limit=_known(found.ewma_limit[-1]),
+    )
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 def row(one: FigureTrend) -> tuple[str, ...]:
     """Return the cells of `HEADINGS`."""
-    state = one.trend.state if not one.trend.direction else f"{one.trend.state} {'up' if one.trend.direction > 0 else 'down'}"
-    ahead = one.trend.forecast
-    slope = "" if math.isnan(ahead.slope) else f"{ahead.slope:+.3g} ± {COVERAGE * ahead.slope_u:.2g}"
+    state = one.state if not one.direction else f"{one.state} {'up' if one.direction > 0 else 'down'}"
+    slope = ""
+    if one.change_per_day is not None and one.change_per_day_u is not None:
+        slope = f"{one.change_per_day:+.3g} ± {COVERAGE * one.change_per_day_u:.2g}"
     limit = "" if one.limit is None else f"{one.limit:g}"
     since = "" if one.since_utc is None else f"{one.since_utc:%Y-%m-%d %H:%M}"
-    return (one.figure, str(one.checks), f"{one.latest:.2f}", f"{one.expanded:.2f}", limit, state, since, slope, in_words(ahead))
-
-
-def in_words(ahead: Forecast) -> str:
-    """Return the days until the limit with their interval, or why they are not known."""
-    return ahead.reason or f"{_days(ahead.days)} ({_days(ahead.low)} to {_days(ahead.high)})"
+    figures = f"{one.latest:.2f}", f"{one.expanded_uncertainty:.2f}"
+    return (one.figure, str(one.checks), *figures, limit, state, since, slope, one.ahead)
 
 
 def _days(days: float) -> str:
     return f"{days:.1f}" if days < 10 else f"{days:.0f}"
 
 
-def as_doc(machine: str, found: Sequence[FigureTrend]) -> dict[str, Any]:
-    """Return everything as JSON value; what is not known is null, with its reason beside it."""
-    chart = {"cusum_k": CUSUM_K, "cusum_h": CUSUM_H, "checks_to_a_false_alarm": round(average_run_length())}
-    return {"schema": 1, "machine": machine, "chart": chart, "figures": [_figure_doc(one) for one in found]}
-
-
-def _figure_doc(one: FigureTrend) -> dict[str, Any]:
-    ahead = one.trend.forecast
-    return {
-        "figure": one.figure,
-        "checks": one.checks,
-        "latest": one.latest,
-        "expanded_uncertainty": one.expanded,
-        "limit": one.limit,
-        "state": one.trend.state,
-        "direction": one.trend.direction,
-        "since_utc": None if one.since_utc is None else one.since_utc.isoformat(),
-        "found_utc": None if one.found_utc is None else one.found_utc.isoformat(),
-        "change_per_day": _known(ahead.slope),
-        "change_per_day_u": _known(ahead.slope_u),
-        "days_until_limit": _known(ahead.days),
-        "days_until_limit_95": None if ahead.reason else [_known(ahead.low), _known(ahead.high)],
-        "reason": ahead.reason,
-        "cusum_high": _known(float(one.trend.high[-1])),
-        "cusum_low": _known(float(one.trend.low[-1])),
-        "ewma": _known(float(one.trend.ewma[-1])),
-        "ewma_limit": _known(float(one.trend.ewma_limit[-1])),
-    }
-
-
-def _known(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+def chart() -> dict[str, float]:
+    """Settings of the control chart, for programs that draw it."""
+    return {"cusum_k": CUSUM_K, "cusum_h": CUSUM_H, "checks_to_a_false_alarm": round(average_run_length())}

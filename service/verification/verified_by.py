@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, computed_field
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import VerificationRecord
@@ -46,7 +48,7 @@ _WORDS: dict[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class VerifiedBy:
-    """What is known of a machine with the table in force.
+    """Which measurement stands behind the table in force: every display shows this record.
 
     Parameters
     ----------
@@ -57,8 +59,8 @@ class VerifiedBy:
         ``never``, ``journal``: why it is unknown.
     number : int
         Of the check or of the push; 0 for none.
-    utc : str
-        When that was; empty for never.
+    utc : datetime or None
+        When that was; None for never.
     crc : int or None
         CRC-32 of the table in force by the push journal; None where there was no push, or nobody knows.
     since : datetime or None
@@ -70,8 +72,8 @@ class VerifiedBy:
     state: Word
     why: Why
     number: int = 0
-    utc: str = ""
-    crc: int | None = None
+    utc: datetime | None = None
+    crc: Annotated[int | None, Field(exclude=True)] = None
     since: datetime | None = None
     changes: tuple[datetime, ...] = ()
 
@@ -80,15 +82,22 @@ class VerifiedBy:
         """Whether a verdict of a check can be shown as that of the machine."""
         return self.why in ("check", "never")
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def text(self) -> str:
         """One line for people: ``unverified since the rollback of 2026-11-23 02:10 UTC (push 3)``."""
         return _WORDS[self.why].format(number=self.number, when=minute(self.utc))
 
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def table_crc(self) -> str | None:
+        """CRC-32 of the table in force, hexadecimal; None where it is not known."""
+        return None if self.crc is None else f"{self.crc:08X}"
+
     def as_doc(self) -> Doc:
-        """As JSON value."""
-        crc = None if self.crc is None else f"{self.crc:08X}"
-        return {"state": self.state, "why": self.why, "number": self.number, "utc": self.utc or None, "table_crc": crc, "text": self.text}
+        """As JSON value for messages: without the times of all changes."""
+        utc = None if self.utc is None else self.utc.isoformat()
+        return {"state": self.state, "why": self.why, "number": self.number, "utc": utc, "table_crc": self.table_crc, "text": self.text}
 
     def verdict(self, verdict: str) -> str:
         """The word to show for the last verdict: itself where it holds, else where the machine stands."""
@@ -100,9 +109,9 @@ def measure_now(machine_file: str = "MACHINE.toml") -> str:
     return f"abbe measure {machine_file} --recipe quick-check"
 
 
-def minute(utc: str) -> str:
-    """A moment to the minute, as lines for people have it."""
-    return f"{datetime.fromisoformat(utc):%Y-%m-%d %H:%M} UTC" if utc else ""
+def minute(utc: datetime | None) -> str:
+    """A moment to the minute, as lines for people have it; empty for none."""
+    return "" if utc is None else f"{utc:%Y-%m-%d %H:%M} UTC"
 
 
 def strange_table(attention: Sequence[str]) -> bool:
@@ -159,14 +168,14 @@ def of_journal(store: Store, entries: Sequence[JournalEntry], checks: Sequence[V
     changes = tuple(datetime.fromisoformat(e.utc) for e in changed)
     known: dict[str, Any] = {"crc": crc, "since": changes[-1] if changes else None, "changes": changes}
     if not settled:
-        return VerifiedBy("unverified", "open", entries[-1].push, entries[-1].utc, **known)
+        return VerifiedBy("unverified", "open", entries[-1].push, datetime.fromisoformat(entries[-1].utc), **known)
     last = _last_measured(checks)
     if strange:
-        return VerifiedBy("unverified", "changed", 0, "", **known)
+        return VerifiedBy("unverified", "changed", **known)
     if last is not None and (not changes or started(last) > changes[-1] or _with(store, last, crc, changes[-1])):
         table = table_of(store, last)
         other = crc is not None and table is not None and table != crc
-        return VerifiedBy("unverified" if other else "verified", "other" if other else "check", last.id, started(last).isoformat(), **known)
+        return VerifiedBy("unverified" if other else "verified", "other" if other else "check", last.id, started(last), **known)
     if changed:
         return _since(store, entries, changed[-1], known)
     return VerifiedBy("unknown", "never", **known)
@@ -175,11 +184,11 @@ def of_journal(store: Store, entries: Sequence[JournalEntry], checks: Sequence[V
 def _since(store: Store, entries: Sequence[JournalEntry], change: JournalEntry, known: dict[str, Any]) -> VerifiedBy:
     """No check was measured since a table came into force: what brought it says whether a measurement stands behind it."""
     if change.state is PushState.ACCEPTED:
-        return VerifiedBy("unverified", "accepted", change.push, change.utc, **known)
+        return VerifiedBy("unverified", "accepted", change.push, datetime.fromisoformat(change.utc), **known)
     number = facts(tuple(e for e in entries if e.push == change.push)).get("table")
     if number and _kind(store, int(number)) == KIND:
-        return VerifiedBy("unverified", "rollback", change.push, change.utc, **known)
-    return VerifiedBy("verified", "push", change.push, change.utc, **known)
+        return VerifiedBy("unverified", "rollback", change.push, datetime.fromisoformat(change.utc), **known)
+    return VerifiedBy("verified", "push", change.push, datetime.fromisoformat(change.utc), **known)
 
 
 def _kind(store: Store, table: int) -> str:

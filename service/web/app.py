@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse, JSONResponse, Response
@@ -13,9 +13,11 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from abbe.service.clock import SystemClock
 from abbe.service.plant.facts import FactsSource
 from abbe.service.plant.gather import Gatherer
-from abbe.service.report.report_parts import Rules
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import Status, StatusSource
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.roles import Permission
 from abbe.service.web import problems
@@ -35,31 +37,16 @@ from abbe.service.web.login.login import add_login
 from abbe.service.web.metrics import add_metrics
 from abbe.service.web.mtconnect import add_mtconnect
 from abbe.service.web.page import HERE, ICON, environment, render
+from abbe.service.web.pages.desk import PageContext
 from abbe.service.web.pages.live import add_live_page
 from abbe.service.web.pages.new import add_new_page
 from abbe.service.web.pages.plant_screens import add_plant_screens
 from abbe.service.web.pages.rehearsal import Rehearsals
 from abbe.service.web.pages.routes import add_pages
 from abbe.service.web.pages.table import add_table_screen
-from abbe.service.web.schemas import Health, Problem, Status, Verification, Verifications
+from abbe.service.web.schemas import Health, LatestChecks, Problem
 
 PAGE_ROWS = 60
-
-
-class StoreSource(Protocol):
-    """Where the answers come from."""
-
-    async def status(self) -> Status:
-        """Return everything the page shows."""
-        ...
-
-    async def verifications(self, limit: int) -> list[Verification]:
-        """Return the latest checks, newest first."""
-        ...
-
-    async def ready(self) -> None:
-        """Return if a check could be kept and shown now; raise what is wrong."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -117,7 +104,7 @@ class Application(FastAPI):
 
 
 def create_app(
-    source: StoreSource,
+    source: StatusSource,
     *,
     version: str,
     hosts: Sequence[str] = ("127.0.0.1", "localhost", "[::1]"),
@@ -130,7 +117,7 @@ def create_app(
 
     Parameters
     ----------
-    source : StoreSource
+    source : StatusSource
         Where the answers come from.
     version : str
         Of this program, for the OpenAPI document.
@@ -156,12 +143,13 @@ def create_app(
         add_api(app, api)
     if door is not None:
         add_login(app, environment(), door)
-        add_pages(app, environment(), door, source, Rules() if api is None else api.rules)
-        add_live_page(app, environment(), door, source, parts.core.jobs if parts is not None else tuple)
-        add_new_page(app, environment(), door, source, parts.plans if parts is not None else Rehearsals())
-    if door is not None and api is not None:
-        add_plant_screens(app, environment(), door, source, api)
-        add_table_screen(app, environment(), door, source, api)
+        desk = _desk(source, door, api)
+        add_pages(app, desk)
+        add_live_page(app, desk, parts.core.jobs if parts is not None else tuple)
+        add_new_page(app, desk, parts.plans if parts is not None else Rehearsals())
+        if api is not None:
+            add_plant_screens(app, desk, api)
+            add_table_screen(app, desk)
     if parts is not None:
         add_jobs(app, parts.core, parts.recipes, parts.campaigns)
         add_table_orders(app, parts.core)
@@ -174,7 +162,13 @@ def create_app(
     return app
 
 
-def _add_routes(app: FastAPI, source: StoreSource) -> None:
+def _desk(source: StatusSource, door: Authenticator, api: Sources | None) -> PageContext:
+    if api is None:
+        return PageContext(environment(), door, source, Reader(door.store, "", SystemClock()))
+    return PageContext(environment(), door, source, api.reader, api.rules)
+
+
+def _add_routes(app: FastAPI, source: StatusSource) -> None:
     env = environment()
     trouble: dict[int | str, dict[str, object]] = {503: {"model": Problem, "description": "The store or the core does not answer"}}
 
@@ -201,9 +195,9 @@ def _add_routes(app: FastAPI, source: StoreSource) -> None:
 
     @app.get("/api/v1/verifications", responses=trouble)
     @needs(Permission.READ)
-    async def verifications(limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> Verifications:
+    async def verifications(limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> LatestChecks:
         """Checks of this machine, newest first."""
-        return Verifications(verifications=await source.verifications(limit))
+        return LatestChecks(verifications=await source.verifications(limit))
 
     @app.get("/healthz")
     @needs(PUBLIC)

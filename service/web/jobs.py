@@ -8,18 +8,17 @@ from typing import Annotated
 
 from fastapi import FastAPI, Header, HTTPException, Path, Request
 from fastapi.responses import JSONResponse, Response
-from pydantic import TypeAdapter
 
 from abbe.service.campaigns.builtin_recipes import named, parted
 from abbe.service.channel.messages import Answer, How
 from abbe.service.domain.job_state import JobState
+from abbe.service.queries.reader import json_value
 from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.problems import problem
-from abbe.service.web.schemas import Problem
-from abbe.service.web.schemas_jobs import JobList, NewJob
+from abbe.service.web.schemas import JobList, NewJob, Problem
 
 STATUS = {"unknown": 404, "busy": 409, "forbidden": 403, "conflict": 409}
 NUMBER = Path(pattern="^[0-9a-f]{12}$", description="Number of the job")
@@ -33,7 +32,6 @@ REFUSALS: dict[int | str, dict[str, object]] = {
     429: {"model": Problem, "description": "Too many requests"},
     503: {"model": Problem, "description": "The core or the store does not answer"},
 }
-_JOB = TypeAdapter(JobState)
 ACCEPTED: dict[int | str, dict[str, object]] = {202: {"model": JobState, "description": "Accepted; `Location` is the job"}}
 
 
@@ -44,7 +42,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
     @needs(Permission.READ)
     async def jobs() -> JobList:
         """List the jobs since the service began, newest first (`kind` says what each is), and the recipes that can be started."""
-        return JobList(recipes=list(recipes), jobs=list(core.jobs()))
+        return JobList(recipes=recipes, jobs=core.jobs())
 
     @app.post("/api/v1/jobs", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
     @needs(Permission.MEASURE)
@@ -112,7 +110,7 @@ def answered(core: CoreLine, answer: Answer) -> Response:
     found = _find(core, answer.job)
     if found is None:  # so long ago that the core has forgotten it
         return problem(404, f"job {answer.job} is not known any more")
-    return JSONResponse(_JOB.dump_python(found, mode="json"), 202, headers={"Location": f"/api/v1/jobs/{answer.job}"})
+    return JSONResponse(json_value(found), 202, headers={"Location": f"/api/v1/jobs/{answer.job}"})
 
 
 def _find(core: CoreLine, number: str) -> JobState | None:

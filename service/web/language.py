@@ -61,7 +61,7 @@ def _weight(text: str) -> float:
 
 
 def span(language: str, seconds: float) -> str:
-    """A length of time in the largest sensible unit, as `abbe.service.web.words.span`."""
+    """A length of time in the largest sensible unit, as `abbe.service.queries.timetable.span`."""
     s = abs(seconds)
     if s < 90:
         return say(language, "span.s", n=f"{s:.0f}")

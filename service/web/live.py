@@ -8,14 +8,16 @@ from collections.abc import Awaitable
 from contextlib import suppress
 
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
+from pydantic import TypeAdapter
 
 from abbe.service.errors import CoreSilent
+from abbe.service.queries.status import LiveEvent
 from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.schemas_jobs import Live
 
+_EVENT = TypeAdapter(LiveEvent)
 LONGEST_S = 600.0
 """Then it is closed: who listens on comes again, and is looked at again - a session that has ended in between hears no more."""
 TRY_AGAIN, GOING_AWAY, POLICY = 1013, 1001, 1008
@@ -88,7 +90,9 @@ async def _gone(socket: WebSocket) -> bool:
 def _event(core: CoreLine, revision: int) -> str | None:
     """The event of this moment; None while the core is silent."""
     try:
-        event = Live(revision=revision, job=core.job, devices=core.devices, mqtt_connected=core.mqtt_connected, attention=core.attention)
+        event = LiveEvent(
+            revision=revision, job=core.job, devices=core.devices, mqtt_connected=core.mqtt_connected, attention=core.attention
+        )
     except CoreSilent:
         return None
-    return event.model_dump_json()
+    return _EVENT.dump_json(event).decode()

@@ -10,9 +10,10 @@ from zoneinfo import ZoneInfo
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from abbe.service.domain.verification import Verification
+from abbe.service.queries.status import Status
 from abbe.service.web import language, words
 from abbe.service.web.frame import current, template_words
-from abbe.service.web.schemas import Status, Verification
 from abbe.service.web.trend import Point, trend_svg
 from abbe.service.web.units import converted
 

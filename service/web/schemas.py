@@ -1,133 +1,174 @@
-"""What the JSON interface answers, declared: the OpenAPI document and the page are both made from these."""
+"""What HTTP alone has: envelopes of lists, bodies of requests, problems. What is in an envelope is a record of the read model."""
 
 from __future__ import annotations
 
-from datetime import datetime
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from abbe.service.campaigns.builtin_recipes import USUAL_HZ
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.job_state import JobState
+from abbe.service.domain.verification import Verification
+from abbe.service.queries.measured import CampaignSummary, MachineDescription, RunSummary
+from abbe.service.queries.people import UserSummary
+from abbe.service.queries.proposals import ProposalSummary
+from abbe.service.queries.pushes import PushEntry
+from abbe.service.queries.results import DiscoverySummary, SolutionSummary
+from abbe.service.queries.timetable import ScheduleState
+from abbe.service.web.catalogue import ErrorEntry
+
+LONGEST_RECIPE = 180
+"""The channel takes words of 200 characters, and the rate stands behind the name."""
 
 
-class _Answer(BaseModel):
+class Answer(BaseModel):
+    """Base of all answers. Times are UTC, ISO 8601; units stand in the names."""
+
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class Cause(_Answer):
-    """Why a check could not be completed."""
+class ListPage(Answer):
+    """A page of a list, newest first."""
 
-    code: str
-    what: str
-    remedy: str = ""
-    device: str = ""
+    next_cursor: Annotated[int | None, Field(description="Give it as `cursor` for the next page; null: this is the last one.")]
 
 
-class Verified(_Answer):
-    """Which measurement stands behind the table in force.
+class MachineList(ListPage):
+    """Machines, newest description first."""
 
-    ``verified``: a check was measured with it, whatever its verdict, or the push that brought it was measured before and after.
-    ``unverified``: an earlier verdict says nothing of the machine now; ``text`` says since what.
-    """
-
-    state: Literal["verified", "unverified", "unknown"] = "unknown"
-    why: Literal["check", "push", "rollback", "accepted", "changed", "other", "open", "never", "journal"] = "never"
-    number: int = 0
-    utc: datetime | None = None
-    text: str = ""
-    changes: Annotated[list[datetime], Field(default_factory=list)]
+    machines: Sequence[MachineDescription]
 
 
-class Verification(_Answer):
-    """One check. Figures end in their unit; uncertainties are expanded, k = 2. ``push``: the one that it decided on, 0 for none."""
+class CampaignList(ListPage):
+    """Campaigns."""
 
-    id: int
-    machine: str
-    schedule: str
-    recipe: str
-    slot_utc: datetime
-    started_utc: datetime
-    duration_s: float
-    verdict: Literal["pass", "fail", "cannot tell"]
-    values: dict[str, float | None]
-    uncertainties: dict[str, float | None]
-    limits: dict[str, float | None]
-    campaign: str = ""
-    runs: Annotated[list[str], Field(default_factory=list)]
-    text: str
-    cause: Cause | None = None
-    push: int = 0
+    campaigns: Sequence[CampaignSummary]
 
 
-class Due(_Answer):
-    """What comes next of one schedule."""
+class RunList(ListPage):
+    """Runs."""
 
-    schedule: str
-    recipe: str
-    due_utc: datetime
-    timezone: str
-    cron_words: str
-    words: str
+    runs: Sequence[RunSummary]
 
 
-class Mqtt(_Answer):
-    """The way to the broker."""
+class SolutionList(ListPage):
+    """Solutions."""
 
-    configured: bool
-    broker: str = ""
-    connected: bool = False
-    waiting: int = 0
-    dropped: int = 0
+    solutions: Sequence[SolutionSummary]
 
 
-class Alarm(_Answer):
-    """An alarm that is active, or that nobody has acknowledged. ``signals``: figures behind it; ``outcome``: what was done so far."""
+class DiscoveryList(ListPage):
+    """Searches."""
 
-    alarm: int
-    state: Literal["raised", "acknowledged", "cleared"]
-    recipe: str
-    schedule: str
-    text: str
-    signals: list[dict[str, str | float | None]]
-    raised_utc: datetime
-    acknowledged_by: str = ""
-    cleared_utc: datetime | None = None
-    outcome: str = ""
-    proposal: int | None = None
+    discoveries: Sequence[DiscoverySummary]
 
 
-class Status(_Answer):
-    """Everything the page shows. ``revision`` changes when more than the progress of a running check has changed; ``attention``: what needs
-    a person now; ``verified``: whether the last verdict is of the table in force."""
+class ProposalList(ListPage):
+    """Proposals."""
+
+    proposals: Sequence[ProposalSummary]
+
+
+class PushJournal(ListPage):
+    """The journal of pushes."""
+
+    entries: Sequence[PushEntry]
+
+
+class CheckList(ListPage):
+    """Checks of all machines."""
+
+    verifications: Sequence[Verification]
+
+
+class LatestChecks(Answer):
+    """Checks of this service's machine, newest first."""
+
+    verifications: Sequence[Verification]
+
+
+class DeviceList(Answer):
+    """Devices of this service's machine. They are not asked for this answer."""
 
     machine: str
-    version: str
-    now_utc: datetime
-    revision: str
-    job: RunningCheck | None
-    devices: list[DeviceStatus]
-    next_due: list[Due]
-    mqtt: Mqtt
-    alarms: Annotated[list[Alarm], Field(default_factory=list)]
-    last: list[Verification]
-    attention: Annotated[list[str], Field(default_factory=list)]
-    verified: Annotated[Verified, Field(default_factory=lambda: Verified(changes=[]))]
+    devices: Sequence[DeviceStatus]
 
 
-class Verifications(_Answer):
-    """Checks, newest first."""
+class Recipe(Answer):
+    """A builtin recipe that a schedule can name."""
 
-    verifications: list[Verification]
+    name: str
+    about: str
 
 
-class Health(_Answer):
+class RecipeList(Answer):
+    """Builtin recipes."""
+
+    recipes: Sequence[Recipe]
+
+
+class ErrorList(Answer):
+    """All codes of errors, and what they mean."""
+
+    errors: Sequence[ErrorEntry]
+
+
+class Timetable(Answer):
+    """The timetable of this service's machine."""
+
+    machine: str
+    schedules: Sequence[ScheduleState]
+
+
+class JobList(Answer):
+    """The latest jobs, newest first, and what can be started."""
+
+    recipes: Sequence[str]
+    jobs: Sequence[JobState]
+
+
+class UserList(Answer):
+    """All users."""
+
+    users: Sequence[UserSummary]
+
+
+class AuditList(Answer):
+    """Records, oldest first."""
+
+    records: Sequence[AuditEvent]
+
+
+class Me(Answer):
+    """Who asks. ``csrf_token`` is empty for tokens and onlookers."""
+
+    name: str
+    role: str
+    permissions: list[str]
+    csrf_token: str
+
+
+class Decision(Answer):
+    """What was decided, by whom. ``expiry``: of an approval."""
+
+    proposal: int
+    decision: Literal["approved", "rejected"]
+    by: str
+    utc: str
+    expiry: str | None = None
+    reason: str | None = None
+
+
+class Health(Answer):
     """The process answers, or is ready to work."""
 
     status: Literal["ok"] = "ok"
 
 
-class Problem(_Answer):
+class Problem(Answer):
     """RFC 9457 problem details."""
 
     type: str = "about:blank"
@@ -135,3 +176,40 @@ class Problem(_Answer):
     status: int
     detail: str = ""
     code: str = ""
+
+
+class RequestBody(BaseModel):
+    """Base of all bodies of requests."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class NewJob(RequestBody):
+    """What is to be done now."""
+
+    recipe: Annotated[str, Field(min_length=1, max_length=LONGEST_RECIPE)]
+    rate_hz: Annotated[int, Field(ge=1, le=1000, description="Ball-bar samples per second; has to divide 1000")] = USUAL_HZ
+
+
+class ApproveBody(RequestBody):
+    """For how long the approval holds, at most."""
+
+    hours: Annotated[float, Field(ge=0.01, le=720.0)] = 24.0
+
+
+class RejectBody(RequestBody):
+    """Why. The proposer reads it."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=500)]
+
+
+class RollbackBody(RequestBody):
+    """Which table shall go: the push that brought it, its CRC-32 as `/table` shows it, and why. Refused if another one is in force."""
+
+    push: Annotated[int, Field(ge=1, le=2**31 - 1)]
+    crc: Annotated[str, Field(pattern="^[0-9A-Fa-f]{8}$")]
+    reason: Annotated[str, Field(min_length=1, max_length=500, pattern=r"\S")]
+
+
+class PushBody(RequestBody):
+    """Empty: what is pushed is what was approved."""

@@ -22,12 +22,15 @@ from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.config import load_machine
 from abbe.service.config_timetable import AlarmSection
+from abbe.service.core.board import Board
 from abbe.service.devices.session import open_session
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.check import CheckResult, run_check
 from abbe.service.push.limits import PushLimits
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
 from abbe.service.scheduler.job import CheckJob
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
@@ -40,8 +43,6 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.verification.alarm_states import Alarm, AlarmKind
 from abbe.service.verification.alarms import acknowledge, alarms_of
-from abbe.service.web.core_link.board import Board
-from abbe.service.web.view import View
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
 from tests.scenarios.conftest import Sims
 
@@ -89,7 +90,7 @@ class Shop:
         terms = LoopTerms(poll_s=0.5, recheck_s=0.5, errands=desk)
         scheduler = Scheduler([OFTEN], StoreLedger(self.store, clock, "sim"), job, shelf, clock, terms)
         running = asyncio.create_task(scheduler.run())
-        self.view = View("sim", "0", board, self.store, scheduler.next_due, "", clock)
+        self.view = StatusReader(Reader(self.store, "sim", clock), "0", board, scheduler.next_due, "")
         try:
             yield board
             assert not running.done(), running

@@ -237,7 +237,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
     assert run(["comp", "push", shop.file, str(plain), "--before", "start"]) == 2
     assert "error STO-001" in capsys.readouterr().err
     assert run(["comp", "show", "--machine", shop.file, "--json"]) == 0  # one bad row does not hide the others
-    states = {p["proposal"]: p["state"] for p in json.loads(capsys.readouterr().out)["proposals"]}
+    states = {p["number"]: p["state"] for p in json.loads(capsys.readouterr().out)["proposals"]}
     assert (states[plain], states[1]) == ("changed", "proposed")
 
 
@@ -264,7 +264,7 @@ def test_a_proposal_with_reasons_is_kept_to_look_at_and_goes_nowhere(shop, capsy
     doc = json.loads(capsys.readouterr().out)
     assert doc["state"] == "refused"
     assert any(reason.startswith("VALUE") for reason in doc["reasons"])
-    number = str(doc["proposal"])
+    number = str(doc["number"])
     assert run(["comp", "approve", number, "--as", "anna", "--machine", str(strict)]) == 1
     assert "reasons against it" in capsys.readouterr().out
     assert run(["comp", "push", str(strict), number, "--before", "start"]) == 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,13 +19,17 @@ def runs(
     as_json: JsonOption = False,
 ) -> None:
     """List the runs in the database."""
+    from abbe.service.queries.measured import all_runs
+    from abbe.service.queries.reader import json_value
+
     with open_store(database_url(db, machine)) as store:
-        found = store.runs(store.campaign(campaign).id if campaign is not None else None)
-        if as_json:
-            print_json([_summary(run) for run in found])
-            return
-        rows = [[str(value) for value in _summary(run).values()] for run in found]
-        print_table(("number", "campaign", "run", "test", "role", "status", "reason", "started (UTC)", "ended (UTC)"), rows)
+        found = [json_value(run) for run in all_runs(store, campaign)]
+    if as_json:
+        print_json(found)
+        return
+    keys = ("number", "campaign", "machine", "run_id", "test", "role", "status", "reason", "started_utc", "ended_utc")
+    heads = ("number", "campaign", "machine", "run", "test", "role", "status", "reason", "started (UTC)", "ended (UTC)")
+    print_table(heads, [[str(run[key] or "") for key in keys] for run in found])
 
 
 def show(
@@ -39,7 +43,8 @@ def show(
 ) -> None:
     """Show one run: state, setup and what its columns hold (--json: as an exchange file). Or a campaign: runs and incidents."""
     from abbe.service.cli.results.show_campaign import show_campaign
-    from abbe.service.domain.measured import RunRecord
+    from abbe.service.queries.measured import run_summary
+    from abbe.service.queries.reader import json_value
     from abbe.service.runs.columns import run_document, whole_document
     from abbe.service.runs.coverage import not_judged, with_state
 
@@ -49,6 +54,7 @@ def show(
             show_campaign(store, record, as_json=as_json)
             return
         chunks = store.chunks(record.id)
+        facts = json_value(run_summary(record, store.machine(store.campaign(record.campaign_id).machine_id).name))
         document = (
             whole_document(store, record) if record.visible_status == "complete" else with_state(run_document(record, chunks), record)
         )
@@ -61,27 +67,12 @@ def show(
     setup = {f"setup.{key}": value for key, value in document["setup"].items()}
     print_table(
         ("key", "value"),
-        [(key, str(value)) for key, value in (_summary(record) | told | setup | _samples(record, chunks)).items()],
+        [(key, "" if value is None else str(value)) for key, value in (facts | told | setup | _samples(record, chunks)).items()],
         title=f"run {record.campaign}/{record.label}",
     )
     print_table(
         ("column", "rows", "smallest", "largest", "mean"), [_statistics(key, values) for key, values in document["columns"].items()]
     )
-
-
-def _summary(run: RunRecord) -> dict[str, Any]:
-    who = {"number": run.id, "campaign": run.campaign, "run_id": run.label, "test": run.test, "role": run.role}
-    return who | {"status": run.visible_status, "reason": _told(run), "started_utc": run.started_utc, "ended_utc": run.ended_utc or ""}
-
-
-def _told(run: RunRecord) -> str:
-    """Why a run is not complete, or what it lacks although it is."""
-    if run.visible_status == "incomplete":
-        return "its process ended before the run was closed; the next command that connects to the machine takes over what was saved"
-    gaps = (run.end_doc or {}).get("gaps") or []
-    if run.reason or not gaps:
-        return run.reason
-    return f"{len(gaps)} gaps, {sum(gap['last'] - gap['first'] + 1 for gap in gaps if gap.get('last') is not None)} samples missing"
 
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:

@@ -25,31 +25,28 @@ def trend(
     as_json: JsonOption = False,
 ) -> None:
     """Trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
-    from abbe.service.cli.common import open_store
-    from abbe.service.config import load_machine
-    from abbe.service.devices.urls import control_of
-    from abbe.service.scheduler.store import ServiceStore
-    from abbe.service.verification.trend_table import HEADINGS, as_doc, row, trends
-    from abbe.service.verification.verified_by import measure_now, verified_by
+    from abbe.service.cli.common import reader_of
+    from abbe.service.queries.checks import trends
+    from abbe.service.queries.reader import json_value
+    from abbe.service.verification.trend_table import HEADINGS, chart, row
+    from abbe.service.verification.verified_by import measure_now
 
-    loaded = load_machine(machine)
     since = _moment(after)
-    open_store(loaded.database_url).close()  # a missing file is one line, and none is made
-    with ServiceStore.open(loaded.database_url) as store:
-        known = verified_by(store, loaded.machine.name, control=control_of(loaded.machine.devices.cnc))
-        found = trends(store.verifications_of(loaded.machine.name, limit=100_000), since or known.since)
+    with reader_of(machine) as reader:
+        found = trends(reader, reader.machine, since)
     if as_json:
-        print_json(as_doc(loaded.machine.name, found) | {"verified": known.as_doc()})
+        print_json({"schema": 1, "chart": chart()} | json_value(found))
         return
+    known = found.verified
     if not known.holds:
         typer.echo(f"{known.text}: {measure_now(str(machine))}" if known.state == "unverified" else known.text)
-    if not found and known.changes:
-        typer.echo(f"no check of {loaded.machine.name} has figures since the table in force came: --after shows those before it")
+    if not found.figures and known.changes:
+        typer.echo(f"no check of {found.machine} has figures since the table in force came: --after shows those before it")
         return
-    if not found:
-        typer.echo(f"no check of {loaded.machine.name} has figures yet: abbe serve, or abbe serve --once")
+    if not found.figures:
+        typer.echo(f"no check of {found.machine} has figures yet: abbe serve, or abbe serve --once")
         return
-    print_table(HEADINGS, [row(one) for one in found])
+    print_table(HEADINGS, [row(one) for one in found.figures])
 
 
 def _moment(text: str | None) -> datetime | None:

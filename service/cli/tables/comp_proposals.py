@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, reader
 from abbe.service.cli.measure import MachineArgument, ready_session
 
 if TYPE_CHECKING:
-    from abbe.service.compensation.proposal_doc import Proposed
     from abbe.service.compensation.proposals import Made
+    from abbe.service.queries.proposals import ProposalSummary
     from abbe.service.storage.store import Store
 
+MOST = 100_000
 ProposalArgument = Annotated[int, typer.Argument(metavar="PROPOSAL", help="Number of a proposal; abbe comp show lists them.")]
 
 
@@ -50,15 +51,19 @@ def propose(
 
 
 def _print_made(store: Store, made: Made, *, as_json: bool) -> None:
+    from abbe.service.queries.proposals import proposal
+    from abbe.service.queries.reader import json_value
+
+    found = proposal(reader(store), made.number)
     if as_json:
-        print_json(_row(store, made.number, made.proposed))
+        print_json(json_value(found))
         return
-    typer.echo(f"proposal {made.number}: {_promise(made.proposed)}")
-    for reason in made.proposed.reasons:
+    typer.echo(f"proposal {found.number}: {_promise(found)}")
+    for reason in found.reasons:
         typer.echo(f"against it: {reason}")
-    for line in made.proposed.not_for_tables:
+    for line in found.not_for_tables:
         typer.echo(f"not in the tables: {line}")
-    if made.proposed.reasons:
+    if found.reasons:
         typer.echo("it is stored to be looked at, and cannot be approved or pushed")
 
 
@@ -70,45 +75,38 @@ def show_proposals(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Proposals: what they promise, with uncertainty, where they stand, what spoke against them."""
-    from abbe.service.compensation.proposal_doc import load
+    """Proposals: what they promise, with uncertainty, where they stand, the reasons against them."""
+    from abbe.service.queries import proposals
+    from abbe.service.queries.reader import json_value
 
     with open_store(database_url(db, machine)) as store:
         if proposal is None:
-            _print_list(store, as_json=as_json)
+            _print_list(proposals.proposals(reader(store), None, None, MOST)[0], as_json=as_json)
             return
-        proposed = load(store, proposal)
-        row = _row(store, proposal, proposed)
+        found = proposals.proposal(reader(store), proposal)
     if as_json:
-        print_json(row)
+        print_json(json_value(found))
         return
-    typer.echo(f"proposal {proposal}: {row['state']}{': ' if row['why'] else ''}{row['why']}")
-    typer.echo(_promise(proposed))
-    for name in ("machine", "campaign", "solution", "by", "utc", "valid_until", "base_crc", "generation", "digest"):
-        typer.echo(f"{name.replace('_', ' ')}: {row[name]}")
-    for word, lines in (("against it", row["reasons"]), ("not in the tables", row["not_for_tables"])):
+    typer.echo(f"proposal {proposal}: {found.state}{': ' if found.why else ''}{found.why}")
+    typer.echo(_promise(found))
+    for name in ("machine", "campaign", "solution", "by", "created_utc", "valid_until", "base_crc", "generation", "digest"):
+        typer.echo(f"{name.replace('_', ' ')}: {getattr(found, name)}")
+    for word, lines in (("against it", found.reasons), ("not in the tables", found.not_for_tables)):
         for line in lines:
             typer.echo(f"{word}: {line}")
-    for a in row["approvals"]:
-        typer.echo(f"approved by {a['name']} (account {a['login']}) at {a['utc']} until {a['expiry']}")
+    for one in found.approvals:
+        typer.echo(f"approved by {one.name} (account {one.login}) at {one.utc} until {one.expiry}")
 
 
-def _print_list(store: Store, *, as_json: bool) -> None:
-    from abbe.service.compensation.proposal_doc import load
-    from abbe.service.errors import StoreError
+def _print_list(found: list[ProposalSummary], *, as_json: bool) -> None:
+    from abbe.service.queries.reader import json_value
 
-    rows: list[dict[str, Any]] = []
-    for record in store.proposals():
-        try:
-            rows.append(_row(store, record.id, load(store, record.id)))
-        except StoreError as error:  # one bad row must not hide the others
-            blank = dict.fromkeys(("campaign", "by", "utc"), "")
-            rows.append({"proposal": record.id, "machine": record.machine, "state": "changed", "why": error.detail, "promise": ""} | blank)
     if as_json:
-        print_json({"proposals": rows})
+        print_json({"proposals": [json_value(one) for one in found]})
         return
-    keys = ("proposal", "machine", "campaign", "by", "utc", "promise", "state", "why")
-    print_table(("no", *keys[1:]), [tuple(str(r[k]) for k in keys) for r in rows])
+    heads = ("no", "machine", "campaign", "by", "created (UTC)", "promise", "state", "why")
+    rows = [(str(p.number), p.machine, p.campaign, p.by, p.created_utc, _short(p), p.state, p.why) for p in reversed(found)]
+    print_table(heads, rows)
 
 
 def diff(
@@ -122,8 +120,10 @@ def diff(
     as_json: JsonOption = False,
 ) -> None:
     """What a proposal changes: each of the nine tables in numbers, and as a picture."""
-    from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_html, diff_json, largest, rows
+    from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_html, largest, rows
     from abbe.service.compensation.proposal_doc import load
+    from abbe.service.queries.proposals import difference_of
+    from abbe.service.queries.reader import json_value
     from abbe.service.rendering.page_file import write_page
 
     with open_store(database_url(db, machine)) as store:
@@ -132,7 +132,7 @@ def diff(
     if html is not None:
         write_page(diff_html(found, proposed), html)
     if as_json:
-        print_json(diff_json(found))
+        print_json(json_value(difference_of(found)))
         return
     print_table(HEADINGS, rows(found), title=f"{found.new} against {found.old}; U: k = 2")
     typer.echo(largest(found))
@@ -149,22 +149,19 @@ def approve(
 ) -> None:
     """Approve exactly this table on exactly this base, for this machine, under these limits (exit code 1: it cannot be approved)."""
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_checks import approve as work_approve
-    from abbe.service.compensation.proposal_doc import load
-    from abbe.service.compensation.proposal_states import check_waiting
+    from abbe.service.compensation.proposal_states import approve_waiting
     from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
     from abbe.service.tables.push_outcome import open_pushes
 
     with open_store(database_url(db, machine)) as store:
-        proposed = load(store, proposal)
         try:
-            check_waiting(store, proposal, proposed, SystemClock().utc().timestamp())
-            done = work_approve(store, proposal, proposed, name.strip() or login(), hours, SystemClock())
+            done = approve_waiting(store, proposal, name.strip() or login(), hours, SystemClock())
         except TableRefused as error:
             typer.echo(f"not approved: {error}")
             raise typer.Exit(1) from None
-        left_open = open_pushes(store, proposed.candidate.machine, _control(machine, proposed.candidate.machine))
+        owner = store.proposal(proposal).machine
+        left_open = open_pushes(store, owner, _control(machine, owner))
     typer.echo(f"proposal {proposal} is approved by {done.name} until {done.expiry}")
     for line in left_open:
         typer.echo(f"warning: {line}", err=True)
@@ -188,46 +185,27 @@ def reject(
 ) -> None:
     """Reject a proposal for good: it cannot be approved or pushed any more (exit code 1: it cannot be rejected any more)."""
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_checks import reject as work_reject
-    from abbe.service.compensation.proposal_doc import load
-    from abbe.service.compensation.proposal_states import check_waiting
+    from abbe.service.compensation.proposal_states import reject_waiting
     from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
 
     with open_store(database_url(db, machine)) as store:
         try:
-            check_waiting(store, proposal, load(store, proposal), SystemClock().utc().timestamp())
-            done = work_reject(store, proposal, name.strip() or login(), reason)
+            done = reject_waiting(store, proposal, name.strip() or login(), reason, SystemClock())
         except TableRefused as error:
             typer.echo(f"not rejected: {error}")
             raise typer.Exit(1) from None
     typer.echo(f"proposal {proposal} is rejected by {done.name}: {done.reason}")
 
 
-def _promise(proposed: Proposed) -> str:
-    p = proposed.predicted
-    before, after, expanded = p.before_mm * 1e3, p.after_mm * 1e3, 2e3 * p.u_model_mm
-    return f"{before:.1f} → {after:.1f} µm rms over the volume, better by {before - after:.1f} ± {expanded:.1f} µm (U, k = 2)"
+def _promise(found: ProposalSummary) -> str:
+    p = found.predicted_rms_um
+    if p is None:
+        return ""
+    gain, expanded = p.before - p.after, 2.0 * p.u_model
+    return f"{p.before:.1f} → {p.after:.1f} µm rms over the volume, better by {gain:.1f} ± {expanded:.1f} µm (U, k = 2)"
 
 
-def _row(store: Store, number: int, proposed: Proposed) -> dict[str, Any]:
-    """Everything about a proposal that people and programs ask for, and where it stands."""
-    from datetime import UTC, datetime
-
-    from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_states import proposal_status
-    from abbe.service.storage.base import utc_text
-
-    now = proposal_status(store, number, proposed, SystemClock().utc().timestamp())
-    p, c = proposed.predicted, proposed.candidate
-    approvals = [{"name": a.name, "login": a.login, "utc": a.utc, "expiry": a.expiry} for a in store.approvals(number)]
-    return {
-        "proposal": number, "machine": c.machine, "campaign": proposed.campaign, "solution": proposed.solution_id,
-        "state": now.word, "why": now.text, "by": proposed.by, "utc": proposed.utc,
-        "valid_until": utc_text(datetime.fromtimestamp(proposed.valid_until_s, UTC)),
-        "promise": f"{p.before_mm * 1e3:.1f} → {p.after_mm * 1e3:.1f} µm, U {2e3 * p.u_model_mm:.1f}",
-        "predicted_rms_um": {"before": p.before_mm * 1e3, "after": p.after_mm * 1e3, "u_model": p.u_model_mm * 1e3},
-        "base_crc": f"{c.base_crc:08X}", "generation": proposed.base.gen, "boot": f"{proposed.base.boot:08X}", "digest": c.digest,
-        "two_people": proposed.two_people, "reasons": list(proposed.reasons), "not_for_tables": list(proposed.not_for_tables),
-        "approvals": approvals,
-    }  # fmt: skip
+def _short(found: ProposalSummary) -> str:
+    p = found.predicted_rms_um
+    return "" if p is None else f"{p.before:.1f} → {p.after:.1f} µm, U {2.0 * p.u_model:.1f}"

@@ -119,3 +119,8 @@ class QueueStore(StoreBase):
             return dropped
 
         return self._write(work)
+
+    def waiting_messages(self) -> int:
+        """Return how many messages wait for the broker."""
+        query = select(func.count()).select_from(outbox).where(outbox.c.sent_utc.is_(None))
+        return int(self._read(lambda connection: connection.execute(query).scalar_one()))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from fastapi import FastAPI
 
-from abbe.service.web.api.field import add_field
-from abbe.service.web.api.found import add_found
 from abbe.service.web.api.measured import add_measured
 from abbe.service.web.api.plant import add_plant
 from abbe.service.web.api.reports import add_reports
+from abbe.service.web.api.results import add_results
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.api.tables import add_tables
 
@@ -18,5 +17,5 @@ def add_api(app: FastAPI, sources: Sources) -> None:
 
     They are added to the application itself and not by a router of their own: the guard asks the application's routes what each needs.
     """
-    for add in (add_measured, add_found, add_field, add_tables, add_plant, add_reports):
+    for add in (add_measured, add_results, add_tables, add_plant, add_reports):
         add(app, sources)

@@ -10,10 +10,11 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
 from abbe.service.errors import NotStored
+from abbe.service.queries.reader import as_stored, storable
 from abbe.service.rendering.document import Document
 from abbe.service.report.report import FORMS, default_name, numbered_report, stored_report
 from abbe.service.users.roles import Permission
-from abbe.service.web.api.sources import Number, Sources, as_stored, storable
+from abbe.service.web.api.sources import Number, Sources
 from abbe.service.web.login.access import needs
 
 AT_A_TIME = 2
@@ -79,12 +80,12 @@ def _written(sources: Sources, kind: ReportKind, number: int, form: ReportForm, 
 
 
 def _document(sources: Sources, kind: ReportKind, number: int, machine: str | None) -> Document:
-    store = sources.store
+    reader, store = sources.reader, sources.reader.store
     if kind is ReportKind.PUSH:
-        if machine is not None and (not storable(machine) or not store.push_entries(machine, sources.control_of(machine))):
+        if machine is not None and (not storable(machine) or not store.push_entries(machine, reader.control_of(machine))):
             raise NotStored("this machine has no push")
         found = store.page(
-            "pushes", {"push": number, "machine": machine and store.push_chain(machine, sources.control_of(machine))}, None, 1
+            "pushes", {"push": number, "machine": machine and store.push_chain(machine, reader.control_of(machine))}, None, 1
         )
         if not found:
             raise NotStored(f"there is no push {number}")
@@ -95,7 +96,7 @@ def _document(sources: Sources, kind: ReportKind, number: int, machine: str | No
         ReportKind.VERIFICATION: "verifications",
         ReportKind.DISCOVERY: "discoveries",
     }[kind]
-    row = sources.row(listing, number, kind)
+    row = reader.row(listing, number, kind)
     if kind is ReportKind.RUN:
         return stored_report(store, store.run(f"{row['campaign']}/{row['label']}"), sources.rules)
     if kind is ReportKind.CAMPAIGN:

@@ -9,12 +9,12 @@ from abbe.service.channel.messages import Answer
 from abbe.service.domain.job_state import JobState
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.once import REPLAYED, Key
-from abbe.service.web.api.shapes_tables import PushBody, RollbackBody
 from abbe.service.web.api.sources import Number
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.jobs import ACCEPTED, REFUSALS, answered
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
+from abbe.service.web.schemas import PushBody, RollbackBody
 
 LONGEST_BODY = 4096
 RESPONSES = ACCEPTED | REFUSALS

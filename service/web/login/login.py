@@ -12,6 +12,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 from starlette.requests import ClientDisconnect
 
+from abbe.service.queries import people
 from abbe.service.users.lockout import Came
 from abbe.service.users.roles import Permission
 from abbe.service.web.listening import is_local
@@ -20,8 +21,7 @@ from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.login.authentication import Authenticator, csrf_token
 from abbe.service.web.login.origin import is_tls
 from abbe.service.web.problems import problem
-from abbe.service.web.schemas import Problem
-from abbe.service.web.schemas_people import AuditList, Me, User, Users
+from abbe.service.web.schemas import AuditList, Me, Problem, UserList
 
 LONGEST_FORM = 4096
 DEVICE_S = 90 * 86_400
@@ -101,17 +101,15 @@ def _add_reading(app: FastAPI, door: Authenticator) -> None:
 
     @app.get("/api/v1/users", responses=refusals)
     @needs(Permission.USERS)
-    async def users() -> Users:
+    async def users() -> UserList:
         """List users with their roles."""
-        found = await asyncio.to_thread(door.store.users)
-        return Users(users=[User(name=u.name, role=u.role, created_utc=u.created_utc, disabled_utc=u.disabled_utc) for u in found])
+        return UserList(users=await asyncio.to_thread(people.users, door.store))
 
     @app.get("/api/v1/audit", responses=refusals)
     @needs(Permission.AUDIT)
     async def audit(limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> AuditList:
         """List the newest records of the audit, oldest first."""
-        found = await asyncio.to_thread(door.store.audit, limit)
-        return AuditList(records=list(found))
+        return AuditList(records=await asyncio.to_thread(people.audit, door.store, limit))
 
 
 async def _form(request: Request) -> dict[str, str] | None:

@@ -6,33 +6,21 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
-from typing import Protocol, TypeVar
+from typing import TypeVar
 from zoneinfo import ZoneInfo
 
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
 from abbe.service.errors import NotStored
+from abbe.service.queries.reader import Reader, storable
+from abbe.service.queries.status import Status, StatusSource
 from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from abbe.service.web import words
-from abbe.service.web.api.sources import storable
 from abbe.service.web.login.authentication import Authenticator
-from abbe.service.web.schemas import Status, Verification
 
 T = TypeVar("T")
-
-
-class PageSource(Protocol):
-    """The moment, as the home page has it."""
-
-    async def status(self) -> Status:
-        """Return what is going on."""
-        ...
-
-    async def verifications(self, limit: int) -> list[Verification]:
-        """Return the latest checks, newest first."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +33,18 @@ class PageContext:
         The templates; they escape everything.
     door : Authenticator
         Its store is read, and its users approve.
-    source : PageSource
-        The moment.
+    source : StatusSource
+        How things stand now.
+    reader : Reader
+        The read model.
     rules : Rules
         Limits and certificates of the machine file: a screen judges as the report does.
     """
 
     env: Environment
     door: Authenticator
-    source: PageSource
+    source: StatusSource
+    reader: Reader
     rules: Rules = field(default_factory=Rules)
 
     @property

@@ -16,9 +16,10 @@ from typing import Any
 
 from abbe.service.campaign_data.provenance import versions
 from abbe.service.domain.service_records import StoreHealth
+from abbe.service.queries.reader import json_value
+from abbe.service.queries.status import Status
 from abbe.service.secrets import mask_secrets
 from abbe.service.web.api.sources import Sources
-from abbe.service.web.schemas import Status
 
 # What could be a secret, taken out of texts and documents before they leave the house. Rather too much is blanked than too little.
 
@@ -103,7 +104,7 @@ class Diagnosis:
 
 def diagnosis(sources: Sources, version: str) -> Diagnosis:
     """Look at everything now."""
-    store, now = sources.store, sources.clock.utc()
+    store, now = sources.reader.store, sources.reader.clock.utc()
     found: StoreHealth = store.health()
     since = None if found.since_utc is None else datetime.fromisoformat(found.since_utc)
     days = 0.0 if since is None else (now - since).total_seconds() / DAY_S
@@ -123,8 +124,8 @@ def megabytes(size_b: float) -> str:
 def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
     """What the core has told this process of the machine file. Keys and passwords were never in it, but for those in URLs."""
     return {
-        "machine": sources.machine,
-        "database": sources.store.url,
+        "machine": sources.reader.machine,
+        "database": sources.reader.store.url,
         "broker": broker,
         "devices": {device.role: device.url for device in status.devices},
         "schedules": [asdict(one) for one in sources.schedules],
@@ -140,7 +141,7 @@ def bundle(diagnosis: Diagnosis, config: Mapping[str, Any], status: Status, log:
         "config.json": _json(config),
         "diagnosis.json": _json(asdict(diagnosis)),
         "log.txt": "\n".join(blanked_line(line) for line in log) + "\n",
-        "status.json": _json(status.model_dump(mode="json")),
+        "status.json": _json(json_value(status)),
         "versions.json": _json(versions()),
     }
     out = io.BytesIO()

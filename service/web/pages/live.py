@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
-from jinja2 import Environment
 
 from abbe.service.domain.job_state import JobState
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.login.authentication import Authenticator
-from abbe.service.web.pages.desk import PageContext, PageSource
+from abbe.service.web.pages.desk import PageContext
 
 SCRIPT_WORDS = (
     "live.abort", "live.ended", "live.gone", "live.old", "live.pause", "live.resume", "live.stop", "live.no_path",
@@ -23,16 +21,13 @@ SCRIPT_WORDS = (
 """What the script fills in; the states of a measurement, and how one ends, come on top."""
 
 
-def add_live_page(
-    app: FastAPI, env: Environment, door: Authenticator, source: PageSource, jobs: Callable[[], Sequence[JobState]] = tuple
-) -> None:
-    """Add the screen to the application. ``jobs``: those since the service began, newest first; how the last one ended is told."""
-    desk = PageContext(env, door, source)
+def add_live_page(app: FastAPI, desk: PageContext, jobs: Callable[[], Sequence[JobState]] = tuple) -> None:
+    """Add the screen to the application. ``jobs``: those since the service began, newest first; the screen shows how the last one ended."""
 
     @app.get("/live", include_in_schema=False)
     @needs(Permission.READ)
     async def live() -> HTMLResponse:
-        status = await source.status()
+        status = await desk.source.status()
         return await desk.show(
             "live.html",
             moment=status,

@@ -8,7 +8,6 @@ from urllib.parse import urlencode
 
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, Response
-from jinja2 import Environment
 from pydantic import AfterValidator
 
 from abbe.service.domain.audit_event import AuditEvent
@@ -18,8 +17,7 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.frame import THEMES, current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.login.authentication import Authenticator
-from abbe.service.web.pages.desk import PageContext, PageSource, can_be_stored
+from abbe.service.web.pages.desk import PageContext, can_be_stored
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
 from abbe.service.web.pages.fleet import SORTS, FleetQuery, fleet_csv, fleet_lines
@@ -30,9 +28,8 @@ Sort = Literal["worst", "machine", "due"]
 BUNDLE_ACTION = "support bundle"
 
 
-def add_plant_screens(app: FastAPI, env: Environment, door: Authenticator, source: PageSource, sources: Sources) -> None:
+def add_plant_screens(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     """Add the screens."""
-    desk = PageContext(env, door, source, sources.rules)
     _add_fleet(app, desk, sources)
     _add_devices(app, desk, sources)
     _add_settings(app, desk, sources)
@@ -42,8 +39,8 @@ def _add_fleet(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/fleet", include_in_schema=False)
     @needs(Permission.READ)
     async def fleet(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> HTMLResponse:
-        asked, now, lang = FleetQuery(name, verdict, sort), sources.clock.utc(), current().lang
-        lines = await desk.read(fleet_lines, sources.store, now, asked)
+        asked, now, lang = FleetQuery(name, verdict, sort), sources.reader.clock.utc(), current().lang
+        lines = await desk.read(fleet_lines, sources.reader.store, now, asked)
 
         def named(key: str) -> tuple[str, str]:
             words, unit = language.figure(lang, key)
@@ -63,7 +60,7 @@ def _add_fleet(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/fleet.csv", include_in_schema=False)
     @needs(Permission.READ)
     async def as_csv(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> Response:
-        lines = await desk.read(fleet_lines, sources.store, sources.clock.utc(), FleetQuery(name, verdict, sort))
+        lines = await desk.read(fleet_lines, sources.reader.store, sources.reader.clock.utc(), FleetQuery(name, verdict, sort))
         headers = {"Content-Disposition": 'attachment; filename="fleet.csv"'}
         return Response(fleet_csv(lines), media_type="text/csv; charset=utf-8", headers=headers)
 
@@ -72,9 +69,9 @@ def _add_devices(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/devices", include_in_schema=False)
     @needs(Permission.READ)
     async def devices() -> HTMLResponse:
-        status, now = await desk.source.status(), sources.clock.utc()
+        status, now = await desk.source.status(), sources.reader.clock.utc()
         until = sources.rules.calibrated_until
-        screen = await desk.read(device_screen, sources.store, sources.machine, status.devices, until, now.date())
+        screen = await desk.read(device_screen, sources.reader.store, sources.reader.machine, status.devices, until, now.date())
         lang = current().lang
         return await desk.show("devices.html", screen=screen, ago=lambda at: language.ago(lang, at, now))
 
@@ -87,7 +84,7 @@ def _add_settings(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/settings", include_in_schema=False)
     @needs(Permission.READ)
     async def settings() -> HTMLResponse:
-        users = await desk.read(sources.store.users) if current().may(Permission.USERS) else []
+        users = await desk.read(sources.reader.store.users) if current().may(Permission.USERS) else []
         return await desk.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, users=users)
 
     @app.get("/diagnostics", include_in_schema=False)
@@ -108,7 +105,7 @@ def _add_settings(app: FastAPI, desk: PageContext, sources: Sources) -> None:
         event = AuditEvent(
             who=visit.principal.name,
             action=BUNDLE_ACTION,
-            target=sources.machine,
+            target=sources.reader.machine,
             outcome="done",
             doc={"address": visit.address, "bytes": len(made)},
         )

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import re
 import secrets
-from dataclasses import fields
 from typing import Annotated
 from urllib.parse import parse_qs
 
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from jinja2 import Environment
 from pydantic import AfterValidator
 
 from abbe.service.errors import NotStored, StoreError, TableRefused
 from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
-from abbe.service.report.report_parts import Rules
 from abbe.service.users.roles import Permission
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.login.authentication import Authenticator
 from abbe.service.web.pages import times
-from abbe.service.web.pages.desk import PageContext, PageSource, can_be_stored, found
+from abbe.service.web.pages.desk import PageContext, can_be_stored, found
 from abbe.service.web.pages.proposals import approve_as, proposal_lines, proposal_screen
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_lines, discovery_screen, result_screen, solution_lines
@@ -56,9 +52,8 @@ Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 PLOT_STYLE = themed(style_rules())
 
 
-def add_pages(app: FastAPI, env: Environment, door: Authenticator, source: PageSource, rules: Rules) -> None:
-    """Add the screens to the application. ``rules``: limits and certificates of the machine file."""
-    desk = PageContext(env, door, source, rules)
+def add_pages(app: FastAPI, desk: PageContext) -> None:
+    """Add the screens to the application."""
 
     @app.get("/plots.css", include_in_schema=False)
     @needs(Permission.READ)
@@ -200,16 +195,15 @@ def _add_times(app: FastAPI, desk: PageContext) -> None:
     @app.get("/trends", include_in_schema=False)
     @needs(Permission.READ)
     async def trends() -> HTMLResponse:
-        past = await desk.source.verifications(times.CHECKS)
-        moment = await desk.source.status()
-        screen = await desk.read(times.trend_screen, past, moment)
-        return await desk.show("trends.html", **{one.name: getattr(screen, one.name) for one in fields(screen)})
+        past, moment = await desk.source.verifications(times.CHECKS), await desk.source.status()
+        screen = await desk.read(times.trend_screen, desk.reader, past, moment)
+        return await desk.show("trends.html", verified=moment.verified, plots=screen.plots, charts=screen.charts, checks=len(past))
 
     @app.get("/schedule", include_in_schema=False)
     @needs(Permission.READ)
     async def schedule() -> HTMLResponse:
         moment = await desk.source.status()
-        return await desk.show("schedule.html", lines=await desk.read(times.schedule_lines, desk.store, moment))
+        return await desk.show("schedule.html", lines=await desk.read(times.schedule_lines, desk.reader, moment))
 
     @app.get("/audit", include_in_schema=False)
     @needs(Permission.AUDIT)

@@ -6,16 +6,13 @@ import secrets
 
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
-from jinja2 import Environment
 
 from abbe.service.errors import JournalChanged
-from abbe.service.tables.table_history import table_history
+from abbe.service.queries.pushes import tables
 from abbe.service.users.roles import Permission
-from abbe.service.web.api.sources import Sources
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.login.authentication import Authenticator
-from abbe.service.web.pages.desk import PageContext, PageSource
+from abbe.service.web.pages.desk import PageContext
 
 MOST = 50
 SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}
@@ -28,18 +25,17 @@ def ends(group: str) -> dict[str, str]:
     return {word: current().state(group, word) for word in ENDS}
 
 
-def add_table_screen(app: FastAPI, env: Environment, door: Authenticator, source: PageSource, sources: Sources) -> None:
+def add_table_screen(app: FastAPI, desk: PageContext) -> None:
     """Add the screen to the application."""
-    desk = PageContext(env, door, source, sources.rules)
 
     @app.get("/table", include_in_schema=False)
     @needs(Permission.READ)
     async def table() -> HTMLResponse:
         try:
-            told = await desk.read(table_history, sources.store, sources.machine, sources.control)
+            told = await desk.read(tables, desk.reader)
         except JournalChanged as error:
             return await desk.show("table.html", 409, broken=error.detail, told=None)
-        status = await source.status()
+        status = await desk.source.status()
         return await desk.show(
             "table.html",
             told=told,

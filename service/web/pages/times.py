@@ -7,16 +7,17 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.service_records import SlotRecord
-from abbe.service.storage.store import Store
-from abbe.service.verification.trend_table import FigureTrend, in_words
-from abbe.service.verification.trend_table import trends as figure_trends
+from abbe.service.domain.verification import Verification
+from abbe.service.queries.checks import trends
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import Status
+from abbe.service.queries.timetable import NextDue, past_slots
+from abbe.service.verification.trend_table import FigureTrend
 from abbe.service.web import language
 from abbe.service.web.frame import current
-from abbe.service.web.page import trends
+from abbe.service.web.page import trends as trend_plots
 from abbe.service.web.pages.desk import zone_of
-from abbe.service.web.schemas import Due, Status, Verification, Verified
 
 CHECKS = 300
 SLOTS = 30
@@ -25,59 +26,48 @@ AUDIT_ROWS = 200
 
 @dataclass(frozen=True, slots=True)
 class TrendLine:
-    """One judged figure: what the control chart says, and when the limit will be reached."""
+    """One judged figure in the reader's units: what the control chart says is in ``trend``."""
 
     name: str
-    checks: int
     latest: str
     limit: str
-    state: str
-    direction: int
-    since: str
-    ahead: str
+    trend: FigureTrend
 
 
 @dataclass(frozen=True, slots=True)
 class TrendScreen:
-    """Pictures and control charts, of checks with the table in force; ``verified``: whether there is one."""
+    """Pictures of all checks, and control charts of those with the table in force."""
 
-    verified: Verified
     plots: Sequence[Markup]
     charts: Sequence[TrendLine]
-    checks: int
 
 
 @dataclass(frozen=True, slots=True)
 class ScheduleLine:
     """One schedule: what comes, in the reader's words, and what became of its past slots."""
 
-    due: Due
+    due: NextDue
     in_words: str
     slots: Sequence[SlotRecord]
 
 
-def trend_screen(past: Sequence[Verification], moment: Status) -> TrendScreen:
-    """Every judged figure of the latest checks."""
-    records = [VerificationRecord(p.id, 0, None, p.verdict, p.model_dump(mode="json"), p.started_utc.isoformat()) for p in past]
-    changes = moment.verified.changes
-    lines = [_line(t) for t in figure_trends(records, changes[-1] if changes else None)]
-    return TrendScreen(moment.verified, trends(past, zone_of(moment), changes), lines, len(past))
+def trend_screen(reader: Reader, past: Sequence[Verification], moment: Status) -> TrendScreen:
+    """Every judged figure of the latest checks, newest first in ``past``: pictures, and what the control chart says."""
+    found = trends(reader, moment.machine, limit=CHECKS)
+    plots = trend_plots(past, zone_of(moment), moment.verified.changes)
+    return TrendScreen(plots, [_line(one) for one in found.figures])
 
 
 def _line(one: FigureTrend) -> TrendLine:
+    """A trend in the reader's language and units."""
     name, unit = language.figure(current().lang, one.figure)
     frame, ours = current(), current().unit(unit)
     limit = "–" if one.limit is None else f"{frame.length(f'{one.limit:g}', unit)} {ours}"
-    since = "" if one.since_utc is None else one.since_utc.isoformat()
-    ahead = in_words(one.trend.forecast)
-    latest = f"{frame.length(f'{one.latest:.2f}', unit)} ± {frame.length(f'{one.expanded:.2f}', unit)} {ours}"
-    return TrendLine(name, one.checks, latest, limit, one.trend.state, one.trend.direction, since, ahead)
+    latest = f"{frame.length(f'{one.latest:.2f}', unit)} ± {frame.length(f'{one.expanded_uncertainty:.2f}', unit)} {ours}"
+    return TrendLine(name, latest, limit, one)
 
 
-def schedule_lines(store: Store, moment: Status) -> list[ScheduleLine]:
+def schedule_lines(reader: Reader, moment: Status) -> list[ScheduleLine]:
     """All schedules with their latest slots."""
     lang = current().lang
-    return [
-        ScheduleLine(d, language.due(lang, d.due_utc, moment.now_utc), store.slots_of(f"{moment.machine}/{d.schedule}", SLOTS))
-        for d in moment.next_due
-    ]
+    return [ScheduleLine(d, language.due(lang, d.due_utc, moment.now_utc), past_slots(reader, d.schedule, SLOTS)) for d in moment.next_due]

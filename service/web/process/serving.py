@@ -18,6 +18,8 @@ from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError, ChannelBroken
 from abbe.service.plant.gather import Gatherer
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.people import People
@@ -28,7 +30,6 @@ from abbe.service.web.core_link.logtail import keep_log
 from abbe.service.web.login.authentication import Authenticator, Front
 from abbe.service.web.login.connections import PatientProtocol
 from abbe.service.web.pages.rehearsal import Rehearsals
-from abbe.service.web.view import View
 
 # The web server inside the event loop of the web process: the core's socket, our signals, our end.
 
@@ -144,14 +145,19 @@ async def _serve(wire: Wire, begin: Begin, store: ServiceStore, listening: socke
     people = People(store, clock)
     people.passwords.prepare()
     core = CoreLine(wire, clock)
-    view = View(begin.machine, begin.version, core, store, core.next_due, begin.broker, clock, begin.control)
+    reader = Reader(store, begin.machine, clock, begin.control)
+    view = StatusReader(reader, begin.version, core, core.next_due, begin.broker)
     door = Authenticator(store, people, AuditBook(store, begin.store_url), Front(begin.port, begin.behind_tls))
     parts = Parts(
         core, store, begin.machine, begin.recipes, Rehearsals(begin.plan, begin.recipes, rules=begin.rules), begin.campaigns, begin.control
     )
     plant = Gatherer(view.status, store, begin.control)
     api = Sources(
-        store, begin.machine, clock, begin.schedules, lambda: core.devices, Rules(**asdict(begin.rules)), keep_log(), begin.control
+        reader=reader,
+        schedules=begin.schedules,
+        devices=lambda: core.devices,
+        rules=Rules(**asdict(begin.rules)),
+        tail=keep_log(),
     )
     app = create_app(view, version=begin.version, hosts=begin.hosts, door=door, parts=parts, plant=plant, api=api)
     server = make_server(app, begin.certificate, begin.key)

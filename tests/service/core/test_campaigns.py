@@ -18,6 +18,7 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, DoneByHand, How, StartJob, SteerJob
+from abbe.service.core.board import Board
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import CampaignOrder, Ground, full_campaigns
 from abbe.service.core.snapshot import SnapshotSource
@@ -27,7 +28,6 @@ from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, Prompts
-from abbe.service.web.core_link.board import Board
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 

@@ -12,18 +12,20 @@ import httpx
 import pytest
 
 from abbe.drivers.errors import LinkDown
+from abbe.service.core.board import Board
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.verification import Verification
 from abbe.service.errors import StoreError
+from abbe.service.queries.reader import Reader, read_as
+from abbe.service.queries.status import StatusReader
+from abbe.service.queries.timetable import span
 from abbe.service.scheduler import record
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web import words
 from abbe.service.web.app import create_app
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.document import HEADERS
 from abbe.service.web.page import figure_verdict
-from abbe.service.web.schemas import Verification
 from abbe.service.web.trend import Point, trend_svg
-from abbe.service.web.view import View
 from tests.service.core.fakes import STEP, FakeClock, Result, utc
 
 NOW = utc(2026, 11, 21, 9)
@@ -38,7 +40,7 @@ class Site:
         self.clock = FakeClock(NOW)
         self.board = Board(DEVICES, self.clock)
         self.due: list[tuple[Schedule, datetime]] = [(WEEKLY, utc(2026, 11, 23, 5))]
-        view = View("mill-7", "0.1.0", self.board, store, lambda: self.due, "mqtt://127.0.0.1:1883", self.clock)
+        view = StatusReader(Reader(store, "mill-7", self.clock), "0.1.0", self.board, lambda: self.due, "mqtt://127.0.0.1:1883")
         self.client = httpx.AsyncClient(
             transport=httpx.ASGITransport(create_app(view, version="0.1.0"), False), base_url="http://127.0.0.1:8080"
         )
@@ -179,7 +181,7 @@ async def test_a_store_that_is_gone_is_503(site: Site, monkeypatch: pytest.Monke
     def gone(*_: object) -> None:
         raise StoreError("database is locked")
 
-    monkeypatch.setattr(site.store, "verifications_of", gone)
+    monkeypatch.setattr(site.store, "page", gone)
     for path in ("/readyz", "/", "/api/v1/status"):
         answer = await site.client.get(path)
         assert (answer.status_code, answer.json()["code"], answer.headers["retry-after"]) == (503, "STO-001", "5")
@@ -219,7 +221,7 @@ def test_a_point_shows_the_verdict_of_its_figure(verdict: str, diagonal: float, 
     doc = record.found(
         record.Occasion("m", WEEKLY, NOW), Result(verdict=verdict, values={"body_diagonal_um": diagonal, "helix_rms_um": helix})
     )
-    check = Verification.model_validate({"id": 1, **doc})
+    check = read_as(Verification, {"id": 1, **doc})
     assert (figure_verdict(check, "body_diagonal_um"), figure_verdict(check, "helix_rms_um")) == expected
 
 
@@ -228,7 +230,7 @@ def test_words() -> None:
     assert words.figure_name("helix_rms_um") == ("Helix RMS", "µm")
     assert words.figure_name("odd") == ("Odd", "")
     assert [words.number(v) for v in (123.4, 11.84, 0.123, None)] == ["123", "11.8", "0.12", "–"]
-    assert [words.span(s) for s in (5, 600, 7200, 200000)] == ["5 s", "10 min", "2 h", "2 days"]
+    assert [span(s) for s in (5, 600, 7200, 200000)] == ["5 s", "10 min", "2 h", "2 days"]
 
 
 async def test_a_skipped_slot_changes_the_revision(site: Site) -> None:

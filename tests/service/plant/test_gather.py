@@ -8,13 +8,14 @@ from typing import Any
 
 import pytest
 
+from abbe.service.core.board import Board
 from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.plant.facts import UNITS
 from abbe.service.plant.gather import Gatherer, table_in_force
 from abbe.service.plant.opcua.picture import picture_of
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.web.core_link.board import Board
-from abbe.service.web.view import View
 from tests.service.core.fakes import STEP, FakeClock
 from tests.service.plant.facts_for_tests import NOON, facts
 
@@ -66,7 +67,7 @@ def store(tmp_path: Path) -> Iterator[ServiceStore]:
 async def test_facts_of_a_real_store(store: ServiceStore) -> None:
     clock = FakeClock(NOON)
     board = Board({"laser": "modbus+tcp://127.0.0.1:502"}, clock)
-    view = View("mill-7", "0.1.0", board, store, lambda: [], "", clock)
+    view = StatusReader(Reader(store, "mill-7", clock), "0.1.0", board, lambda: [], "")
     gatherer = Gatherer(view.status, store)
     empty = await gatherer.facts()
     assert (empty.state, empty.checks, empty.alarms, empty.table) == ("idle", (), (), None)
@@ -127,7 +128,7 @@ async def test_a_table_of_slots_is_not_read_every_second(store: ServiceStore) ->
         def last_push(self, machine: str, control: str = "", /) -> list[Any]:
             return []
 
-    gatherer = Gatherer(View("mill-7", "0.1.0", board, store, lambda: [], "", clock).status, Counted())
+    gatherer = Gatherer(StatusReader(Reader(store, "mill-7", clock), "0.1.0", board, lambda: [], "").status, Counted())
     for _ in range(59):
         await gatherer.facts()
         clock.now_s += 1.0

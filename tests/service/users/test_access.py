@@ -12,17 +12,18 @@ import pytest
 from fastapi import FastAPI, WebSocket
 from fastapi.responses import PlainTextResponse
 
+from abbe.service.core.board import Board
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import ConfigError
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.document import HEADERS
 from abbe.service.web.listening import check_exposure
 from abbe.service.web.login.access import MUTATING, PUBLIC, Open, cells, needs
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
-from abbe.service.web.view import View
 from tests.service.users.conftest import PHRASE, World
 
 BASE = "http://127.0.0.1:8080"
@@ -62,7 +63,7 @@ class Gate:
 def app_of(world: World, door: Authenticator | None) -> FastAPI:
     board = Board({}, world.clock)
     none: list[tuple[Schedule, Any]] = []
-    view = View("mill-7", "0.1.0", board, world.store, lambda: none, "", world.clock)
+    view = StatusReader(Reader(world.store, "mill-7", world.clock), "0.1.0", board, lambda: none, "")
     return create_app(view, version="0.1.0", door=door)
 
 

@@ -264,10 +264,11 @@ async def test_an_address_with_colons_is_a_name_as_well(world: World) -> None:
 
 
 def _view(world: World) -> Any:
-    from abbe.service.web.core_link.board import Board
-    from abbe.service.web.view import View
+    from abbe.service.core.board import Board
+    from abbe.service.queries.reader import Reader
+    from abbe.service.queries.status import StatusReader
 
-    return View("mill-7", "0.1.0", Board({}, world.clock), world.store, lambda: [], "", world.clock)
+    return StatusReader(Reader(world.store, "mill-7", world.clock), "0.1.0", Board({}, world.clock), lambda: [], "")
 
 
 async def test_guesses_from_ever_new_addresses_do_not_keep_a_user_out(world: World) -> None:

@@ -18,6 +18,7 @@ import pytest
 from abbe.drivers.tables import crc32
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
+from abbe.service.core.board import Board
 from abbe.service.domain.schedule import Schedule
 from abbe.service.plant.facts import Facts
 from abbe.service.plant.gather import Gatherer
@@ -25,6 +26,8 @@ from abbe.service.plant.mtconnect import Agent
 from abbe.service.plant.opcua.picture import picture_of
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import S
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import Status, StatusReader
 from abbe.service.rendering.document import Document
 from abbe.service.report.report import numbered_report
 from abbe.service.report.report_parts import Rules
@@ -32,11 +35,8 @@ from abbe.service.scheduler import record
 from abbe.service.scheduler.fleet import MachineStatus, stands
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.verification.verified_by import STRANGE, VerifiedBy, verified_by
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.page import environment, render
 from abbe.service.web.pages.times import trend_screen
-from abbe.service.web.schemas import Status
-from abbe.service.web.view import View
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.system.serve_check import Result
 
@@ -83,8 +83,8 @@ class World:
     def fleet(self) -> MachineStatus:
         return stands(self.store, datetime.now(UTC))[0]
 
-    def _view(self) -> View:
-        return View("mill-7", "0", self.board, self.store, list, "", SystemClock())
+    def _view(self) -> StatusReader:
+        return StatusReader(Reader(self.store, "mill-7", SystemClock()), "0", self.board, list, "")
 
     def status(self) -> Status:
         return asyncio.run(self._view().status())
@@ -266,13 +266,14 @@ def test_trends_mark_where_the_table_changed_and_begin_anew(world: World) -> Non
     world.push(OLD, NEW)
     status = world.status()
     past = asyncio.run(world._view().verifications(50))
-    screen = trend_screen(past, status)
-    assert [line.checks for line in screen.charts] == []
+    reader = world._view().reader
+    screen = trend_screen(reader, past, status)
+    assert [line.trend.checks for line in screen.charts] == []
     assert str(screen.plots[0]).count('class="changed"') == 1
     assert str(screen.plots[0]).count('class="pass earlier"') == 3
     world.check("pass", NEW, 5.0)
-    screen = trend_screen(asyncio.run(world._view().verifications(50)), world.status())
-    assert [line.checks for line in screen.charts] == [1]
+    screen = trend_screen(reader, asyncio.run(world._view().verifications(50)), world.status())
+    assert [line.trend.checks for line in screen.charts] == [1]
     assert str(screen.plots[0]).count("earlier table") == 3
 
 
@@ -301,4 +302,5 @@ def test_nothing_known_is_said_as_before(world: World) -> None:
     began = datetime.now(UTC) - timedelta(seconds=5)
     number = world.check("cannot tell")
     assert world.known().number == number
-    assert datetime.fromisoformat(world.known().utc) > began
+    assert world.known().utc is not None
+    assert world.known().utc > began

@@ -19,6 +19,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.compensation.proposal_doc import digest_of_doc, doc_of, load
 from abbe.service.compensation.proposals import Gathered, make
+from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.schedule import Schedule
@@ -26,6 +27,8 @@ from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.events import ignore_progress
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import PushState
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler.store import ServiceStore
@@ -35,12 +38,10 @@ from abbe.service.users.people import People
 from abbe.service.users.roles import ALLOWED, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.process.serving import make_server
-from abbe.service.web.view import View
 from tests.service.discovery.discovery_bench import MACHINE, Search, write_case
 
 PHRASE = "correct horse battery staple"
@@ -205,8 +206,8 @@ def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
 def app_of(store: ServiceStore, clock: Hour, door: Authenticator | None) -> FastAPI:
     board = Board({"cnc": "modbus://127.0.0.1:5020"}, clock)
     schedules = (Schedule("daily", "0 6 * * *", "Europe/Berlin", "quick-check"), Schedule("hours", "", "UTC", "verification", every_h=8.0))
-    view = View(NAME, "0.1.0", board, store, list, "", clock)
-    sources = Sources(store, NAME, clock, schedules, lambda: board.devices)
+    view = StatusReader(Reader(store, NAME, clock), "0.1.0", board, list, "")
+    sources = Sources(reader=view.reader, schedules=schedules, devices=lambda: board.devices)
     return create_app(view, version="0.1.0", door=door, api=sources)
 
 

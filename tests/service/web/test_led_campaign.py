@@ -17,12 +17,13 @@ from abbe.service.channel.messages import Answer, DoneByHand, Jobs, Outcome, Sna
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobState
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 from abbe.service.web.problems import MEDIA_TYPE
-from abbe.service.web.view import View
 from tests.service.core.test_channel import MOMENT
 from tests.service.web.api_bench import NAME, Plant
 from tests.service.web.pages.test_rehearsal import TOLD
@@ -77,7 +78,7 @@ async def desk(plant: Plant) -> AsyncIterator[Desk]:
     ours, theirs = socket.socketpair()
     near, far = await Wire.over(ours), await Wire.over(theirs)
     core = CoreLine(near, SystemClock())
-    view = View(NAME, "0.1.0", core, plant.store, core.next_due, "", plant.clock)
+    view = StatusReader(Reader(plant.store, NAME, plant.clock), "0.1.0", core, core.next_due, "")
     names = ("quick-check", CAMPAIGN)
     parts = Parts(core, plant.store, NAME, names, Rehearsals(TOLD, names), (CAMPAIGN,))
     app = create_app(view, version="0.1.0", door=plant.door, parts=parts)

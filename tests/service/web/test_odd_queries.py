@@ -14,16 +14,17 @@ from starlette.routing import Route
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.clock import SystemClock
+from abbe.service.core.board import Board
 from abbe.service.domain.schedule import Schedule
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
-from abbe.service.web.view import View
 
 PHRASE = "correct horse battery staple"
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
@@ -44,8 +45,8 @@ async def test_every_text_of_every_query(url: str) -> None:
         door = Authenticator(store, people, AuditBook(store, url), rate_hz=1e9, burst=1e9)
         board = Board({}, clock)
         schedules = (Schedule("s", "0 6 * * *", "UTC", "r"),)
-        view = View("m", "0", board, store, list, "", clock)
-        app = create_app(view, version="0", door=door, api=Sources(store, "m", clock, schedules, tuple))
+        view = StatusReader(Reader(store, "m", clock), "0", board, list, "")
+        app = create_app(view, version="0", door=door, api=Sources(reader=view.reader, schedules=schedules))
         secret = people.begin(people.get("adam"))
         headers = {"Cookie": f"{COOKIE}={secret}", CSRF_HEADER: csrf_token(secret), "Origin": "http://127.0.0.1"}
         found: dict[str, int] = {}

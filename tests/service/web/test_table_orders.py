@@ -16,16 +16,17 @@ from fastapi import FastAPI
 from abbe.service.channel.messages import Answer, Jobs, Outcome, PushNow, RollBack, from_web
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
+from abbe.service.core.board import Board
 from abbe.service.domain.job_state import JobState
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.api.once import REPLAYED
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
-from abbe.service.web.core_link.board import Board
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.login.access import cells
 from abbe.service.web.problems import MEDIA_TYPE
-from abbe.service.web.view import View
 from tests.service.core.test_channel import MOMENT
 from tests.service.web.api_bench import NAME, Plant
 
@@ -71,8 +72,8 @@ async def desk(plant: Plant) -> AsyncIterator[Desk]:
     ours, theirs = socket.socketpair()
     near, far = await Wire.over(ours), await Wire.over(theirs)
     core = CoreLine(near, SystemClock())
-    view = View(NAME, "0.1.0", Board({}, plant.clock), plant.store, list, "", plant.clock)
-    sources = Sources(plant.store, NAME, plant.clock)
+    view = StatusReader(Reader(plant.store, NAME, plant.clock), "0.1.0", Board({}, plant.clock), list, "")
+    sources = Sources(reader=view.reader)
     app = create_app(view, version="0.1.0", door=plant.door, api=sources, parts=Parts(core, plant.store, NAME, ()))
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:
         made = Desk(app, client)

@@ -15,13 +15,14 @@ import pytest
 
 from abbe.service.clock import SystemClock
 from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.fleet import FleetFigure, MachineLine
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web.app import create_app
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import HIDDEN, blanked, blanked_doc, blanked_line
 from abbe.service.web.pages.fleet import FleetLine, FleetQuery, fleet_csv, fleet_lines
-from abbe.service.web.view import View
 from tests.pages_world import Served
 from tests.service.web.pages.test_screens import as_user
 
@@ -95,7 +96,7 @@ async def test_a_choice_is_kept_by_a_screen_alone_and_over_tls_only_where_there_
         asked = [client.get(f"{path}?theme=dark").headers for path in ("/healthz", "/api/v1/status", "/settings")]
         assert ["set-cookie" in headers for headers in asked] == [False, False, True]
         assert "Secure" not in asked[2]["set-cookie"]
-    app = create_app(View("m", "0", running.board, running.store, list, "", SystemClock()), version="0", door=running.door)
+    app = create_app(StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, ""), version="0", door=running.door)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="https://127.0.0.1") as client:
         assert "Secure" in (await client.get("/login?theme=dark")).headers["set-cookie"]
 
@@ -184,7 +185,7 @@ async def test_a_screen_that_is_not_there_is_not_in_the_bar(running: Served) -> 
         there = set(re.findall(entries, client.get("/settings").text))
         headers = {"Cookie": client.headers["Cookie"]}
     assert {"/fleet", "/devices", "/settings", "/runs"} <= there
-    app = create_app(View("m", "0", running.board, running.store, list, "", SystemClock()), version="0", door=running.door)
+    app = create_app(StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, ""), version="0", door=running.door)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://127.0.0.1", headers=headers) as client:
         assert (await client.get("/fleet")).status_code == 404
         fewer = set(re.findall(entries, (await client.get("/runs")).text))

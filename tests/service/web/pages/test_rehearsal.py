@@ -19,7 +19,7 @@ from abbe.service.web.jobs import add_jobs
 from abbe.service.web.page import HERE, environment
 from abbe.service.web.pages.new import expired
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
-from abbe.service.web.schemas_jobs import LONGEST_RECIPE
+from abbe.service.web.schemas import LONGEST_RECIPE
 from tests.service.core.fakes import utc
 
 STROKES = {"X": (0.0, 600.0), "Y": (0.0, 500.0), "Z": (0.0, 450.0)}

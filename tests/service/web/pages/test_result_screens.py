@@ -17,7 +17,7 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
 from abbe.service.site import machine_from_doc
 from abbe.service.verification.compare_runs import LoadedRun, RunDifference, curve, difference, remarks
-from abbe.service.web.api.field import Motion
+from abbe.service.web.api.results import Motion
 from abbe.service.web.pages.runs import run_document
 from tests.pages_world import Served, as_user
 

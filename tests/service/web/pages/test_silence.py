@@ -5,10 +5,12 @@ from __future__ import annotations
 import httpx
 
 from abbe.service.clock import SystemClock
+from abbe.service.domain.verification import Verification
 from abbe.service.errors import CoreSilent
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.status import Status
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.schemas import Status, Verification
 from tests.pages_world import Served
 from tests.service.web.pages.test_screens import as_user
 
@@ -26,7 +28,7 @@ class Silent:
 
 async def test_every_screen_says_so_and_the_api_gives_a_problem(running: Served) -> None:
     store = running.store
-    app = create_app(Silent(), version="0", door=running.door, api=Sources(store, running.filled.machine, SystemClock()))
+    app = create_app(Silent(), version="0", door=running.door, api=Sources(reader=Reader(store, running.filled.machine, SystemClock())))
     with as_user(running, "adam") as known:
         headers = dict(known.headers) | {"host": "127.0.0.1"}
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url="http://127.0.0.1", headers=headers) as client:

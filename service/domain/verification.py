@@ -1,0 +1,41 @@
+"""A check that has ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Literal
+
+Verdict = Literal["pass", "fail", "cannot tell"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckFailure:
+    """Why a check could not be completed."""
+
+    code: str
+    what: str
+    remedy: str = ""
+    device: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verification:
+    """One check. Figures end in their unit; uncertainties are expanded, k = 2. ``push``: the one that it decided on, 0 for none."""
+
+    id: int
+    machine: str
+    schedule: str
+    recipe: str
+    slot_utc: datetime
+    started_utc: datetime
+    duration_s: float
+    verdict: Verdict
+    values: dict[str, float | None]
+    uncertainties: dict[str, float | None]
+    limits: dict[str, float | None]
+    campaign: str = ""
+    runs: list[str] = field(default_factory=list)
+    text: str
+    cause: CheckFailure | None = None
+    push: int = 0

@@ -1,0 +1,166 @@
+"""Machines, campaigns and runs: what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from abbe.service.domain.document import Doc
+from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, RunRecord
+from abbe.service.queries.reader import Reader, of_row, read_as
+from abbe.service.runs.machine_object import MachineObject
+from abbe.service.storage.repositories.pages import visible_status
+from abbe.service.storage.store import Store
+
+MOST_RUNS = 10_000
+MOST_RESULTS = 1000
+MOST_RUNNING = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineDescription:
+    """A machine as it was described at some time; another description is another number. None: it was stored in another form."""
+
+    number: int
+    name: str
+    created_utc: str
+    description: MachineObject | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignSummary:
+    """Runs that belong together."""
+
+    number: int
+    name: str
+    machine: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSummary:
+    """One measured sequence. ``status`` is as people are told: a run whose process died is incomplete."""
+
+    number: int
+    campaign: str
+    machine: str
+    run_id: str
+    test: str
+    role: str
+    status: str
+    reason: str
+    started_utc: str
+    ended_utc: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignDetail(CampaignSummary):
+    """A campaign with its runs, in the order of measuring, and the numbers of its solutions and discoveries."""
+
+    runs: list[RunSummary]
+    solutions: list[int]
+    discoveries: list[int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunDetail(RunSummary):
+    """A run with its channels. ``gaps``: stretches of samples that are known to be missing."""
+
+    channels: list[ChannelRecord]
+    gaps: int
+
+
+def machines(reader: Reader, name: str | None, cursor: int | None, limit: int) -> tuple[list[MachineDescription], int | None]:
+    """Descriptions of machines, newest first."""
+    rows, after = reader.page("machines", {"name": name}, cursor, limit)
+    return [_machine(row) for row in rows], after
+
+
+def machine(reader: Reader, number: int) -> MachineDescription:
+    """One description. Raises NotStored."""
+    return _machine(reader.row("machines", number, "machine"))
+
+
+def _machine(row: Doc) -> MachineDescription:
+    return of_row(MachineDescription, row, description=read_as(MachineObject, row["doc"]))
+
+
+def campaigns(reader: Reader, machine: str | None, cursor: int | None, limit: int) -> tuple[list[CampaignSummary], int | None]:
+    """Campaigns, newest first."""
+    rows, after = reader.page("campaigns", {"machine": machine}, cursor, limit)
+    return [of_row(CampaignSummary, row) for row in rows], after
+
+
+def campaign(reader: Reader, number: int) -> CampaignDetail:
+    """A campaign with its runs. Raises NotStored."""
+    row = reader.row("campaigns", number, "campaign")
+    given = {"campaign": row["name"]}
+    runs = [_run(one) for one in reversed(reader.store.page("runs", given, None, MOST_RUNS))]
+    solutions, discoveries = (
+        [one["id"] for one in reader.store.page(kind, given, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
+    )
+    return of_row(CampaignDetail, row, runs=runs, solutions=solutions, discoveries=discoveries)
+
+
+def runs(reader: Reader, given: Mapping[str, str | None], cursor: int | None, limit: int) -> tuple[list[RunSummary], int | None]:
+    """Runs, newest first, also those that were broken off.
+
+    Parameters
+    ----------
+    given : mapping
+        ``campaign``, ``machine``, ``test``, ``role``, ``status`` (as written: a run whose process died is ``running`` here); None: any.
+    cursor, limit
+        From where on, and at most how many.
+    """
+    rows, after = reader.page("runs", given, cursor, limit)
+    return [_run(row) for row in rows], after
+
+
+def runs_by_state(reader: Reader, campaign: str, test: str, state: str, limit: int) -> tuple[list[RunSummary], bool]:
+    """The newest runs whose visible state fits (empty: any), and whether there are more."""
+    given = {"campaign": campaign or None, "test": test or None, "status": state or None}
+    if state not in (INCOMPLETE, RUNNING):
+        found, after = runs(reader, given, None, limit)
+        return found, after is not None
+    # Both are written as running; which one it is depends on whether its process still lives.
+    fitting = [run for run in runs(reader, given | {"status": RUNNING}, None, MOST_RUNNING)[0] if run.status == state]
+    return fitting[:limit], len(fitting) > limit
+
+
+def run(reader: Reader, number: int) -> RunDetail:
+    """One run, and which channels it holds. Raises NotStored."""
+    row = reader.row("runs", number, "run")
+    end = reader.store.run(number).end_doc or {}
+    state = visible_status(row)
+    known = {"run_id": row["label"], "status": state, "reason": _reason(state, row["reason"], end)}
+    return of_row(RunDetail, row, **known, channels=reader.store.channels(number), gaps=len(end.get("gaps") or []))
+
+
+def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
+    """Runs (of one campaign), oldest first; a complete run with gaps says how many samples it lacks. Raises NotStored."""
+    owners = [store.campaign(campaign)] if campaign is not None else store.campaigns()
+    names = {one.id: store.machine(one.machine_id).name for one in owners}
+    found = store.runs(owners[0].id if campaign is not None else None)
+    return [run_summary(one, names[one.campaign_id]) for one in found]
+
+
+def run_summary(record: RunRecord, machine: str) -> RunSummary:
+    """A run that was read whole."""
+    row = {name: getattr(record, name) for name in RunRecord.__dataclass_fields__}
+    state = record.visible_status
+    return of_row(RunSummary, row, machine=machine, run_id=record.label, status=state, reason=_reason(state, record.reason, record.end_doc))
+
+
+def _run(row: Doc) -> RunSummary:
+    state = visible_status(row)
+    return of_row(RunSummary, row, run_id=row["label"], status=state, reason=_reason(state, row["reason"], None))
+
+
+def _reason(state: str, reason: str, end: Doc | None) -> str:
+    """Why a run is not complete, or what it lacks although it is."""
+    if state == INCOMPLETE:
+        return "its process ended before the run was closed; the next command that connects to the machine takes over what was saved"
+    gaps = (end or {}).get("gaps") or []
+    if reason or not gaps:
+        return reason
+    return f"{len(gaps)} gaps, {sum(gap['last'] - gap['first'] + 1 for gap in gaps if gap.get('last') is not None)} samples missing"

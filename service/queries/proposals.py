@@ -1,0 +1,197 @@
+"""Proposed tables and where each stands: the same for page, HTTP and command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+from abbe.service.compensation.proposal_diff import ACTIVE, TableDifference, compare
+from abbe.service.compensation.proposal_doc import Proposed, load
+from abbe.service.compensation.proposal_states import ProposalStatus, status_of_proposal
+from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
+from abbe.service.errors import NotStored, Unusable
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import JournalEntry
+from abbe.service.queries.reader import Doc, Reader, as_stored, of_row
+from abbe.service.storage.base import utc_text
+
+ProposalState = Literal["refused", "rejected", "proposed", "approved", "expired", "superseded", "pushed", "kept", "rolled back", "changed"]
+OPEN: tuple[ProposalState, ...] = ("proposed", "approved")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictedRms:
+    """What the model promises, µm: rms over the volume before and after, and the standard uncertainty of the improvement."""
+
+    before: float
+    after: float
+    u_model: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalSummary:
+    """Proposed tables. ``state`` changed: the row is not what was stored, so nothing else can be said of it. ``by``: account."""
+
+    number: int
+    machine: str
+    solution: int
+    created_utc: str
+    state: ProposalState
+    why: str
+    campaign: str = ""
+    by: str = ""
+    predicted_rms_um: PredictedRms | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalDetail(ProposalSummary):
+    """A proposal with everything that is needed to judge it, but for the numbers of the tables (`difference`)."""
+
+    valid_until: str
+    base_crc: str
+    generation: int
+    boot: str
+    digest: str
+    two_people: bool
+    reasons: list[str]
+    not_for_tables: list[str]
+    approvals: list[ProposalApproval]
+    rejections: list[ProposalRejection]
+
+    @property
+    def waits(self) -> bool:
+        """Whether it can still be approved."""
+        return self.state in OPEN
+
+
+class _Standings:
+    """Where proposals of one store stand; journals and tables are read once for all of them."""
+
+    def __init__(self, reader: Reader) -> None:
+        self._reader = reader
+        self._tables = {table.id: table.doc for table in reader.store.tables()}
+        self._journals: dict[str, list[JournalEntry]] = {}
+
+    def of(self, number: int, proposed: Proposed) -> ProposalStatus:
+        """Where one stands."""
+        store, machine = self._reader.store, proposed.candidate.machine
+        if machine not in self._journals:
+            self._journals[machine] = read_entries(store, machine, self._reader.control_of(machine))
+        entries = self._journals[machine]
+        return status_of_proposal(
+            number, proposed, store.approvals(number), entries, self._tables, self._reader.now_s, store.rejections(number)
+        )
+
+
+def proposals(reader: Reader, machine: str | None, cursor: int | None, limit: int) -> tuple[list[ProposalSummary], int | None]:
+    """Proposals, newest first. One whose row was changed says so, and does not hide the others."""
+    rows, after = reader.page("proposals", {"machine": machine}, cursor, limit)
+    standings = _Standings(reader) if rows else None
+    return [_summary(reader, row, standings) for row in rows if standings is not None], after
+
+
+def _summary(reader: Reader, row: Doc, standings: _Standings) -> ProposalSummary:
+    try:
+        with as_stored():
+            proposed = load(reader.store, row["id"])
+            now = standings.of(row["id"], proposed)
+    except (Unusable, NotStored) as error:
+        return of_row(ProposalSummary, row, solution=row["solution_id"], state="changed", why=error.detail)
+    return of_row(ProposalSummary, row, **_known(row, proposed, now))
+
+
+def _known(row: Doc, proposed: Proposed, now: ProposalStatus) -> Doc:
+    p = proposed.predicted
+    predicted = PredictedRms(before=p.before_mm * 1e3, after=p.after_mm * 1e3, u_model=p.u_model_mm * 1e3)
+    known = {"solution": row["solution_id"], "campaign": proposed.campaign, "by": proposed.by, "predicted_rms_um": predicted}
+    return known | {"state": now.word, "why": now.text}
+
+
+def proposal(reader: Reader, number: int) -> ProposalDetail:
+    """One proposal: what it promises with its uncertainty, where it stands, the reasons against it.
+
+    Raises
+    ------
+    NotStored
+        There is none.
+    Unusable
+        Its row was changed after it was stored.
+    """
+    row, store = reader.row("proposals", number, "proposal"), reader.store
+    with as_stored():
+        proposed = load(store, number)
+        now = _Standings(reader).of(number, proposed)
+    c = proposed.candidate
+    return of_row(
+        ProposalDetail,
+        row,
+        **_known(row, proposed, now),
+        valid_until=utc_text(datetime.fromtimestamp(proposed.valid_until_s, UTC)),
+        base_crc=f"{c.base_crc:08X}",
+        generation=proposed.base.gen,
+        boot=f"{proposed.base.boot:08X}",
+        digest=c.digest,
+        two_people=proposed.two_people,
+        reasons=list(proposed.reasons),
+        not_for_tables=list(proposed.not_for_tables),
+        approvals=store.approvals(number),
+        rejections=store.rejections(number),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurveDifference:
+    """One of the nine tables, before and after. ``u_um``: standard uncertainty of the new entries."""
+
+    table: str
+    moved: str
+    corrected: str
+    position_mm: list[float]
+    old_um: list[float]
+    new_um: list[float]
+    u_um: list[float]
+    largest_change_um: float
+    at_mm: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalDifference:
+    """What a proposal changes, in numbers; ``new``, ``old``: what is compared."""
+
+    new: str
+    old: str
+    tables: list[CurveDifference]
+
+
+def difference(reader: Reader, number: int, other: int | None = None) -> ProposalDifference:
+    """What a proposal changes: nine tables in numbers, with uncertainty; ``other``: another proposal, None: the table in force.
+
+    Raises
+    ------
+    NotStored
+        There is no such proposal.
+    """
+    for one in (number, other or number):
+        reader.row("proposals", one, "proposal")
+    with as_stored():
+        return difference_of(compare(reader.store, number, ACTIVE if other is None else str(other)))
+
+
+def difference_of(found: TableDifference) -> ProposalDifference:
+    """Tables that were compared, as numbers for programs."""
+    tables = [
+        CurveDifference(
+            table=f"{c.corrected} over {c.moved}",
+            moved=c.moved,
+            corrected=c.corrected,
+            position_mm=c.position_mm.tolist(),
+            old_um=(c.old_mm * 1e3).tolist(),
+            new_um=(c.new_mm * 1e3).tolist(),
+            u_um=(c.u_mm * 1e3).tolist(),
+            largest_change_um=float(c.change_mm[c.worst] * 1e3),
+            at_mm=float(c.position_mm[c.worst]),
+        )
+        for c in found.curves
+    ]
+    return ProposalDifference(new=found.new, old=found.old, tables=tables)

@@ -1,0 +1,50 @@
+"""The journal of pushes, and with it which table is in force and how it came there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from abbe.service.queries.reader import Reader, of_row
+from abbe.service.tables.table_history import TableHistory, table_history
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushEntry:
+    """One transition of one push in the journal of a machine, chained to the one before it."""
+
+    number: int
+    machine: str
+    push: int
+    seq: int
+    state: str
+    utc: str
+    prev: str
+    digest: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushEntryDetail(PushEntry):
+    """An entry with everything that became known with it; tables are hexadecimal images."""
+
+    known: dict[str, Any]
+
+
+def push_entries(
+    reader: Reader, machine: str | None, push: int | None, state: str | None, cursor: int | None, limit: int
+) -> tuple[list[PushEntry], int | None]:
+    """The journal of pushes, newest entry first; of a machine that was renamed under the name that its journal was begun with."""
+    journal = machine and reader.store.push_chain(machine, reader.control_of(machine))
+    rows, after = reader.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
+    return [of_row(PushEntry, row) for row in rows], after
+
+
+def push_entry(reader: Reader, number: int) -> PushEntryDetail:
+    """One entry of the journal, with everything that became known with it. Raises NotStored."""
+    row = reader.row("pushes", number, "entry of a push")
+    return of_row(PushEntryDetail, row, known=row["doc"])
+
+
+def tables(reader: Reader) -> TableHistory:
+    """The table in force on this service's machine, its pushes, and what can be ordered back. Raises JournalChanged."""
+    return table_history(reader.store, reader.machine, reader.control)

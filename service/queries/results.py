@@ -1,0 +1,226 @@
+"""Solutions, discoveries, and the map of a solution's volume: what was found from runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from abbe.service.discovery.changed_words import proved
+from abbe.service.discovery.discovery_states import taken_back
+from abbe.service.errors import Unusable
+from abbe.service.identification.solution_field import node_map, stored_field
+from abbe.service.queries.reader import Doc, Reader, as_stored, of_row, read_as
+from abbe.service.runs.discovery_file import DiscoveryFile
+from abbe.service.runs.solution_file import SolutionFile
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolutionSummary:
+    """What a solver found from some runs."""
+
+    number: int
+    campaign: str
+    machine: str
+    kind: str
+    runs: list[int]
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolutionDetail(SolutionSummary):
+    """A solution with every parameter, its standard uncertainty, and what was not observable from the runs (``not_observable``)."""
+
+    document: SolutionFile
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscoverySummary:
+    """One search for what a campaign's model lacks."""
+
+    number: int
+    campaign: str
+    machine: str
+    created_utc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscoveryState:
+    """One state that a search reached."""
+
+    state: str
+    utc: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangeRival:
+    """Another change that explains nearly as much: natural logarithm of how much less likely it is."""
+
+    name: str
+    less_evidence: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionChange:
+    """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
+
+    ``u``: standard uncertainty; ``rivals``: what these runs cannot tell it from; ``halves``: by how many of two halves of the runs it was
+    chosen without the other.
+    """
+
+    motion: str
+    part: Literal["linear", "shape"]
+    value: float
+    u: float
+    unit: Literal["um/m", "urad", "um"]
+    evidence: float
+    rivals: list[ChangeRival]
+    halves: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangeGap:
+    """Measured less the solution from before, rms over runs that did not choose what changed: without and with it, and noise."""
+
+    before_um: float
+    after_um: float
+    floor_um: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangedSince:
+    """What has changed since an earlier solution.
+
+    ``gap``, ``judged``: None where too few set-ups judge; ``judged``: log of how much more likely runs are with what they did not choose;
+    ``hidden_um_m``: how much each scale and squareness may have changed all the same; ``beside``: effects that were found in the same runs
+    and may be the same thing; ``trouble``: why the runs say nothing.
+    """
+
+    since: int
+    changes: list[MotionChange]
+    gap: ChangeGap | None
+    judged: float | None
+    hidden_um_m: dict[str, float]
+    proved: bool
+    beside: tuple[str, ...] = ()
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscoveryDetail(DiscoverySummary):
+    """A search with its states and, once it has one, its answer; ``changed`` where an earlier solution could be compared."""
+
+    states: list[DiscoveryState]
+    answer: DiscoveryFile | None
+    changed: ChangedSince | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HiddenMotion:
+    """A motion that the runs do not show by itself, and why."""
+
+    motion: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VolumeMap:
+    """Deviation (actual minus nominal, best-fit rigid motion removed) at the nodes of an even grid over the strokes, X slowest.
+
+    Nodes lie at every crossing of ``x_mm``, ``y_mm``, ``z_mm``. ``motions``: what the map is made of. ``deviation_um``: dX, dY, dZ;
+    ``expanded_um``: their U and that of the length, k = 2. ``told``: whether the 95 % ellipsoid about the deviation leaves out zero; where
+    it does not, neither error nor direction is known. ``hidden``: motions that have no map of their own.
+    """
+
+    solution: int
+    motions: list[str]
+    nodes: int
+    x_mm: list[float]
+    y_mm: list[float]
+    z_mm: list[float]
+    deviation_um: list[tuple[float, float, float]]
+    expanded_um: list[tuple[float, float, float, float]]
+    told: list[bool]
+    coverage_factor: float = 2.0
+    hidden: list[HiddenMotion]
+
+
+def solutions(
+    reader: Reader, campaign: str | None, machine: str | None, cursor: int | None, limit: int
+) -> tuple[list[SolutionSummary], int | None]:
+    """Solutions, newest first."""
+    rows, after = reader.page("solutions", {"campaign": campaign, "machine": machine}, cursor, limit)
+    return [of_row(SolutionSummary, row, runs=row["run_ids"]) for row in rows], after
+
+
+def solution(reader: Reader, number: int) -> SolutionDetail:
+    """A solution: parameters with uncertainties, what was not observable, residuals, budget.
+
+    Raises
+    ------
+    NotStored
+        There is none.
+    Unusable
+        It was stored in another form.
+    """
+    row = reader.row("solutions", number, "solution")
+    document = read_as(SolutionFile, row["doc"])
+    if document is None:
+        raise Unusable(f"solution {number} was stored in another form than abbe-solution/1", "solve the campaign again")
+    return of_row(SolutionDetail, row, runs=row["run_ids"], document=document)
+
+
+def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) -> VolumeMap:
+    """The map of the volume; a thousandth of a micrometre is far below every U.
+
+    Parameters
+    ----------
+    number : int
+        Of the solution.
+    motions : sequence of str
+        Only what these make together; none: all of them.
+    nodes : int
+        So many per axis.
+    """
+    reader.row("solutions", number, "solution")
+    with as_stored():
+        stored = stored_field(reader.store, reader.store.solution(number))
+        found = node_map(stored, nodes, motions)
+    grid = found.points_mm.reshape(nodes, nodes, nodes, 3)
+    x, y, z = ([round(float(v), 3) for v in axis] for axis in (grid[:, 0, 0, 0], grid[0, :, 0, 1], grid[0, 0, :, 2]))
+    return VolumeMap(
+        solution=number,
+        motions=[name for name in stored.motions if not motions or name in motions],
+        nodes=nodes,
+        x_mm=x,
+        y_mm=y,
+        z_mm=z,
+        deviation_um=found.deviation_um.round(3).tolist(),
+        expanded_um=(2.0 * found.u_um).round(3).tolist(),
+        told=found.told.tolist(),
+        hidden=[HiddenMotion(motion=name, reason=why) for name, why in stored.hidden.items()],
+    )
+
+
+def discoveries(
+    reader: Reader, campaign: str | None, machine: str | None, cursor: int | None, limit: int
+) -> tuple[list[DiscoverySummary], int | None]:
+    """Searches for missing effects, newest first."""
+    rows, after = reader.page("discoveries", {"campaign": campaign, "machine": machine}, cursor, limit)
+    return [of_row(DiscoverySummary, row) for row in rows], after
+
+
+def discovery(reader: Reader, number: int) -> DiscoveryDetail:
+    """A search: its states, and what it found. Raises NotStored."""
+    row = reader.row("discoveries", number, "discovery")
+    steps = reader.store.discovery_steps(number)
+    states = [DiscoveryState(state=one.state, utc=one.utc, why=str(one.doc.get("why", ""))) for one in steps]
+    found: Doc | None = next((taken_back(one.doc["finding"]) for one in steps if "finding" in one.doc), None)
+    answer = None if found is None else read_as(DiscoveryFile, found.get("answer"))
+    return of_row(DiscoveryDetail, row, states=states, answer=answer, changed=_changed(found))
+
+
+def _changed(found: Doc | None) -> ChangedSince | None:
+    told: Any = None if found is None else found.get("changed")
+    return None if told is None else read_as(ChangedSince, told | {"proved": proved(told)})

@@ -1,0 +1,204 @@
+"""How things stand at this moment: what the core says, what is due, and what the store has of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Literal, Protocol
+
+from pydantic import TypeAdapter
+
+from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.verification import Verification
+from abbe.service.queries.checks import latest_checks
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.timetable import NextDue, next_due
+from abbe.service.verification.alarm_states import folded, is_open
+from abbe.service.verification.alarms import alarm_doc
+from abbe.service.verification.verified_by import VerifiedBy, strange_table, verified_by
+
+LATEST = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BrokerStatus:
+    """The way to the broker. ``waiting``, ``dropped``: messages."""
+
+    configured: bool
+    broker: str = ""
+    connected: bool = False
+    waiting: int = 0
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenAlarm:
+    """An alarm that is active, or not acknowledged. ``signals``: figures behind it; ``outcome``: what was done so far."""
+
+    alarm: int
+    state: Literal["raised", "acknowledged", "cleared"]
+    recipe: str
+    schedule: str
+    text: str
+    signals: list[dict[str, str | float | None]]
+    raised_utc: datetime
+    acknowledged_by: str = ""
+    cleared_utc: datetime | None = None
+    outcome: str = ""
+    proposal: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Activity:
+    """What the core says: the check that runs, the devices, and what needs a person now."""
+
+    job: RunningCheck | None
+    devices: list[DeviceStatus]
+    attention: list[str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveEvent(Activity):
+    """One event of ``/api/v1/live``. ``revision`` grows when more than the progress of a check has changed."""
+
+    event: Literal["moment"] = "moment"
+    revision: int
+    mqtt_connected: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status(Activity):
+    """Everything the home page shows. ``revision`` changes when more than the progress of a running check has changed; ``last``: checks,
+    newest first; ``verified``: which measurement stands behind the table in force."""
+
+    machine: str
+    version: str
+    now_utc: datetime
+    revision: str
+    next_due: list[NextDue]
+    mqtt: BrokerStatus
+    alarms: list[OpenAlarm] = field(default_factory=list)
+    last: list[Verification]
+    verified: VerifiedBy
+
+
+_ALARM = TypeAdapter(OpenAlarm)
+
+
+class CoreState(Protocol):
+    """What the core knows now. Every property raises CoreSilent while the core does not answer."""
+
+    @property
+    def devices(self) -> list[DeviceStatus]:
+        """The devices, and when they were last heard of."""
+        ...
+
+    @property
+    def job(self) -> RunningCheck | None:
+        """The check that runs."""
+        ...
+
+    @property
+    def changes(self) -> int:
+        """Grows when more than the progress of a check has changed."""
+        ...
+
+    @property
+    def mqtt_connected(self) -> bool:
+        """Whether the broker is there."""
+        ...
+
+    @property
+    def mqtt_dropped(self) -> int:
+        """Alarms that were dropped because too many waited for the broker."""
+        ...
+
+    @property
+    def attention(self) -> list[str]:
+        """What needs a person now."""
+        ...
+
+
+class StatusSource(Protocol):
+    """Where the pages get the status from."""
+
+    async def status(self) -> Status:
+        """Return everything the home page shows."""
+        ...
+
+    async def verifications(self, limit: int) -> list[Verification]:
+        """Return the latest checks, newest first."""
+        ...
+
+    async def ready(self) -> None:
+        """Return if a check could be kept and shown now; raise what is wrong."""
+        ...
+
+
+class StatusReader:
+    """Puts the status together; never writes.
+
+    Parameters
+    ----------
+    reader : Reader
+        The store, the machine and the clock.
+    version : str
+        Version of this program.
+    core : CoreState
+        What the core says.
+    upcoming : callable
+        What comes next of each schedule, soonest first.
+    broker : str
+        Address of the broker as shown to people; empty if there is none in the machine file.
+    """
+
+    def __init__(
+        self, reader: Reader, version: str, core: CoreState, upcoming: Callable[[], Sequence[tuple[Schedule, datetime]]], broker: str
+    ) -> None:
+        self.reader, self._version, self._core, self._upcoming, self._broker = reader, version, core, upcoming, broker
+
+    async def verifications(self, limit: int) -> list[Verification]:
+        """Return the latest checks, newest first."""
+        return await asyncio.to_thread(latest_checks, self.reader, limit)
+
+    async def ready(self) -> None:
+        """Return if the store can be read and the core has said lately how things stand; else raise what is wrong."""
+        await self.verifications(1)
+        _ = self._core.changes
+
+    async def status(self) -> Status:
+        """Return everything the home page shows."""
+        reader, core, upcoming = self.reader, self._core, self._upcoming()
+        now, machine = reader.clock.utc(), reader.machine
+        job, attention = core.job, core.attention
+        entries = await asyncio.to_thread(reader.store.alarm_entries, machine)
+        # A slot that was skipped leaves no check and may leave no alarm: without it an open page would go on as if it had not been due.
+        slot = await asyncio.to_thread(reader.store.newest_slot, [f"{machine}/{schedule.name}" for schedule, _ in upcoming])
+        strange = strange_table(attention)
+        known = await asyncio.to_thread(verified_by, reader.store, machine, control=reader.control, strange=strange)
+        last = await self.verifications(LATEST)
+        asked = 0 if job is None else job.prompt
+        return Status(
+            machine=machine,
+            version=self._version,
+            now_utc=now,
+            revision=f"{last[0].id if last else 0}.{core.changes}.{len(entries)}.{asked}.{known.why}{known.number}.{slot}",
+            job=job,
+            devices=core.devices,
+            attention=attention,
+            next_due=[next_due(schedule, slot_utc, now) for schedule, slot_utc in upcoming],
+            mqtt=await self._mqtt(),
+            alarms=[_ALARM.validate_python(alarm_doc(one)) for one in reversed(folded(entries)) if is_open(one)],
+            last=last,
+            verified=known,
+        )
+
+    async def _mqtt(self) -> BrokerStatus:
+        if not self._broker:
+            return BrokerStatus(configured=False)
+        core, waiting = self._core, await asyncio.to_thread(self.reader.store.waiting_messages)
+        return BrokerStatus(configured=True, broker=self._broker, connected=core.mqtt_connected, waiting=waiting, dropped=core.mqtt_dropped)

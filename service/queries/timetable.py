@@ -1,0 +1,83 @@
+"""The timetable: what is due next, in words, and what became of past slots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, tzinfo
+from zoneinfo import ZoneInfo
+
+from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import SlotRecord
+from abbe.service.queries.reader import Reader
+from abbe.service.scheduler.slots import cron_in_words, next_slot
+
+LATEST = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NextDue:
+    """What comes next of one schedule; ``cron_words`` and ``words``: its rule and when that is, in English."""
+
+    schedule: str
+    recipe: str
+    due_utc: datetime
+    timezone: str
+    cron_words: str
+    words: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScheduleState(Schedule):
+    """One line of the timetable. ``next_due_utc`` None: its expression never matches again; ``latest``: slots, newest first."""
+
+    in_words: str
+    next_due_utc: datetime | None
+    latest: list[SlotRecord]
+
+
+def next_due(schedule: Schedule, slot_utc: datetime, now: datetime) -> NextDue:
+    """A slot that comes, as people read it."""
+    return NextDue(
+        schedule=schedule.name,
+        recipe=schedule.recipe,
+        due_utc=slot_utc,
+        timezone=schedule.timezone,
+        cron_words=cron_in_words(schedule),
+        words=due_in_words(slot_utc, now, ZoneInfo(schedule.timezone)),
+    )
+
+
+def schedule_state(reader: Reader, schedule: Schedule) -> ScheduleState:
+    """A schedule with what is due next, and what became of its latest slots."""
+    return ScheduleState(
+        **{name: getattr(schedule, name) for name in Schedule.__dataclass_fields__},
+        in_words=cron_in_words(schedule),
+        next_due_utc=next_slot(schedule, reader.clock.utc()),
+        latest=past_slots(reader, schedule.name, LATEST),
+    )
+
+
+def past_slots(reader: Reader, schedule: str, limit: int) -> list[SlotRecord]:
+    """The latest slots of a schedule of this service's machine, newest first."""
+    return reader.store.slots_of(f"{reader.machine}/{schedule}", limit)
+
+
+def due_in_words(moment: datetime, now: datetime, zone: tzinfo) -> str:
+    """When something is due: ``Monday 23 November 06:00, in 2 days``."""
+    left_s = (moment - now).total_seconds()
+    local = moment.astimezone(zone)
+    clock = f"{local:%H:%M}" if local.second == 0 else f"{local:%H:%M:%S}"
+    day = "today" if local.date() == now.astimezone(zone).date() else f"{local:%A} {local.day} {local:%B}"
+    return f"{day} {clock}, in {span(left_s)}" if left_s > 0 else f"{day} {clock}, now"
+
+
+def span(seconds: float) -> str:
+    """A length of time in the largest sensible unit: ``40 s``, ``5 min``, ``3 h``, ``2 days``."""
+    seconds = abs(seconds)
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 90 * 60:
+        return f"{seconds / 60:.0f} min"
+    if seconds < 36 * 3600:
+        return f"{seconds / 3600:.0f} h"
+    return f"{seconds / 86400:.0f} days"

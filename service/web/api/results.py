@@ -1,0 +1,105 @@
+"""Routes: solutions with the map of their volume, discoveries, checks and their trends."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Literal
+
+from fastapi import FastAPI, Query
+from pydantic import BeforeValidator
+
+from abbe.service.domain.verification import Verification
+from abbe.service.queries import checks as checked
+from abbe.service.queries import results
+from abbe.service.users.roles import Permission
+from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
+from abbe.service.web.login.access import needs
+from abbe.service.web.schemas import CheckList, DiscoveryList, SolutionList
+
+MOST_NODES = 9
+Nodes = Annotated[int, Query(ge=2, le=MOST_NODES, description="So many per axis.")]
+Motion = Literal[
+    "EXX", "EYX", "EZX", "EAX", "EBX", "ECX", "EXY", "EYY", "EZY", "EAY", "EBY", "ECY",
+    "EXZ", "EYZ", "EZZ", "EAZ", "EBZ", "ECZ", "C0Y", "B0Z", "A0Z",
+]  # fmt: skip
+Motions = Annotated[list[Motion], Query(max_length=21, description="Only what these make together; none: all of them.")]
+
+
+def _no_number(value: object) -> object:
+    """Refuse a count of seconds: a person cannot check it."""
+    try:
+        float(str(value))
+    except ValueError:
+        return value
+    raise ValueError("expected a date and time, e.g. 2026-11-21T03:00:00Z")
+
+
+UtcTime = Annotated[datetime, BeforeValidator(_no_number)]
+After = Annotated[UtcTime | None, Query(description="Only later checks (UTC if it does not say); absent: since the table came.")]
+
+
+def add_results(app: FastAPI, sources: Sources) -> None:
+    """Add the routes."""
+    _add_solutions(app, sources)
+    _add_discoveries(app, sources)
+    _add_checks(app, sources)
+
+
+def _add_solutions(app: FastAPI, sources: Sources) -> None:
+    @app.get("/api/v1/solutions")
+    @needs(Permission.READ)
+    def solutions(campaign: Filter = None, machine: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> SolutionList:
+        """Solutions, newest first."""
+        found, after = results.solutions(sources.reader, campaign, machine, cursor, limit)
+        return SolutionList(solutions=found, next_cursor=after)
+
+    @app.get("/api/v1/solutions/{number}")
+    @needs(Permission.READ)
+    def solution(number: Number) -> results.SolutionDetail:
+        """A solution: parameters with uncertainties, what was not observable, residuals, budget."""
+        return results.solution(sources.reader, number)
+
+    @app.get("/api/v1/solutions/{number}/field")
+    @needs(Permission.READ)
+    def field(number: Number, motion: Motions = [], nodes: Nodes = 6) -> results.VolumeMap:  # noqa: B006 - FastAPI copies it
+        """The map of the volume: deviation and uncertainty at the nodes, from the solution's whole covariance."""
+        return results.volume_map(sources.reader, number, motion, nodes)
+
+
+def _add_discoveries(app: FastAPI, sources: Sources) -> None:
+    @app.get("/api/v1/discoveries")
+    @needs(Permission.READ)
+    def discoveries(campaign: Filter = None, machine: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> DiscoveryList:
+        """Searches for missing effects, newest first."""
+        found, after = results.discoveries(sources.reader, campaign, machine, cursor, limit)
+        return DiscoveryList(discoveries=found, next_cursor=after)
+
+    @app.get("/api/v1/discoveries/{number}")
+    @needs(Permission.READ)
+    def discovery(number: Number) -> results.DiscoveryDetail:
+        """A search: its states, and what it found."""
+        return results.discovery(sources.reader, number)
+
+
+def _add_checks(app: FastAPI, sources: Sources) -> None:
+    @app.get("/api/v1/checks")
+    @needs(Permission.READ)
+    def checks(machine: Filter = None, verdict: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> CheckList:
+        """Checks of all machines of the store, newest first."""
+        found, after = checked.checks(sources.reader, machine, verdict, cursor, limit)
+        return CheckList(verifications=found, next_cursor=after)
+
+    @app.get("/api/v1/checks/{number}")
+    @needs(Permission.READ)
+    def check(number: Number) -> Verification:
+        """One check: figures with uncertainties (k = 2), limits, verdict."""
+        return checked.check(sources.reader, number)
+
+    @app.get("/api/v1/trends")
+    @needs(Permission.READ)
+    def trends(
+        machine: Annotated[str | None, Query(description="Absent: the machine of this service.")] = None, after: After = None
+    ) -> checked.Trends:
+        """Whether the figures of the checks drift, since when, and when they reach their limits."""
+        since = after.replace(tzinfo=UTC) if after is not None and after.tzinfo is None else after
+        return checked.trends(sources.reader, sources.reader.machine if machine is None else machine, since)
