@@ -13,7 +13,7 @@ BENCH_READY := $(BENCH_VENV)/.ready
 COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long lint fmt bench lock clean
+.PHONY: help demo test test-long lint fmt docs bench lock clean
 # Most of a test's time is waiting for ports and processes, so there are more workers than cores; each may take a gigabyte.
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 WORKERS ?= $(shell n=$$(( $(CORES) * 2 )); echo $$(( n < 8 ? n : 8 )))
@@ -41,6 +41,14 @@ lint: $(DEV_READY) ## style, formatting, types, import walls
 fmt: $(DEV_READY) ## sort imports and format
 	$(BIN)/ruff check --fix-only --quiet
 	$(BIN)/ruff format
+
+docs: $(DEV_READY) ## write the pages of docs/ that come from the code: commands, machine file, error codes, formats, faults, schemas
+	@$(BIN)/python -m tests.project.cli_page
+	@$(BIN)/python -m tests.project.machine_file_page
+	@$(BIN)/python -m tests.service.formats.page
+	@$(BIN)/python -m tests.faults.page
+	@$(BIN)/python -m abbe.service.web.catalogue > docs/reference/error-codes.md
+	@$(BIN)/abbe schema
 
 bench: $(BENCH_READY) ## speed and memory of the fast paths against other libraries (own environment, .venv-bench)
 	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/kernel/test_kernel_threads.py tests/experiments/test_bench_case.py tests/experiments/test_bench_trials.py tests/experiments/test_bench_discovery.py

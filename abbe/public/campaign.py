@@ -17,7 +17,7 @@ def read_campaign(source: str | Path, *, database: str | None = None) -> Campaig
     Parameters
     ----------
     source : str or Path
-        Folder with campaign.json (docs/reference/formats.md); with ``database`` the name of a campaign there.
+        Folder with campaign.json (docs/schemas); with ``database`` the name of a campaign there.
     database : str, optional
         Address of the store, e.g. ``"sqlite:///abbe.sqlite3"``.
 
