@@ -44,10 +44,10 @@ def _commands(group: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 def _section(name: str, command: Any) -> str:
     with command.make_context(name, [], resilient_parsing=True) as context:
-        usage = " ".join(command.collect_usage_pieces(context))
+        usage = " ".join(word.strip("{}") for word in command.collect_usage_pieces(context) if word != "[OPTIONS]")
         rows = [row for row in (p.get_help_record(context) for p in command.params) if row]
-    text = f"\n## {name}\n\n`{name} {usage}`\n\n{_line(command.help or '')}\n"
-    rows = [(_line(left), _line(right.removesuffix("[required]"))) for left, right in rows if "--help" not in left]
+    text = f"\n## {name} {usage}".rstrip() + f"\n\n{_line(command.help or '')}\n"
+    rows = [(re.sub(r" <.*>", "", left), _line(right.removesuffix("[required]"))) for left, right in rows if "--help" not in left]
     rows = [(left, right) for left, right in rows if right and not right.startswith(_COMMON)]
     return text + ("\n| | |\n|---|---|\n" + "".join(f"| `{left}` | {right} |\n" for left, right in rows) if rows else "")
 

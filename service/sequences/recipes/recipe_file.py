@@ -94,7 +94,7 @@ def _config_error(source: str, errors: list[ErrorDetails]) -> ConfigError:
         return ConfigError(f"{source}: key {where((*place, 'kind'))!r} is missing{tail}", f"add kind = {' or '.join(map(repr, KINDS))}")
     if first["type"] == "missing":
         return ConfigError(f"{source}: key {where(place)!r} is missing{tail}", f"add {place[-1]} = ...")
-    return ConfigError(f"{source}: {where(place)}: {expected(first)}{tail}", "correct it; docs/reference/recipe-file.md describes every key")
+    return ConfigError(f"{source}: {where(place)}: {expected(first)}{tail}", "correct it; docs/reference/recipe-file.md has all keys")
 
 
 def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
