@@ -28,7 +28,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board
 from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import Ground, Hands, Orders, full_campaigns
+from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns
 from abbe.service.core.push_recovery import PushRecovery
 from abbe.service.core.rights import may, may_measure
 from abbe.service.core.setup import ServiceSetup
@@ -47,7 +47,7 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
 from abbe.service.scheduler.heartbeat import Heartbeat
-from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.job import Checks
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
@@ -92,19 +92,19 @@ class Service:
         topics = (setup.topics.verification, setup.topics.alarm) if self._publisher is not None else None
         self._shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
         book = AuditBook(store, setup.store_url)
-        alarms = self._make_alarms(book, watchers)
-        job = CheckJob(setup.machine, setup.check(store), self._shelf, watchers, clock, alarms.checked if alarms is not None else None)
+        alarms = self._make_alarms(book)
+        checks = Checks(setup.machine, setup.check(store), self._shelf, clock, alarms.checked if alarms is not None else None)
         recipes = tuple(dict.fromkeys([*setup.recipes, *(parted(schedule.recipe)[0] for schedule in setup.schedules)]))
-        self._jobs = JobRegistry(job.run, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed)
-        ground = Ground(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, watchers, setup.control)
+        self._jobs = JobRegistry(checks, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed, watchers)
+        context = OrderContext(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, setup.control)
         if setup.campaign is not None:
             self._jobs.full = full_campaigns(
-                ground, setup.campaigns, setup.campaign(store), lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE)
+                context, setup.campaigns, setup.campaign(store), lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE)
             )
-        terms = LoopTerms(setup.maintenance, setup.ready(clock), errands=alarms, carry=self._jobs.errand)
+        terms = LoopTerms(setup.maintenance, setup.ready(clock), follow_ups=alarms, run_job=self._jobs.run)
         self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._jobs, self._shelf, clock, terms)
         snapshots = SnapshotSource(self.board, self._jobs, self._scheduler.next_due, clock)
-        orders = Orders(store, clock, self._jobs, ground, Hands() if setup.hands is None else setup.hands(store))
+        orders = Orders(store, clock, self._jobs, context, OrderActions() if setup.actions is None else setup.actions(store))
         begin = self._begin((*recipes, *self._jobs.full.names))
         self._web = WebProcess(begin, listening, snapshots.now, self._jobs, clock, setup.live, orders)
         self._opcua = self._make_opcua()
@@ -157,11 +157,11 @@ class Service:
         view = StatusReader(reader, version("abbe"), self.board, self._scheduler.next_due, broker)
         return OpcUaServer(setup.opcua, Gatherer(view.status, self._store, setup.control), self._clock, setup.machine, version("abbe"))
 
-    def _make_alarms(self, book: AuditBook, watchers: list[JobWatcher]) -> AlarmManager | None:
+    def _make_alarms(self, book: AuditBook) -> AlarmManager | None:
         setup = self._setup
         if setup.duties is None:
             return None
-        channels = AlarmChannels(setup.topics.alarm if self._publisher is not None else None, self._posted, book, watchers)
+        channels = AlarmChannels(setup.topics.alarm if self._publisher is not None else None, self._posted, book)
         return AlarmManager(self._store, self._clock, setup.machine, setup.schedules, setup.duties(self._store), channels)
 
     def _posted(self) -> None:

@@ -1,8 +1,8 @@
-"""The jobs of this run of the service, by number, and how a person steers them: checks of the timetable, checks and full campaigns that a
-person starts, and what follows from alarms: investigations and pushes. What a person orders of tables (`abbe.service.core.orders`) is a job
-too.
+"""The jobs since the service began, by number, and how people start and steer them.
 
-Rights are decided here, not where a request comes from: the web process says who asks, and the users' table says what he may.
+A job is a check of the timetable, a check or full campaign that a person starts, what follows from an alarm (an investigation or a push),
+or an order for the tables (`abbe.service.core.orders`). Rights are decided here, not where a request comes from: the web process says who
+asks, and the table of users says what this person may do.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Protocol
+from typing import Any, Protocol
 
 import structlog
 
@@ -21,9 +21,10 @@ from abbe.service.campaigns.builtin_recipes import parted
 from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
 from abbe.service.domain.bounds import TEXT, WORD
-from abbe.service.domain.job_state import JobKind, JobState
+from abbe.service.domain.job_state import JobState
 from abbe.service.domain.schedule import Schedule
-from abbe.service.scheduler.ports import FollowUp, SlotState
+from abbe.service.scheduler.job import Job, carry_out
+from abbe.service.scheduler.ports import JobWatcher, SlotState
 from abbe.service.sequences.control import Control, State
 
 log = structlog.get_logger("abbe.jobs")
@@ -35,34 +36,32 @@ AGAIN = "asked for before, with this key"
 ASKING = "asking"
 """State of a job that waits until a person has done something by hand."""
 
-Run = Callable[[Schedule, datetime, Control], Awaitable[SlotState]]
-"""``await run(schedule, slot, control)``: how the check ended."""
 
-
-ByHand = Callable[[datetime, Control], Awaitable[SlotState]]
-"""``await work(begun, control)``: what a person wants done, and how it ended."""
+def by_hand(recipe: str) -> Schedule:
+    """The terms of a job that a person starts: at once."""
+    return Schedule(BY_HAND, "", "UTC", recipe)
 
 
 async def deny(_: str) -> bool:
-    """Nobody may."""
+    """Allow no user."""
     return False
 
 
 @dataclass(frozen=True, slots=True)
 class FullCampaigns:
-    """What a person may start besides checks: names, and ``of(recipe, who)``, how one is carried out for somebody; None: it is none.
+    """What a person may start besides checks: names, and ``of(recipe, who)``, the job of one for a user; None: the recipe is no campaign.
 
-    ``may``: whether somebody may propose tables, by the table of users as it is now: a full campaign ends with a proposal of his.
+    ``may``: whether a user may propose tables, by the table of users as it is now: a full campaign ends with this user's proposal.
     """
 
     names: tuple[str, ...] = ()
-    of: Callable[[str, str], ByHand | None] = lambda recipe, who: None
+    of: Callable[[str, str], Job[Any] | None] = lambda recipe, who: None
     may: Callable[[str], Awaitable[bool]] = deny
 
 
 @dataclass(frozen=True, slots=True)
 class JobRequest:
-    """Who asks for something, in which request; ``what`` is what he may not ask for again under another meaning of ``key``."""
+    """Who asks, in which request; ``what``: the one thing that ``key`` stands for, when the same user sends it again."""
 
     request: int
     who: str
@@ -71,7 +70,7 @@ class JobRequest:
 
 
 class MachineClaim(Protocol):
-    """Who sees to it that one check runs at a time."""
+    """Makes sure that one job runs at a time."""
 
     def take(self, name: str) -> str:
         """Take the machine; return what runs on it instead, or nothing."""
@@ -83,50 +82,60 @@ class MachineClaim(Protocol):
 
 
 @dataclass
-class _Job:
+class _Entry:
+    job: Job[Any]
     seen: JobState
     control: Control = field(default_factory=Control)
     task: asyncio.Task[SlotState] | None = None
 
 
 class JobRegistry:
-    """Knows every job since the service began, the latest `MOST_JOBS` of them by number.
+    """Runs jobs, and keeps the latest `MOST_JOBS` of them by number.
 
     Parameters
     ----------
-    run : callable
-        Runs one check.
+    checks : callable
+        ``checks(schedule, slot)``: the check of a slot.
     recipes : sequence of str
         What a person may start.
     may : callable
-        ``await may(who)``: whether somebody may start and steer measurements, by the table of users as it is now.
+        ``await may(who)``: whether a user may start and steer measurements, by the table of users as it is now.
     clock : Clock
         Times of jobs.
     changed : callable
-        Told whenever a job begins, changes or ends.
+        Called whenever a job begins, changes or ends.
+    watchers : sequence of JobWatcher
+        Follow every job.
     """
 
     def __init__(
-        self, run: Run, recipes: Sequence[str], may: Callable[[str], Awaitable[bool]], clock: Clock, changed: Callable[[], None]
+        self,
+        checks: Callable[[Schedule, datetime], Job[Any]],
+        recipes: Sequence[str],
+        may: Callable[[str], Awaitable[bool]],
+        clock: Clock,
+        changed: Callable[[], None],
+        watchers: Sequence[JobWatcher] = (),
     ) -> None:
-        self._run, self._recipes, self._may, self._clock, self._changed = run, tuple(recipes), may, clock, changed
-        self._jobs: OrderedDict[str, _Job] = OrderedDict()
+        self._checks, self._recipes, self._may, self._clock, self._changed = checks, tuple(recipes), may, clock, changed
+        self._watchers = tuple(watchers)
+        self._jobs: OrderedDict[str, _Entry] = OrderedDict()
         self._keys: OrderedDict[tuple[str, str], tuple[str, str]] = OrderedDict()
-        self._now: _Job | None = None
+        self._now: _Entry | None = None
         self.place: MachineClaim | None = None
         """Where a job by hand is started; None: nowhere (``--once``, or not yet)."""
         self.full = FullCampaigns()
-        """The full campaigns; none unless somebody says which."""
+        """The full campaigns; by default there are none."""
         self._tasks: asyncio.TaskGroup | None = None
 
     def open(self, place: MachineClaim, tasks: asyncio.TaskGroup) -> None:
-        """From now on people may start jobs; they run in ``tasks``."""
+        """Let people start jobs from now on; they run in ``tasks``."""
         self.place, self._tasks = place, tasks
 
     async def close(self) -> None:
-        """Nothing is started any more, and what was started by hand is stopped: the devices hold the motion."""
+        """Start nothing more, and stop what was started by hand: the devices hold the motion."""
         self.place = None
-        running = [job.task for job in self._jobs.values() if job.task is not None and not job.task.done()]
+        running = [entry.task for entry in self._jobs.values() if entry.task is not None and not entry.task.done()]
         for task in running:
             task.cancel()
         if running:
@@ -135,47 +144,43 @@ class JobRegistry:
     # ---- what runs --------------------------------------------------------------------------------------------------
 
     async def __call__(self, schedule: Schedule, slot_utc: datetime) -> SlotState:
-        """Run the check of a slot; return the slot's state. This is the scheduler's job."""
-        job = self._new(schedule, "")
-        return await self._carry_out(job, lambda: self._run(schedule, slot_utc, job.control))
+        """Run the check of a slot; return the slot's state. The scheduler calls this."""
+        return await self.run(self._checks(schedule, slot_utc))
 
-    async def errand(self, errand: FollowUp) -> SlotState:
-        """Do what no slot asks for, as a job; return how it ended."""
-        job = self._new(errand.schedule, "", errand.kind)
-        work = errand.work
-        assert work is not None
-        return await self._carry_out(job, lambda: work(job.control))
+    async def run(self, job: Job[Any]) -> SlotState:
+        """Run a job that the service starts by itself; return how it ended."""
+        return await self._run(self._new(job, ""))
 
-    def _new(self, schedule: Schedule, who: str, kind: JobKind = "check") -> _Job:
+    def _new(self, job: Job[Any], who: str) -> _Entry:
         number = secrets.token_hex(6)
-        by_hand = "" if who else schedule.name
-        job = _Job(
+        entry = _Entry(
+            job,
             JobState(
                 id=number,
-                kind=kind,
-                recipe=schedule.recipe[:WORD],
-                schedule=by_hand[:WORD],
+                kind=job.kind,
+                recipe=job.terms.recipe[:WORD],
+                schedule="" if who else job.terms.name[:WORD],
                 who=who,
                 state=State.READY,
                 text="",
                 begun_utc=self._clock.utc(),
-            )
+            ),
         )
-        self._jobs[number] = job
+        self._jobs[number] = entry
         while len(self._jobs) > MOST_JOBS:
             self._jobs.popitem(last=False)
-        return job
+        return entry
 
-    async def _carry_out(self, job: _Job, run: Callable[[], Awaitable[SlotState]]) -> SlotState:
+    async def _run(self, entry: _Entry) -> SlotState:
         end = SlotState("interrupted")
-        self._now = job
+        self._now = entry
         self._changed()
         try:
-            end = await run()
+            end = await carry_out(entry.job, entry.seen.begun_utc, entry.control, self._watchers)
         finally:
             self._now = None
-            job.seen = replace(
-                job.seen,
+            entry.seen = replace(
+                entry.seen,
                 state=str(end),
                 text=end.reason[:TEXT],
                 ended_utc=self._clock.utc(),
@@ -186,9 +191,9 @@ class JobRegistry:
             self._changed()
         return end
 
-    async def _by_hand(self, job: _Job, work: ByHand, place: MachineClaim) -> SlotState:
+    async def _run_by_hand(self, entry: _Entry, place: MachineClaim) -> SlotState:
         try:
-            return await self._carry_out(job, lambda: work(job.seen.begun_utc, job.control))
+            return await self._run(entry)
         finally:
             place.give_back()
 
@@ -201,20 +206,20 @@ class JobRegistry:
 
     def seen(self) -> tuple[JobState, ...]:
         """The latest jobs, newest first."""
-        return tuple(self._look(job) for job in reversed(self._jobs.values()))
+        return tuple(self._look(entry) for entry in reversed(self._jobs.values()))
 
-    def _look(self, job: _Job) -> JobState:
-        if job.seen.ended_utc is not None:
-            return job.seen
-        control, now, prompt = job.control, job.control.situation, job.control.prompts.now
+    def _look(self, entry: _Entry) -> JobState:
+        if entry.seen.ended_utc is not None:
+            return entry.seen
+        control, now, prompt = entry.control, entry.control.situation, entry.control.prompts.now
         state = now.state
-        if state is State.READY:  # the work has not said anything yet; what a person has asked for is kept for it
+        if state is State.READY:  # the work has not reported yet; what a person has asked for waits for it
             asked = ((State.ABORTING, control.aborting), (State.STOPPING, control.stopping), (State.PAUSING, control.pausing))
             state = next((one for one, is_asked in asked if is_asked), State.RUNNING)
         if prompt is None:
-            return replace(job.seen, state=state, text=now.why)
+            return replace(entry.seen, state=state, text=now.why)
         shown = ASKING if state is State.RUNNING else state
-        return replace(job.seen, state=shown, text=now.why, prompt=prompt.number, ask=prompt.text[:WORD])
+        return replace(entry.seen, state=shown, text=now.why, prompt=prompt.number, ask=prompt.text[:WORD])
 
     # ---- what is asked for ------------------------------------------------------------------------------------------
 
@@ -230,16 +235,15 @@ class JobRegistry:
         again = self.again(requested)
         if again is not None:
             return again
-        schedule = Schedule(BY_HAND, "", "UTC", asked.recipe)
         if campaign is not None:
-            return self.begin(requested, schedule, campaign, "campaign")
+            return self.begin(requested, campaign)
         if parted(asked.recipe)[0] not in self._recipes:
             there = ", ".join((*self._recipes, *self.full.names))
             return _answer(asked.request, "unknown", f"there is no recipe {asked.recipe!r} here; there are: {there}")
-        return self.begin(requested, schedule, lambda begun, control: self._run(schedule, begun, control))
+        return self.begin(requested, self._checks(by_hand(asked.recipe), self._clock.utc()))
 
     def again(self, requested: JobRequest) -> Answer | None:
-        """The answer to what was asked for with this key before; None: it was not."""
+        """Return the answer that this key was given before; None: it is new."""
         known = self._keys.get((requested.who, requested.key)) if requested.key else None
         if known is None:
             return None
@@ -247,58 +251,59 @@ class JobRegistry:
             return _answer(requested.request, "conflict", "this key was used for another request", known[0])
         return _answer(requested.request, "done", AGAIN, known[0])
 
-    def begin(self, requested: JobRequest, schedule: Schedule, work: ByHand, kind: JobKind = "check") -> Answer:
-        """Begin a job that a person wants, now, if nothing else has the machine. Whether he may is for the caller to ask."""
+    def begin(self, requested: JobRequest, job: Job[Any]) -> Answer:
+        """Begin a job that a person asks for, if nothing else has the machine. The caller has checked the person's rights."""
         if self.place is None or self._tasks is None:
             return _answer(requested.request, "busy", "the service starts, ends, or runs its timetable once; it takes no jobs")
-        other = self.place.take(f"{BY_HAND}: {schedule.recipe}")
+        other = self.place.take(f"{BY_HAND}: {job.terms.recipe}")
         if other:
             return _answer(requested.request, "busy", f"the machine measures: {other}")
-        job = self._new(schedule, requested.who, kind)
+        entry = self._new(job, requested.who)
         if requested.key:
-            self._keys[requested.who, requested.key] = (job.seen.id, requested.what)
+            self._keys[requested.who, requested.key] = (entry.seen.id, requested.what)
             while len(self._keys) > MOST_KEYS:
                 self._keys.popitem(last=False)
-        job.task = self._tasks.create_task(self._by_hand(job, work, self.place), name=f"job {job.seen.id}")
-        log.info("job started", job=job.seen.id, kind=kind, recipe=schedule.recipe, who=requested.who)
-        return _answer(requested.request, "done", "", job.seen.id)
+        entry.task = self._tasks.create_task(self._run_by_hand(entry, self.place), name=f"job {entry.seen.id}")
+        log.info("job started", job=entry.seen.id, kind=job.kind, recipe=job.terms.recipe, who=requested.who)
+        return _answer(requested.request, "done", "", entry.seen.id)
 
     async def steer(self, asked: SteerJob) -> Answer:
         """Stop, abort, pause or go on with the job that runs."""
-        job = await self._asked_of(asked)
-        if isinstance(job, Answer):
-            return job
-        if job.control.state is State.ENDED:
+        entry = await self._asked_of(asked)
+        if isinstance(entry, Answer):
+            return entry
+        control = entry.control
+        if control.state is State.ENDED:
             return _answer(asked.request, "conflict", "the measurement of this job is over; its figures are judged now", asked.job)
-        if asked.how == "pause" and job.control.hurry:
-            return _answer(asked.request, "conflict", f"it cannot be paused now: {job.control.hurry}", asked.job)
-        {"stop": job.control.stop, "abort": job.control.abort, "pause": job.control.pause, "resume": job.control.resume}[asked.how]()
+        if asked.how == "pause" and control.hurry:
+            return _answer(asked.request, "conflict", f"it cannot be paused now: {control.hurry}", asked.job)
+        {"stop": control.stop, "abort": control.abort, "pause": control.pause, "resume": control.resume}[asked.how]()
         log.info("job steered", job=asked.job, how=asked.how, who=asked.who)
         self._changed()
         return _answer(asked.request, "done", "", asked.job)
 
     async def done_by_hand(self, asked: DoneByHand) -> Answer:
-        """Take somebody's word that what a job asks for is done; not for any other prompt than the one that stands."""
-        job = await self._asked_of(asked)
-        if isinstance(job, Answer):
-            return job
-        if not job.control.prompts.answer(asked.prompt):
+        """Confirm that what a job asks for is done; only for the prompt that is open."""
+        entry = await self._asked_of(asked)
+        if isinstance(entry, Answer):
+            return entry
+        if not entry.control.prompts.answer(asked.prompt):
             return _answer(asked.request, "conflict", f"prompt {asked.prompt} is not what this job waits for: look at it again", asked.job)
         log.info("done by hand", job=asked.job, prompt=asked.prompt, who=asked.who)
         self._changed()
         return _answer(asked.request, "done", "", asked.job)
 
-    async def _asked_of(self, asked: SteerJob | DoneByHand) -> _Job | Answer:
-        """The running job that somebody may say something to, or why not."""
+    async def _asked_of(self, asked: SteerJob | DoneByHand) -> _Entry | Answer:
+        """The running job that a user may steer, or the answer why not."""
         refused = await self._refused(asked.who)
         if refused:
             return _answer(asked.request, "forbidden", refused)
-        job = self._jobs.get(asked.job)
-        if job is None:
+        entry = self._jobs.get(asked.job)
+        if entry is None:
             return _answer(asked.request, "unknown", f"there is no job {asked.job!r} since the service began")
-        if job.seen.ended_utc is not None:
-            return _answer(asked.request, "conflict", f"this job has ended: {job.seen.state}", asked.job)
-        return job
+        if entry.seen.ended_utc is not None:
+            return _answer(asked.request, "conflict", f"this job has ended: {entry.seen.state}", asked.job)
+        return entry
 
     async def _refused(self, who: str) -> str:
         return "" if await self._may(who) else f"{who} may not measure here"

@@ -1,17 +1,16 @@
-"""What a person orders: a full campaign, that the table in force gives way to the one before, or that an approved one is pushed now.
-Each is a job as a check is, with the machine to itself.
+"""What a person can order as a job: a full campaign, a rollback to the table before, or the push of an approved proposal.
 
-Rights are decided here. Who ordered it and why stands in the audit before anything is done, and how it ended after it. How a push ended is
-the word of the push journal, whatever somebody heard.
+Rights are decided here. The audit records who ordered it and why before anything is done, and afterwards how it ended. How a push ended is
+what the push journal says, whatever was reported.
 """
 
 from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, Literal
 
 import structlog
@@ -25,16 +24,15 @@ from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.compensation.rollback import Ordered
-from abbe.service.core.jobs import BY_HAND, ByHand, FullCampaigns, JobRegistry, JobRequest
+from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand
 from abbe.service.core.rights import person
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobKind, JobOutcome
-from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, NotStored, TableRefused
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.guided_campaign import is_full
-from abbe.service.scheduler.job import Job, carry_out, failure
-from abbe.service.scheduler.ports import Doc, JobWatcher, SlotState
+from abbe.service.scheduler.job import Job, failure
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
@@ -49,15 +47,15 @@ PUSH: Final = "push"
 NO_PAUSE = "a table is being changed: stop it, or let it end"
 
 OrderedRollback = Callable[[BackOrder], Awaitable[JobOutcome]]
-"""``await bring_back(order)``: does it, and says what was heard of it."""
+"""``await rollback(order)``: restores the table before; returns what it learned of the end."""
 Push = Callable[[PushOrder], Awaitable[JobOutcome]]
-"""``await push(order)``: pushes what is approved, and says what was heard of it."""
+"""``await push(order)``: pushes what is approved; returns what it learned of the end."""
 BY_ITSELF = "this service pushes what is approved by itself ([alarm] push), or has no controller"
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignOrder:
-    """What is wanted: the recipe, who proposes, who hears how far it is, and who may pause and stop it."""
+    """A full campaign that a person started: its recipe, who proposes, where progress goes, and what pauses and stops it."""
 
     recipe: str
     by: str
@@ -70,127 +68,124 @@ MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
 
 
 @dataclass(frozen=True, slots=True)
-class Hands:
-    """What can be ordered: a rollback, a push of what is approved. None: that is not ordered here."""
+class OrderActions:
+    """What can be ordered: a rollback, a push of what is approved. None: it cannot be ordered here."""
 
     ordered_rollback: OrderedRollback | None = None
     push: Push | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
-    """Where orders are carried out: the machine's name, who may (``await may(who)``), the audit, who watches jobs, and the identity
-    of the machine's control.
-    """
+class OrderContext:
+    """The machine's name, who may give orders (``await may(who)``), the audit, and the identity of the machine's control."""
 
     machine: str
     may: Callable[[str], Awaitable[bool]]
     audit: AuditBook
-    watchers: Sequence[JobWatcher] = ()
     control: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Order:
-    """An order: what it is, who gave it, of what, what of it is recorded, and what is done."""
+Action = Callable[[ProgressSink, Control], Awaitable[JobOutcome]]
+"""``await act(progress, control)``: does what was ordered."""
 
-    kind: JobKind
-    who: str
-    target: str
-    doc: Doc
-    do: Callable[[ProgressSink, Control], Awaitable[JobOutcome]]
+
+@dataclass(frozen=True, slots=True)
+class _AuditTrail:
+    """The records of one order. ``begun``: the first of them."""
+
+    audit: AuditBook
+    begun: AuditEvent
+
+    async def write(self, outcome: str, text: str = "") -> None:
+        """Write how far the order is."""
+        doc = self.begun.doc | ({"text": text} if text else {})
+        await asyncio.to_thread(self.audit.write, replace(self.begun, outcome=outcome, doc=doc))
 
 
 class _OrderJob(Job[JobOutcome]):
-    """An order on its way, with its records in the audit."""
+    """An order, with its records in the audit."""
 
-    def __init__(self, order: _Order, audit: AuditBook) -> None:
-        self._order, self._audit, self.name = order, audit, order.kind
+    def __init__(self, kind: JobKind, recipe: str, trail: _AuditTrail, act: Action) -> None:
+        self.kind, self.terms = kind, by_hand(recipe)
+        self._trail, self._act = trail, act
 
     async def begin(self) -> None:
-        await self.record("begun", "")
+        await self._trail.write("begun")
 
     async def do(self, progress: ProgressSink, control: Control) -> JobOutcome:
         control.now(State.RUNNING)
-        control.hurry = NO_PAUSE if self.name == ROLLBACK else ""  # a push measures first, and that can be held
-        return await self._order.do(progress, control)
+        control.hurry = NO_PAUSE if self.kind == ROLLBACK else ""  # a push measures first, and that can be held
+        return await self._act(progress, control)
 
     async def failed(self, error: Exception) -> JobOutcome:
         return failure(error)
 
     async def end(self, outcome: JobOutcome) -> SlotState:
-        log.warning("an order has ended", kind=self.name, who=self._order.who, word=outcome.word, text=outcome.text)
+        log.warning("an order has ended", kind=self.kind, who=self._trail.begun.who, word=outcome.word, text=outcome.text)
         try:
-            await self.record(outcome.word, outcome.text)
-        except AbbeError as error:  # what was done is in the store; a service that ends here would do nothing more
+            await self._trail.write(outcome.word, outcome.text)
+        except AbbeError as error:  # what was done is in the store; a service that ended here would do nothing more
             log.error("not in the audit", cause=error.detail)
         return SlotState.of(outcome)
 
-    async def last_words(self) -> None:
-        await self.record(STOPPED, "stopped with the service; what is complete stays")
-
-    async def record(self, outcome: str, text: str) -> None:
-        """Write a line of the audit."""
-        order = self._order
-        event = AuditEvent(
-            who=order.who, action=order.kind, target=order.target, outcome=outcome, doc=order.doc | ({"text": text} if text else {})
-        )
-        await asyncio.to_thread(self._audit.write, event)
+    async def interrupted(self) -> None:
+        await self._trail.write(STOPPED, "stopped with the service; what is complete stays")
 
 
-class _TableOrderJob(_OrderJob, RetryingStore):
-    """An order of a table: its end is what the push journal says. ``look``: how its push stands; None: nothing was written."""
+Look = Callable[[], JobOutcome | None]
+"""How the push of an order stands, by the journal; None: nothing was written."""
+RetryingLook = Callable[[Look], Awaitable[JobOutcome | None]]
 
-    def __init__(self, order: _Order, audit: AuditBook, store: ServiceStore, clock: Clock, look: Callable[[], JobOutcome | None]) -> None:
-        _OrderJob.__init__(self, order, audit)
-        RetryingStore.__init__(self, store, clock)
-        self._look = look
+
+class _TableOrderJob(_OrderJob):
+    """An order for the tables: its end is what the push journal says. ``retrying``: looks until the database answers."""
+
+    def __init__(self, kind: JobKind, recipe: str, trail: _AuditTrail, act: Action, look: Look, retrying: RetryingLook) -> None:
+        super().__init__(kind, recipe, trail, act)
+        self._look, self._retrying = look, retrying
 
     async def end(self, outcome: JobOutcome) -> SlotState:
-        return await super().end(put_right(await self._read(self._look), outcome))
+        return await super().end(put_right(await self._retrying(self._look), outcome))
 
-    async def last_words(self) -> None:
-        """Say by the journal where it stands; what is open the next start takes back."""
+    async def interrupted(self) -> None:
+        """Record where it stands by the journal; the next start takes back what is open."""
         done = await asyncio.to_thread(self._look) or JobOutcome("failed", "the service ended before anything was written")
-        log.warning("an order was stopped with the service", kind=self.name, word=done.word, text=done.text)
-        await self.record(done.word, f"{done.text} (stopped with the service)")
+        log.warning("an order was interrupted by the end of the service", kind=self.kind, word=done.word, text=done.text)
+        await self._trail.write(done.word, f"{done.text} (stopped with the service)")
 
 
 def full_campaigns(
-    ground: Ground, names: tuple[str, ...], measure: MeasureCampaign, may: Callable[[str], Awaitable[bool]]
+    context: OrderContext, names: tuple[str, ...], measure: MeasureCampaign, may: Callable[[str], Awaitable[bool]]
 ) -> FullCampaigns:
-    """What the registry of jobs needs to start full campaigns.
+    """Return what the registry of jobs needs to start full campaigns.
 
     Parameters
     ----------
-    ground : Ground
-        Where; its ``may`` is not asked.
+    context : OrderContext
+        Machine and audit; its ``may`` is not asked.
     names : tuple of str
         What can be started.
     measure : callable
         Does it.
     may : callable
-        ``await may(who)``: whether somebody may propose tables.
+        ``await may(who)``: whether a user may propose tables.
     """
 
-    def of(recipe: str, who: str) -> ByHand | None:
+    def of(recipe: str, who: str) -> _OrderJob | None:
         if not is_full(recipe, names):
             return None
 
-        async def do(progress: ProgressSink, control: Control) -> JobOutcome:
+        async def act(progress: ProgressSink, control: Control) -> JobOutcome:
             return await measure(CampaignOrder(recipe, person(who), progress, control))
 
-        async def work(begun: datetime, control: Control) -> SlotState:
-            job = _OrderJob(_Order(CAMPAIGN, who, f"{ground.machine}, {recipe}", {}, do), ground.audit)
-            return await carry_out(job, Schedule(BY_HAND, "", "UTC", recipe), begun, control, ground.watchers)
-
-        return work
+        begun = AuditEvent(who=who, action=CAMPAIGN, target=f"{context.machine}, {recipe}", outcome="begun", doc={})
+        return _OrderJob(CAMPAIGN, recipe, _AuditTrail(context.audit, begun), act)
 
     return FullCampaigns(names, of, may)
 
 
 class Orders(RetryingStore):
-    """Takes orders of tables and carries them out as jobs.
+    """Takes orders for the tables and runs them as jobs.
 
     Parameters
     ----------
@@ -198,50 +193,52 @@ class Orders(RetryingStore):
         Holds the push journal.
     clock : Clock
         Now.
-    book : JobRegistry
-        Of the jobs.
-    ground : Ground
-        Where.
-    hands : Hands
+    jobs : JobRegistry
+        Runs them.
+    context : OrderContext
+        Machine, rights, audit.
+    actions : OrderActions
         What can be ordered.
     """
 
-    def __init__(self, store: ServiceStore, clock: Clock, book: JobRegistry, ground: Ground, hands: Hands) -> None:
+    def __init__(self, store: ServiceStore, clock: Clock, jobs: JobRegistry, context: OrderContext, actions: OrderActions) -> None:
         super().__init__(store, clock)
-        self._book, self._ground, self._hands = book, ground, hands
+        self._jobs, self._context, self._actions = jobs, context, actions
 
     async def rollback(self, asked: RollBack) -> Answer:
-        """Begin to take the table in force back, once for each key; not if another is in force than was seen, or none was before it."""
+        """Begin a rollback, once for each key; not if another table is in force than the user saw, or none was before it."""
         requested = JobRequest(asked.request, asked.who, asked.key, f"{ROLLBACK} of push {asked.push}, {asked.crc:08X}: {asked.reason}")
         refused = await self._refused(
-            requested, "order a table back", self._hands.ordered_rollback is None and "this service has no controller"
+            requested, "order a table back", self._actions.ordered_rollback is None and "this service has no controller"
         )
         if refused is not None:
             return refused
         try:
-            now = await asyncio.to_thread(offered, self._store, self._ground.machine, self._ground.control)
+            now = await asyncio.to_thread(offered, self._store, self._context.machine, self._context.control)
         except TableRefused as no:
             return _answer(asked.request, "conflict", str(no))
         if (now.push, now.crc) != (asked.push, asked.crc):
             what = f"meanwhile another table is in force: {now.crc:08X} of push {now.push}; look at it first"
             return _answer(asked.request, "conflict", what)
-        return self._begun(requested, f"{ROLLBACK} of push {asked.push}", self._back(asked), ROLLBACK)
+        return self._jobs.begin(requested, self._rollback_job(asked))
 
-    def _back(self, asked: RollBack) -> _TableOrderJob:
-        number, ordered_rollback = secrets.token_hex(6), self._hands.ordered_rollback
+    def _rollback_job(self, asked: RollBack) -> _TableOrderJob:
+        number, ordered_rollback = secrets.token_hex(6), self._actions.ordered_rollback
         assert ordered_rollback is not None
 
-        async def do(progress: ProgressSink, control: Control) -> JobOutcome:
+        async def act(progress: ProgressSink, control: Control) -> JobOutcome:
             return await ordered_rollback(BackOrder(asked.push, asked.crc, Ordered(asked.who, asked.reason, number, control)))
 
         doc = {"reason": asked.reason, "order": number, "push": asked.push, "crc": f"{asked.crc:08X}"}
-        target = f"{self._ground.machine}, table of push {asked.push} ({asked.crc:08X})"
-        return self._job(_Order(ROLLBACK, asked.who, target, doc, do), lambda: ordered(self._store, self._ground.machine, number))
+        target = f"{self._context.machine}, table of push {asked.push} ({asked.crc:08X})"
+        begun = AuditEvent(who=asked.who, action=ROLLBACK, target=target, outcome="begun", doc=doc)
+        look = partial(ordered, self._store, self._context.machine, number)
+        return _TableOrderJob(ROLLBACK, f"{ROLLBACK} of push {asked.push}", self._trail(begun), act, look, self._read)
 
     async def push(self, asked: PushNow) -> Answer:
         """Begin to push a proposal whose approval holds, once for each key; its verification before is measured first."""
         requested = JobRequest(asked.request, asked.who, asked.key, f"{PUSH} of proposal {asked.proposal}")
-        refused = await self._refused(requested, "order a push", self._hands.push is None and BY_ITSELF)
+        refused = await self._refused(requested, "order a push", self._actions.push is None and BY_ITSELF)
         if refused is not None:
             return refused
         try:
@@ -250,51 +247,48 @@ class Orders(RetryingStore):
             return _answer(asked.request, "unknown", error.detail)
         if against:
             return _answer(asked.request, "conflict", against)
-        return self._begun(requested, f"{PUSH} of proposal {asked.proposal}", self._approved(asked, after), PUSH)
+        return self._jobs.begin(requested, self._push_job(asked, after))
 
     def _not_approved(self, proposal: int) -> tuple[str, int]:
         """Why a proposal cannot be pushed as it stands, and the number of the last push."""
-        machine, found = self._ground.machine, load(self._store, proposal)
+        machine, found = self._context.machine, load(self._store, proposal)
         now = proposal_status(self._store, proposal, found, self._clock.utc().timestamp())
         after = last_push(self._store, machine)
         if found.candidate.machine != machine:
             return f"proposal {proposal} is for {found.candidate.machine}, not for {machine}", after
         return "" if now.word == "approved" else f"proposal {proposal} is {now.word}: {now.text}", after
 
-    def _approved(self, asked: PushNow, after: int) -> _TableOrderJob:
-        push, machine = self._hands.push, self._ground.machine
+    def _push_job(self, asked: PushNow, after: int) -> _TableOrderJob:
+        push, machine = self._actions.push, self._context.machine
         assert push is not None
 
-        async def begun() -> None:
-            """The audit has it already."""
+        async def in_audit() -> None:
+            """Record nothing: the audit has it already."""
 
-        async def do(progress: ProgressSink, control: Control) -> JobOutcome:
-            return await push(PushOrder(asked.proposal, begun, progress, control))
+        async def act(progress: ProgressSink, control: Control) -> JobOutcome:
+            return await push(PushOrder(asked.proposal, in_audit, progress, control))
 
-        doc = {"proposal": asked.proposal, "after": after}
-        target = f"{machine}, proposal {asked.proposal}"
-        return self._job(_Order(PUSH, asked.who, target, doc, do), lambda: in_force(self._store, machine, asked.proposal, after))
+        doc, target = {"proposal": asked.proposal, "after": after}, f"{machine}, proposal {asked.proposal}"
+        begun = AuditEvent(who=asked.who, action=PUSH, target=target, outcome="begun", doc=doc)
+        look = partial(in_force, self._store, machine, asked.proposal, after)
+        return _TableOrderJob(PUSH, f"{PUSH} of proposal {asked.proposal}", self._trail(begun), act, look, self._read)
 
-    async def _refused(self, requested: JobRequest, words: str, missing: str | Literal[False]) -> Answer | None:
-        """The answer to who may not, to what was asked for before, and while something runs; None: go on."""
-        if not await self._ground.may(requested.who):
-            return _answer(requested.request, "forbidden", f"{requested.who} may not {words} here")
-        again = self._book.again(requested)
+    async def _refused(self, requested: JobRequest, order: str, missing: str | Literal[False]) -> Answer | None:
+        """Return the answer if the user has no right, has asked before, or something runs; None: go on."""
+        if not await self._context.may(requested.who):
+            return _answer(requested.request, "forbidden", f"{requested.who} may not {order} here")
+        again = self._jobs.again(requested)
         if again is not None:
             return again
         if missing:
             return _answer(requested.request, "conflict", missing)
-        running = self._book.running
-        if running is not None:  # before the journal is asked: what pushes now would look like what was left open
+        running = self._jobs.running
+        if running is not None:  # before the journal is read: a running push would look like one that was left open
             return _answer(requested.request, "busy", f"the machine measures: {running.schedule or running.recipe}")
         return None
 
-    def _job(self, order: _Order, look: Callable[[], JobOutcome | None]) -> _TableOrderJob:
-        return _TableOrderJob(order, self._ground.audit, self._store, self._clock, look)
-
-    def _begun(self, requested: JobRequest, name: str, job: _TableOrderJob, kind: JobKind) -> Answer:
-        terms = Schedule(BY_HAND, "", "UTC", name)
-        return self._book.begin(requested, terms, lambda begun, control: carry_out(job, terms, begun, control, self._ground.watchers), kind)
+    def _trail(self, begun: AuditEvent) -> _AuditTrail:
+        return _AuditTrail(self._context.audit, begun)
 
 
 def _answer(request: int, outcome: Word, text: str) -> Answer:

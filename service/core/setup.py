@@ -9,7 +9,7 @@ from typing import Any
 from abbe.service.capture.live import LiveFeed
 from abbe.service.channel.messages import PAGE_MEMORY_MB, MachineSummary
 from abbe.service.clock import Clock
-from abbe.service.core.orders import Hands, MeasureCampaign
+from abbe.service.core.orders import MeasureCampaign, OrderActions
 from abbe.service.core.push_recovery import Recover
 from abbe.service.devices.urls import control_of
 from abbe.service.domain.schedule import Schedule
@@ -75,7 +75,7 @@ class ServiceSetup:
         What ``check`` shows of its paths, for the page.
     told : MachineTold, optional
         What the page calculates dry runs from.
-    hands : callable, optional
+    actions : callable, optional
         Given the open store, what a person can order of tables; None: nothing.
     page_memory_mb : int
         Most that the page's process gets, MiB.
@@ -109,7 +109,7 @@ class ServiceSetup:
     table: Callable[[ServiceStore], LookAtTable] | None = None
     live: LiveFeed | None = None
     told: MachineSummary | None = None
-    hands: Callable[[ServiceStore], Hands] | None = None
+    actions: Callable[[ServiceStore], OrderActions] | None = None
     page_memory_mb: int = PAGE_MEMORY_MB
     campaigns: tuple[str, ...] = ()
     campaign: Callable[[ServiceStore], MeasureCampaign] | None = None

@@ -1,4 +1,4 @@
-"""Alarms: holds each check against the history, keeps the alarms, says what is to be done when the machine is free."""
+"""Alarms: compares each check with the history, keeps the alarms, says what is to be done when the machine is free."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, Store
 from abbe.service.events import ProgressSink
 from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler import record
-from abbe.service.scheduler.job import Job, carry_out, failure
-from abbe.service.scheduler.ports import Doc, FollowUp, JobWatcher, SlotState
+from abbe.service.scheduler.job import FollowUp, Job, failure
+from abbe.service.scheduler.ports import Doc, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
@@ -40,7 +40,7 @@ CODES = {
     AlarmKind.FAILED: "ALM-005",
     AlarmKind.PUSHED: "ALM-006",
 }
-"""Lines that the broker is told of, and how the message is called."""
+"""Entries that are published, and the code of each message."""
 SAID = {OPEN: "is open", STOPPED: "was stopped"}
 """Words of outcomes that make no sentence by themselves."""
 NOTHING_YET = JobOutcome("failed", "the service ended before anything was written")
@@ -60,7 +60,7 @@ class Duties:
     investigate : callable
         ``await investigate(alarm, note, progress, control)``.
     push : callable or None
-        ``await push(order)``, which returns what was heard of it; None: the service pushes nothing.
+        ``await push(order)``, which returns what it learned of the end; None: the service pushes nothing.
     """
 
     warn_days: float
@@ -71,12 +71,11 @@ class Duties:
 
 @dataclass(frozen=True, slots=True)
 class AlarmChannels:
-    """Whom the desk tells: topic of alarms (None: no broker), who is woken for it, the audit, and who watches jobs."""
+    """Where alarms go: their topic (None: no broker), what wakes the publisher, and the audit."""
 
     topic: str | None
     posted: Callable[[], None]
     audit: AuditBook
-    watchers: Sequence[JobWatcher] = ()
 
 
 class AlarmManager(RetryingStore):
@@ -91,11 +90,11 @@ class AlarmManager(RetryingStore):
     machine : str
         Its name.
     schedules : sequence of Schedule
-        The timetable: who asks for proposals, and on which terms work may start.
+        The timetable: which schedules ask for proposals, and on which terms work may start.
     duties : Duties
         What is done.
-    telling : Telling
-        Whom it is told.
+    channels : AlarmChannels
+        Where alarms go.
     """
 
     def __init__(
@@ -110,7 +109,7 @@ class AlarmManager(RetryingStore):
         self._checked_again: set[tuple[int, int]] = set()
 
     async def checked(self, doc: Doc, number: int) -> str:
-        """Hold a kept verification against those before it; raise, hold or clear the alarm of its recipe. Returns that as a sentence."""
+        """Compare a kept verification with those before it; raise, hold or clear the alarm of its recipe. Return that as a sentence."""
         recipe, warn_days = doc["recipe"], self.duties.warn_days
         records = await self._read(self._store.verifications_of, self._machine, READ_CHECKS)
         looked = await self._read(look, self._store, self._machine, recipe, records, warn_days)
@@ -132,12 +131,12 @@ class AlarmManager(RetryingStore):
             return None
 
     async def _pushes_settled(self, entries: list[AlarmEntryRecord]) -> list[AlarmEntryRecord]:
-        """A push that was begun and never told of was interrupted with the service; one that was told as open may have been closed since.
+        """Record the end of pushes that were interrupted with the service, or that were open when last recorded.
 
-        Which table is in force is read from the journal. Nothing of it is begun again here.
+        Which table is in force is read from the journal. No push is begun again here.
         """
         last = {e.alarm: e for e in entries if e.kind in (AlarmKind.PUSHING, AlarmKind.PUSHED)}
-        told = False
+        changed = False
         for entry in last.values():
             if entry.kind == AlarmKind.PUSHED and entry.doc.get("word") != OPEN:
                 continue
@@ -145,29 +144,33 @@ class AlarmManager(RetryingStore):
             now = await asyncio.to_thread(in_force, self._store, self._machine, proposal, after) or NOTHING_YET
             if entry.kind == AlarmKind.PUSHING or now.word != OPEN:
                 text = f"{now.text} (it was interrupted with the service)" if entry.kind == AlarmKind.PUSHING else now.text
-                await self._tell_pushed(entry.alarm, proposal, after, JobOutcome(now.word, text))
-                told = True
-        return await asyncio.to_thread(self._store.alarm_entries, self._machine) if told else entries
+                await self._record_pushed(entry.alarm, proposal, after, JobOutcome(now.word, text))
+                changed = True
+        return await asyncio.to_thread(self._store.alarm_entries, self._machine) if changed else entries
 
     async def note(self, number: int, kind: AlarmKind, doc: Doc) -> Alarm:
-        """Write a line of an alarm; return the alarm with it."""
+        """Write an entry of an alarm; return the alarm with it."""
         await self.line(number, kind, doc)
         return await self._read(alarm_numbered, self._store, self._machine, number)
 
-    async def settled(self, found: Approved, after: int, said: JobOutcome) -> JobOutcome:
-        """Write down how a push later than ``after`` ended, by the journal; return that."""
-        done = await self._read(by_journal, self._store, self._machine, found.proposal, after, said)
-        await self._tell_pushed(found.alarm, found.proposal, after, done)
+    async def settled(self, found: Approved, after: int, reported: JobOutcome) -> JobOutcome:
+        """Record how a push later than ``after`` ended, by the journal; return that."""
+        done = await self._read(by_journal, self._store, self._machine, found.proposal, after, reported)
+        await self._record_pushed(found.alarm, found.proposal, after, done)
         return done
 
-    async def stopped(self, found: Approved, after: int) -> None:
-        """Write down where a push stands that was stopped with the service, at once."""
-        done = await asyncio.to_thread(in_force, self._store, self._machine, found.proposal, after) or NOTHING_YET
-        log.warning("the push was stopped with the service", word=done.word, text=done.text)
-        text = f"{done.text} (stopped with the service)"
-        await self._tell_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
+    async def last_push(self) -> int:
+        """Return the number of the machine's last push."""
+        return await self._read(last_push, self._store, self._machine)
 
-    async def _tell_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:
+    async def interrupted(self, found: Approved, after: int) -> None:
+        """Record at once where a push stands that is interrupted by the end of the service."""
+        done = await asyncio.to_thread(in_force, self._store, self._machine, found.proposal, after) or NOTHING_YET
+        log.warning("the push was interrupted by the end of the service", word=done.word, text=done.text)
+        text = f"{done.text} (stopped with the service)"
+        await self._record_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
+
+    async def _record_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:
         text = f"proposal {proposal} {SAID.get(done.word, done.word)}: {done.text}"
         await self.line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
 
@@ -179,9 +182,9 @@ class AlarmManager(RetryingStore):
             if pushed is None or pushed.doc.get("word") != "kept" or one.held_seq > pushed.seq or schedule is None:
                 continue
             if (one.number, pushed.seq) not in self._checked_again:
-                # Marked when it begins: an errand that may not start yet is offered again.
+                # Marked when it begins: a check that may not start yet is offered again.
                 begun = partial(self._checked_again.add, (one.number, pushed.seq))
-                return FollowUp(f"{schedule.name} (after push)", schedule, begun=begun)
+                return FollowUp(replace(schedule, name=f"{schedule.name} (after push)"), begun=begun)
         return None
 
     async def _push(self, entries: Sequence[AlarmEntryRecord]) -> FollowUp | None:
@@ -195,7 +198,11 @@ class AlarmManager(RetryingStore):
         asked = self._schedule_of(one) if one is not None else None
         needs = Needs() if asked is None else asked.needs
         terms = Schedule(f"push of proposal {found.proposal}", "", "UTC", "push", needs=replace(needs, idle=True))
-        return FollowUp(terms.name, terms, partial(self._pushed, found, terms), "push")
+        return FollowUp(terms, self.push_job(found, terms))
+
+    def push_job(self, found: Approved, terms: Schedule) -> Job[JobOutcome]:
+        """Return the push of an approved proposal as a job."""
+        return _ApprovedPush(self, found, terms)
 
     def _investigation(self, alarms: Sequence[Alarm]) -> FollowUp | None:
         for one in alarms:
@@ -203,7 +210,7 @@ class AlarmManager(RetryingStore):
             if schedule is not None and schedule.on_alarm == "propose" and next_step(one) is not None:
                 needs = replace(schedule.needs, idle=True)  # a machine at work, or in another process's hands, is waited for
                 terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self.duties.campaign, needs=needs)
-                return FollowUp(terms.name, terms, partial(self._investigated, one, terms), "investigation")
+                return FollowUp(terms, _Investigation(self, one, terms))
         return None
 
     def _schedule_of(self, one: Alarm) -> Schedule | None:
@@ -211,18 +218,8 @@ class AlarmManager(RetryingStore):
         same = [s for s in self._schedules if s.recipe == one.recipe]
         return next((s for s in same if s.name == one.schedule), next(iter(same), None))
 
-    async def _investigated(self, one: Alarm, terms: Schedule, control: Control) -> SlotState:
-        return await self._carried_out(_Investigation(self, one), terms, control)
-
-    async def _pushed(self, found: Approved, terms: Schedule, control: Control) -> SlotState:
-        after = await self._read(last_push, self._store, self._machine)
-        return await self._carried_out(_ApprovedPush(self, found, after), terms, control)
-
-    async def _carried_out(self, job: Job[JobOutcome], terms: Schedule, control: Control) -> SlotState:
-        return await carry_out(job, terms, self._clock.utc(), control, self._channels.watchers)
-
     async def line(self, number: int | None, kind: AlarmKind, doc: Doc) -> AlarmEntryRecord:
-        """Write a line with its message and its record in the audit."""
+        """Write an entry with its message and its record in the audit."""
         messages = []
         if self._channels.topic is not None and kind in CODES:
             head = {"schema": record.SCHEMA, "machine": self._machine, "code": CODES[kind], "at_utc": self._clock.utc().isoformat()}
@@ -241,7 +238,7 @@ class AlarmManager(RetryingStore):
             try:
                 event = AuditEvent(who=this_account(), action="abbe serve", target=target, outcome=str(kind), doc={"text": doc["text"]})
                 await asyncio.to_thread(self._channels.audit.write, event)
-            except AbbeError as error:  # the line itself is kept: a service that ends here would warn of nothing more
+            except AbbeError as error:  # the entry itself is kept: a service that ended here would raise no more alarms
                 log.error("not in the audit", cause=error.detail)
         return entry
 
@@ -249,8 +246,8 @@ class AlarmManager(RetryingStore):
 class _AlarmJob(Job[JobOutcome]):
     """Work for an alarm. While another process has the machine it waits, and no try is counted."""
 
-    def __init__(self, manager: AlarmManager, name: str) -> None:
-        self._manager, self.name = manager, name
+    def __init__(self, manager: AlarmManager, terms: Schedule) -> None:
+        self._manager, self.terms = manager, terms
 
     async def do(self, progress: ProgressSink, control: Control) -> JobOutcome:
         try:
@@ -261,17 +258,19 @@ class _AlarmJob(Job[JobOutcome]):
 
     @abstractmethod
     async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
-        """What is done when the machine is ours."""
+        """Do what the alarm asks for, once the machine is free."""
 
     async def end(self, outcome: JobOutcome) -> SlotState:
         return SlotState(WAITS, outcome.text) if outcome.word == WAITS else SlotState.of(outcome)
 
 
 class _Investigation(_AlarmJob):
-    """Each step is a line of the alarm; the last one says how it ended."""
+    """Takes an alarm to a proposal or to the reason why there is none. Each step is an entry of the alarm; the last one is the end."""
 
-    def __init__(self, manager: AlarmManager, alarm: Alarm) -> None:
-        super().__init__(manager, f"investigation of alarm {alarm.number}")
+    kind = "investigation"
+
+    def __init__(self, manager: AlarmManager, alarm: Alarm, terms: Schedule) -> None:
+        super().__init__(manager, terms)
         self._alarm, self._last = alarm, JobOutcome("nothing", "")
 
     async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
@@ -285,7 +284,7 @@ class _Investigation(_AlarmJob):
         return self._last
 
     async def defect(self, error: Exception) -> None:
-        """Its line stays: the next service must not fall over it again."""
+        """Record it: the next service must not fail at the same alarm again."""
         await self.failed(error)
 
     async def _note(self, kind: AlarmKind, doc: Doc) -> Alarm:
@@ -294,11 +293,16 @@ class _Investigation(_AlarmJob):
 
 
 class _ApprovedPush(_AlarmJob):
-    """A push that a person approved. It counts as tried once its first line is written; its end is what the push journal says."""
+    """A push that a person approved. It counts as tried once its first entry is written; its end is what the push journal says."""
 
-    def __init__(self, manager: AlarmManager, found: Approved, after: int) -> None:
-        super().__init__(manager, f"push of proposal {found.proposal}")
-        self._found, self._after, self._is_begun = found, after, False
+    kind = "push"
+
+    def __init__(self, manager: AlarmManager, found: Approved, terms: Schedule) -> None:
+        super().__init__(manager, terms)
+        self._found, self._after, self._is_begun = found, 0, False
+
+    async def begin(self) -> None:
+        self._after = await self._manager.last_push()
 
     async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
         push = self._manager.duties.push
@@ -321,7 +325,7 @@ class _ApprovedPush(_AlarmJob):
             outcome = await self._manager.settled(self._found, self._after, outcome)
         return await super().end(outcome)
 
-    async def last_words(self) -> None:
-        """Say by the journal where it stands; else the next start says it."""
+    async def interrupted(self) -> None:
+        """Record where it stands by the journal; if there is no time for it, the next start does."""
         if self._is_begun:
-            await self._manager.stopped(self._found, self._after)
+            await self._manager.interrupted(self._found, self._after)

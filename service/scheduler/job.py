@@ -1,21 +1,22 @@
-"""One way to carry out a job: watchers hear of it, its begin and its end are written down, and a stop of the service has its last words.
+"""How every job runs: watchers follow it, its begin and its end are recorded, and a stop of the service is recorded too.
 
-Checks, full campaigns, investigations, pushes and rollbacks all go through `carry_out`; what differs is a `Job` of its own.
+Checks, full campaigns, investigations, pushes and rollbacks are each a `Job`; `carry_out` runs any of them (decision 0039).
 """
 
 from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Generic, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import structlog
 
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
-from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, Aborted, Stopped
 from abbe.service.events import Progress, ProgressSink
@@ -27,22 +28,25 @@ log = structlog.get_logger("abbe.job")
 
 T = TypeVar("T")
 FAILURES = (DriverError, AbbeError, OSError, ArithmeticError, ValueError)
-"""What a job may fail with without being a defect of this program: devices, the job's own errors, files, numerics
+"""Failures that are no defect of this program: devices, the job's own errors, files, numerics
 (LinAlgError is a ValueError). Anything else ends the service with a traceback, and systemd starts it again."""
-LAST_WORDS_S = 1.0
-"""A service that ends has five seconds for everything."""
+SHUTDOWN_RECORD_S = 1.0
+"""How long a job may record its state when the service stops; the service has five seconds for everything."""
 
 
 class Job(ABC, Generic[T]):
-    """What is carried out, and what is written down of it. ``T``: what the work gives."""
+    """Work that has the machine to itself, and the records of it.
 
-    name: str
-    """What it is, for the log."""
-    hears_abort = False
-    """Whether the work itself ends on an abort; else it is cancelled."""
+    ``T`` is what the work returns. ``terms``: its name and recipe, as watchers and people see them. ``kind``: of `JobState`.
+    """
+
+    kind: JobKind = "check"
+    terms: Schedule
+    handles_abort: ClassVar[bool] = False
+    """Whether the work ends by itself when it is aborted; otherwise it is cancelled."""
 
     async def begin(self) -> None:
-        """Write down that it begins; what cannot be written down is not begun."""
+        """Record that it begins. If this fails, the work is not started."""
 
     @abstractmethod
     async def do(self, progress: ProgressSink, control: Control) -> T:
@@ -50,38 +54,65 @@ class Job(ABC, Generic[T]):
 
     @abstractmethod
     async def failed(self, error: Exception) -> T:
-        """What a failure is for people: an outcome, no error."""
+        """Return what a failure of devices, data or numerics means, as an outcome."""
 
     async def defect(self, error: Exception) -> None:
-        """Write down what must stay of a defect of this program, which ends the service then."""
+        """Record a defect of this program before it ends the service."""
 
     @abstractmethod
     async def end(self, outcome: T) -> SlotState:
-        """Write down how it ended."""
+        """Record how it ended."""
 
-    async def last_words(self) -> None:
-        """Write down where it stands when the service ends, if the store takes it at once."""
+    async def interrupted(self) -> None:
+        """Record where it stands when the service stops, within `SHUTDOWN_RECORD_S`."""
 
     def document(self) -> Doc | None:
-        """What watchers get at the end."""
+        """Return what watchers get at the end."""
         return None
 
 
-async def carry_out(job: Job[T], terms: Schedule, begun_utc: datetime, control: Control, watchers: Sequence[JobWatcher]) -> SlotState:
-    """Carry out a job.
+@dataclass(frozen=True, slots=True)
+class FollowUp:
+    """Work that no slot asks for: it has the machine to itself, as a check has, and starts on the terms of a schedule.
+
+    ``job``: None: the schedule's check. ``begun``: called when it has the machine.
+    """
+
+    schedule: Schedule
+    job: Job[Any] | None = None
+    begun: Callable[[], None] | None = None
+
+    @property
+    def name(self) -> str:
+        """What has the machine, for people."""
+        return self.schedule.name
+
+
+class FollowUps(Protocol):
+    """Knows what else is to be done."""
+
+    async def due(self) -> FollowUp | None:
+        """Return what may start now, or None."""
+        ...
+
+
+RunJob = Callable[[Job[Any]], Awaitable[SlotState]]
+"""``await run(job)``: runs a job so that people can see and steer it; returns how it ended."""
+
+
+async def carry_out(job: Job[T], begun_utc: datetime, control: Control, watchers: Sequence[JobWatcher] = ()) -> SlotState:
+    """Run a job to its end.
 
     Parameters
     ----------
     job : Job
         The work and its records.
-    terms : Schedule
-        The terms on which it runs, for watchers.
     begun_utc : datetime
         When it began.
     control : Control
-        Who may pause and stop it.
+        Pauses and stops it.
     watchers : sequence of JobWatcher
-        Hear of its start, progress and end.
+        Called at its start, at each progress, and once its end is recorded.
 
     Returns
     -------
@@ -91,7 +122,7 @@ async def carry_out(job: Job[T], terms: Schedule, begun_utc: datetime, control: 
     Raises
     ------
     CancelledError
-        The service ends.
+        The service stops.
     Exception
         A defect of this program; failures of devices, data and numerics are outcomes.
     """
@@ -101,7 +132,7 @@ async def carry_out(job: Job[T], terms: Schedule, begun_utc: datetime, control: 
             watcher.job_progress(progress)
 
     for watcher in watchers:
-        watcher.job_started(terms, begun_utc)
+        watcher.job_started(job.terms, begun_utc)
     try:
         return await job.end(await _outcome(job, progressed, control))
     finally:
@@ -112,10 +143,10 @@ async def carry_out(job: Job[T], terms: Schedule, begun_utc: datetime, control: 
 async def _outcome(job: Job[T], progress: ProgressSink, control: Control) -> T:
     try:
         await job.begin()
-        work = _coroutine(job, progress, control)
-        return await (work if job.hears_abort else control.unless_aborted(work))
+        work = job.do(progress, control)
+        return await (work if job.handles_abort else control.unless_aborted(work))
     except asyncio.CancelledError:
-        await _stopped_with_the_service(job)
+        await _record_interruption(job)
         raise
     except Exception as error:
         if is_defect(error):
@@ -126,35 +157,32 @@ async def _outcome(job: Job[T], progress: ProgressSink, control: Control) -> T:
         control.now(State.ENDED)
 
 
-async def _coroutine(job: Job[T], progress: ProgressSink, control: Control) -> T:
-    return await job.do(progress, control)
-
-
-async def _stopped_with_the_service(job: Job[T]) -> None:
+async def _record_interruption(job: Job[T]) -> None:
     try:
-        async with asyncio.timeout(LAST_WORDS_S):
-            await job.last_words()
+        async with asyncio.timeout(SHUTDOWN_RECORD_S):
+            await job.interrupted()
     except (AbbeError, TimeoutError) as trouble:
-        log.warning("stopped with the service; its end is not written down", job=job.name, cause=str(trouble))
+        log.warning("interrupted by the end of the service; not recorded", job=job.terms.name, cause=str(trouble))
 
 
 def is_defect(error: Exception) -> bool:
     """Whether something other than devices, data and numerics failed.
 
-    Devices that are watched side by side fail with a group; one unknown member makes all of it a defect.
+    Devices that are watched side by side fail with a group; one unknown member makes the whole group a defect.
     """
     return not isinstance(error, FAILURES) and not (isinstance(error, ExceptionGroup) and error.split(FAILURES)[1] is None)
 
 
 def failure(error: Exception) -> JobOutcome:
-    """What a person reads of work that was ended or failed: cause, remedy, and what was noted on its way."""
+    """Return the outcome of work that a person ended or that failed: cause, remedy, and the notes added on its way up."""
     ended, cause = isinstance(error, Stopped | Aborted), record.cause_of(error)
-    words = [cause["what"], "" if ended else cause["remedy"], *getattr(error, "__notes__", [])]
-    return JobOutcome("stopped" if ended else "failed", "; ".join(filter(None, words)))
+    parts = [cause["what"], "" if ended else cause["remedy"], *getattr(error, "__notes__", [])]
+    return JobOutcome("stopped" if ended else "failed", "; ".join(filter(None, parts)))
 
 
-class CheckJob:
-    """Runs checks of one machine.
+@dataclass(frozen=True, slots=True)
+class Checks:
+    """Makes the check of a slot.
 
     Parameters
     ----------
@@ -164,58 +192,52 @@ class CheckJob:
         ``await check(recipe, progress, control)``.
     shelf : Shelf
         Keeps the documents.
-    watchers : sequence of JobWatcher
-        Hear of start, progress and end.
     clock : Clock
         Times of failed checks.
     after : callable, optional
-        Hears of every verification that was kept.
+        ``await after(doc, number)`` for every verification that was kept.
     """
 
-    def __init__(
-        self, machine: str, check: Check, shelf: Shelf, watchers: Sequence[JobWatcher], clock: Clock, after: AfterCheck | None = None
-    ) -> None:
-        self.machine, self.check, self.shelf, self.clock, self.after = machine, check, shelf, clock, after
-        self._watchers = tuple(watchers)
+    machine: str
+    check: Check
+    shelf: Shelf
+    clock: Clock
+    after: AfterCheck | None = None
 
-    async def __call__(self, schedule: Schedule, slot_utc: datetime) -> SlotState:
-        """Run the check of one slot; return the slot's state."""
-        return await self.run(schedule, slot_utc, Control())
-
-    async def run(self, schedule: Schedule, slot_utc: datetime, control: Control) -> SlotState:
-        """Run the check of one slot under somebody's control; return the slot's state with the number of the verification."""
-        return await carry_out(_OneCheck(self, schedule, slot_utc), schedule, self.clock.utc(), control, self._watchers)
+    def __call__(self, schedule: Schedule, slot_utc: datetime) -> Job[Doc]:
+        """Return the check of one slot as a job."""
+        return _CheckJob(self, schedule, slot_utc)
 
 
-class _OneCheck(Job[Doc]):
-    """The check of one slot: what it found is kept, and if it failed, why. The timetable goes on either way."""
+class _CheckJob(Job[Doc]):
+    """The check of one slot. What it found is kept, and if it failed, why; the timetable goes on either way."""
 
-    hears_abort = True
+    handles_abort = True
 
-    def __init__(self, of: CheckJob, schedule: Schedule, slot_utc: datetime) -> None:
-        self._of, self.name = of, schedule.name
-        self._occasion = record.Occasion(of.machine, schedule, slot_utc)
-        self._started_utc, self._started_s = of.clock.utc(), of.clock.monotonic_s()
+    def __init__(self, checks: Checks, schedule: Schedule, slot_utc: datetime) -> None:
+        self.terms, self._checks = schedule, checks
+        self._occasion = record.Occasion(checks.machine, schedule, slot_utc)
+        self._started_utc, self._started_s = checks.clock.utc(), checks.clock.monotonic_s()
         self._doc: Doc | None = None
 
     async def do(self, progress: ProgressSink, control: Control) -> Doc:
-        return record.found(self._occasion, await self._of.check(self._occasion.schedule.recipe, progress, control))
+        return record.found(self._occasion, await self._checks.check(self.terms.recipe, progress, control))
 
     async def failed(self, error: Exception) -> Doc:
-        log.warning("check failed", schedule=self.name, **record.cause_of(error), exc_info=_traceback(error))
-        return record.failed(self._occasion, error, self._started_utc, self._of.clock.monotonic_s() - self._started_s)
+        log.warning("check failed", schedule=self.terms.name, **record.cause_of(error), exc_info=_traceback(error))
+        return record.failed(self._occasion, error, self._started_utc, self._checks.clock.monotonic_s() - self._started_s)
 
     async def end(self, outcome: Doc) -> SlotState:
         self._doc = outcome
-        number = await self._of.shelf.keep(outcome)
-        meant = "" if self._of.after is None else await self._of.after(outcome, number)
-        log.info("check done", schedule=self.name, verification=number, verdict=outcome["verdict"], text=outcome["text"])
-        return SlotState(f"done: {outcome['verdict']}", meant, verification=number)
+        number = await self._checks.shelf.keep(outcome)
+        meaning = "" if self._checks.after is None else await self._checks.after(outcome, number)
+        log.info("check done", schedule=self.terms.name, verification=number, verdict=outcome["verdict"], text=outcome["text"])
+        return SlotState(f"done: {outcome['verdict']}", meaning, verification=number)
 
     def document(self) -> Doc | None:
         return self._doc
 
 
 def _traceback(cause: Exception) -> Exception | None:
-    """The error if its traceback helps anybody: not for a cable that came off."""
+    """The error, if its traceback helps; it does not for a cable that came off."""
     return None if isinstance(cause, DriverError | AbbeError | OSError | ExceptionGroup) else cause

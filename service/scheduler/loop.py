@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Protocol
 
@@ -17,11 +17,13 @@ import structlog
 from abbe.service.clock import Clock
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import outcomes
-from abbe.service.scheduler.ports import Carry, Doc, Errands, FollowUp, Readiness, SlotLedger, SlotState, carried_alone
+from abbe.service.scheduler.job import FollowUp, FollowUps, RunJob, carry_out
+from abbe.service.scheduler.ports import Doc, Readiness, SlotLedger, SlotState
 from abbe.service.scheduler.ready import AlwaysReady
 from abbe.service.scheduler.slots import next_slot, previous_slot, slots_after
 from abbe.service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
 from abbe.service.scheduler.windows import Window, covering
+from abbe.service.sequences.control import Control
 
 log = structlog.get_logger("abbe.scheduler")
 
@@ -34,7 +36,8 @@ MAX_BACKLOG = 1000
 ADOPT_S = 900.0
 """How often slots are looked for that another service, which is gone, has left open."""
 
-Job = Callable[[Schedule, datetime], Awaitable[str]]
+RunSlot = Callable[[Schedule, datetime], Awaitable[str]]
+"""``await run(schedule, slot)``: runs the check of a slot; returns the state to write for it."""
 
 
 class Alarms(Protocol):
@@ -59,18 +62,18 @@ class LoopTerms:
         The longest wait: how soon a changed wall clock is noticed.
     recheck_s : float
         The longest wait while a slot waits for its preconditions.
-    errands : Errands, optional
+    follow_ups : FollowUps, optional
         What is to be done beside the timetable; slots go first.
-    carry : callable, optional
-        Does the work of errands; default: where nobody can steer it.
+    run_job : callable, optional
+        Runs the jobs of follow-ups; default: without a way to steer them.
     """
 
     maintenance: Sequence[Window] = ()
     ready: Readiness = field(default_factory=AlwaysReady)
     poll_s: float = 30.0
     recheck_s: float = 30.0
-    errands: Errands | None = None
-    carry: Carry = carried_alone
+    follow_ups: FollowUps | None = None
+    run_job: RunJob | None = None
 
 
 class Scheduler:
@@ -82,10 +85,10 @@ class Scheduler:
         The timetable.
     ledger : SlotLedger
         Remembers slots across restarts; its ``claim`` makes each of them run once.
-    job : callable
-        ``await job(schedule, slot)`` returns the state to write for the slot.
+    run_slot : callable
+        ``await run_slot(schedule, slot)`` returns the state to write for the slot.
     alarms : Alarms
-        Told of missed and skipped slots and of clock jumps.
+        Gets missed and skipped slots and clock jumps.
     clock : Clock
         All waiting and all "now".
     terms : LoopTerms, optional
@@ -93,11 +96,17 @@ class Scheduler:
     """
 
     def __init__(
-        self, schedules: Sequence[Schedule], ledger: SlotLedger, job: Job, alarms: Alarms, clock: Clock, terms: LoopTerms | None = None
+        self,
+        schedules: Sequence[Schedule],
+        ledger: SlotLedger,
+        run_slot: RunSlot,
+        alarms: Alarms,
+        clock: Clock,
+        terms: LoopTerms | None = None,
     ) -> None:
         self._schedules = tuple(schedules)
         self._ledger = ledger
-        self._job = job
+        self._run_slot = run_slot
         self._alarms = alarms
         self._clock = clock
         self._terms = terms or LoopTerms()
@@ -131,7 +140,7 @@ class Scheduler:
                     for schedule in self._schedules:
                         await self._deal_with_due(schedule)
                     await self._start_what_may(tasks)
-                    await self._start_errand(tasks)
+                    await self._start_follow_up(tasks)
                     await self._wait()
         finally:
             for waiting in self._waiting:
@@ -242,7 +251,7 @@ class Scheduler:
                 self._running = waiting.schedule.name  # before anything is awaited: nobody else takes the machine now
                 await self._ledger.begin(waiting.schedule.name, waiting.slot)
                 self._waiting.remove(waiting)
-                tasks.create_task(self._run_job(waiting.schedule, waiting.slot), name=f"check {waiting.schedule.name}")
+                tasks.create_task(self._run_check(waiting.schedule, waiting.slot), name=f"check {waiting.schedule.name}")
 
     async def _hindrance(self, schedule: Schedule) -> Hindrance | None:
         """Return what keeps a schedule from starting now, the cheapest question first: devices are asked last."""
@@ -254,32 +263,34 @@ class Scheduler:
         lack = await self._terms.ready.lack(schedule)
         return not_ready(lack) if lack else None
 
-    async def _start_errand(self, tasks: asyncio.TaskGroup) -> None:
+    async def _start_follow_up(self, tasks: asyncio.TaskGroup) -> None:
         """Start what no slot asks for, on the terms of its schedule."""
-        if self._terms.errands is None or self._running is not None:
+        if self._terms.follow_ups is None or self._running is not None:
             return
-        errand = await self._terms.errands.due()
-        if errand is None or await self._hindrance(errand.schedule) is not None or self._running is not None:
+        due = await self._terms.follow_ups.due()
+        if due is None or await self._hindrance(due.schedule) is not None or self._running is not None:
             return  # the last: a person took the machine while the devices were asked
-        self._running = errand.name
-        if errand.begun is not None:
-            errand.begun()
-        tasks.create_task(self._run_errand(errand), name=errand.name)
+        self._running = due.name
+        if due.begun is not None:
+            due.begun()
+        tasks.create_task(self._run_follow_up(due), name=due.name)
 
-    async def _run_errand(self, errand: FollowUp) -> None:
+    async def _run_follow_up(self, due: FollowUp) -> None:
         try:
-            if errand.work is not None:
-                await self._terms.carry(errand)
+            if due.job is None:
+                await self._run_slot(due.schedule, self._clock.utc())
+            elif self._terms.run_job is not None:
+                await self._terms.run_job(due.job)
             else:
-                await self._job(replace(errand.schedule, name=errand.name), self._clock.utc())
+                await carry_out(due.job, self._clock.utc(), Control())
         finally:
             self.give_back()
-            log.info("errand done", errand=errand.name)
+            log.info("follow-up done", follow_up=due.name)
 
-    async def _run_job(self, schedule: Schedule, slot: datetime) -> None:
+    async def _run_check(self, schedule: Schedule, slot: datetime) -> None:
         ended = outcomes.stopped(schedule.name, slot)
         try:
-            state = await self._job(schedule, slot)
+            state = await self._run_slot(schedule, slot)
             ended = outcomes.SlotOutcome(state, "", state.reason if isinstance(state, SlotState) else "")
         except Exception:
             ended = outcomes.broken_off(schedule.name, slot)  # a defect: the service ends with it, and nobody has stopped it

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal, NamedTuple, Protocol, Self
 
-from abbe.service.domain.job_state import JobKind, JobOutcome
+from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.schedule import Schedule
 from abbe.service.events import Progress, ProgressSink
 from abbe.service.sequences.control import Control
@@ -101,42 +100,6 @@ AfterCheck = Callable[[Doc, int], Awaitable[str]]
 """``await after(doc, number)``: what a kept verification means beyond itself, as a sentence; empty: nothing."""
 
 
-Work = Callable[[Control], Awaitable[SlotState]]
-
-
-@dataclass(frozen=True, slots=True)
-class FollowUp:
-    """Work that no slot asks for: it has the machine alone, as a check, and starts on a schedule's terms.
-
-    ``work``: what is done under somebody's control, and how it ended; None: the schedule's check, under ``name``. ``kind``: what it is to
-    people. ``begun``: told when it has the machine.
-    """
-
-    name: str
-    schedule: Schedule
-    work: Work | None = None
-    kind: JobKind = "check"
-    begun: Callable[[], None] | None = None
-
-
-Carry = Callable[[FollowUp], Awaitable[SlotState]]
-"""``await carry(errand)``: does an errand's work so that people can see and steer it; returns how it ended."""
-
-
-async def carried_alone(errand: FollowUp) -> SlotState:
-    """Do an errand's work where nobody can steer it."""
-    assert errand.work is not None
-    return await errand.work(Control())
-
-
-class Errands(Protocol):
-    """Who knows what else is to be done."""
-
-    async def due(self) -> FollowUp | None:
-        """Return what may start now, or None."""
-        ...
-
-
 class OpenSlot(NamedTuple):
     """A slot that a service which is gone left open. ``ran``: the machine had begun to move for it."""
 
@@ -197,7 +160,7 @@ class Shelf(Protocol):
 
 
 class JobWatcher(Protocol):
-    """Is told, synchronously, what the one running job does."""
+    """Follows the running job; its methods are called synchronously."""
 
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
         """A check begins."""

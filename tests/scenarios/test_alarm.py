@@ -9,6 +9,7 @@ import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Any
 
 import pytest
@@ -32,8 +33,9 @@ from abbe.service.push.limits import PushLimits
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
-from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.job import Checks, Job, carry_out
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
@@ -79,16 +81,23 @@ class Shop:
         full = identification(self.site.machine, rate_hz=RATE_HZ)
         tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
         duties = duties_on(AlarmSection(push="approved"), self.site, CampaignPlan("full", tests), RATE_HZ)(self.store)
-        channels = AlarmChannels(TOPICS[1], lambda: None, AuditBook(self.store, self.url), [board])
+        channels = AlarmChannels(TOPICS[1], lambda: None, AuditBook(self.store, self.url))
         desk = AlarmManager(self.store, clock, "sim", [OFTEN], duties, channels)
         shelf = StoreShelf(self.store, clock, ("sim", self.store.add_machine("sim", self.site.doc)), TOPICS, lambda: None)
 
         async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:
             return await run_check(self.config, self.store, recipe, progress, control=control)
 
-        job = CheckJob("sim", check, shelf, [board], clock, desk.checked)
-        terms = LoopTerms(poll_s=0.5, recheck_s=0.5, errands=desk)
-        scheduler = Scheduler([OFTEN], StoreLedger(self.store, clock, "sim"), job, shelf, clock, terms)
+        checks = Checks("sim", check, shelf, clock, desk.checked)
+
+        async def run_job(job: Job[Any]) -> SlotState:
+            return await carry_out(job, clock.utc(), Control(), [board])
+
+        async def run_slot(schedule: Schedule, slot: datetime) -> SlotState:
+            return await run_job(checks(schedule, slot))
+
+        terms = LoopTerms(poll_s=0.5, recheck_s=0.5, follow_ups=desk, run_job=run_job)
+        scheduler = Scheduler([OFTEN], StoreLedger(self.store, clock, "sim"), run_slot, shelf, clock, terms)
         running = asyncio.create_task(scheduler.run())
         self.view = StatusReader(Reader(self.store, "sim", clock), "0", board, scheduler.next_due, "")
         try:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from abbe.service.compensation.push_approved import PushOrder
     from abbe.service.config import LoadedMachine
     from abbe.service.config_timetable import AlarmSection
-    from abbe.service.core.orders import CampaignOrder, Hands, MeasureCampaign
+    from abbe.service.core.orders import CampaignOrder, MeasureCampaign, OrderActions
     from abbe.service.core.setup import ServiceSetup
     from abbe.service.domain.job_state import JobOutcome
     from abbe.service.events import ProgressSink
@@ -127,7 +127,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         table=(lambda store: look_at_table(site, store)) if config.alarm.watch_table else None,
         live=live,
         told=_told(site),
-        hands=None if site.urls.cnc is None else hands_on(config.alarm, site),
+        actions=None if site.urls.cnc is None else order_actions_on(config.alarm, site),
         campaigns=_campaigns(config.alarm.campaign, site, folder),
         campaign=None if site.urls.cnc is None else campaign_on(site, folder, live),
         warnings=check_plausibility(config, folder, SystemClock().utc().date()).warnings,
@@ -196,21 +196,21 @@ def duties_on(
     return duties
 
 
-def hands_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], Hands]:
+def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], OrderActions]:
     """Return what a person can order of tables, given the service's store: a push only where the service does not push by itself."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.ordered_rollback import ordered_rollback
     from abbe.service.compensation.push_approved import push_approved
-    from abbe.service.core.orders import Hands
+    from abbe.service.core.orders import OrderActions
 
-    def on(store: ServiceStore) -> Hands:
+    def on(store: ServiceStore) -> OrderActions:
         async def back(order: BackOrder) -> JobOutcome:
             return await ordered_rollback(site, store, order, clock=SystemClock())
 
         async def push(order: PushOrder) -> JobOutcome:
             return await push_approved(site, store, order, clock=SystemClock())
 
-        return Hands(back, push if alarm.push == "never" else None)
+        return OrderActions(back, push if alarm.push == "never" else None)
 
     return on
 

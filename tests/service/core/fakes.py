@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import count
-from typing import Any
+from typing import Any, Protocol
 
 from abbe.service.domain.schedule import Schedule
-from abbe.service.events import Progress
-from abbe.service.scheduler.ports import OpenSlot
+from abbe.service.events import Progress, ProgressSink
+from abbe.service.scheduler.job import Job
+from abbe.service.scheduler.ports import OpenSlot, SlotState
+from abbe.service.sequences.control import Control
 
 
 class FakeClock:
@@ -165,3 +168,29 @@ class FakeWatcher:
 
     def job_ended(self, doc: dict[str, Any] | None) -> None:
         self.heard.append(f"ended {doc['verdict'] if doc else None}")
+
+
+class RunCheck(Protocol):
+    async def __call__(self, schedule: Schedule, slot: datetime, control: Control, /) -> SlotState: ...
+
+
+class FakeCheckJob(Job[SlotState]):
+    """A check that does what a test says, and ends as that says."""
+
+    handles_abort = True
+
+    def __init__(self, run: RunCheck, schedule: Schedule, slot: datetime) -> None:
+        self._run, self.terms, self._slot = run, schedule, slot
+
+    async def do(self, progress: ProgressSink, control: Control) -> SlotState:
+        return await self._run(self.terms, self._slot, control)
+
+    async def failed(self, error: Exception) -> SlotState:
+        raise error
+
+    async def end(self, outcome: SlotState) -> SlotState:
+        return outcome
+
+
+def fake_checks(run: RunCheck) -> Callable[[Schedule, datetime], FakeCheckJob]:
+    return lambda schedule, slot: FakeCheckJob(run, schedule, slot)

@@ -32,6 +32,7 @@ from abbe.service.jobs.investigate import Note, investigate
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import PushState as Push
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
+from abbe.service.scheduler.job import carry_out
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
@@ -41,7 +42,7 @@ from abbe.service.tables.push_outcome import by_journal, open_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
-from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, utc
+from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, utc
 
 NOON = utc(2026, 6, 1, 12)
 YEARLY = Schedule("yearly", "0 0 1 1 *", "UTC", "quick-check", on_alarm="propose")
@@ -65,7 +66,7 @@ Investigate = Callable[[Alarm, Note, ProgressSink, Control], Awaitable[None]]
 
 @dataclass
 class Bench:
-    """A real scheduler, book of jobs, desk and database; what an errand does is told by each test."""
+    """A real scheduler, book of jobs, desk and database; what an follow_up does is told by each test."""
 
     store: ServiceStore
     url: str
@@ -79,8 +80,8 @@ class Bench:
         self.desk = AlarmManager(
             self.store, self.clock, "mill-7", [YEARLY], duties, AlarmChannels(None, lambda: None, AuditBook(self.store, self.url))
         )
-        self.book = JobRegistry(self._check, ("quick-check",), self._may, self.clock, lambda: None)
-        terms = LoopTerms(errands=self.desk, carry=self.book.errand)
+        self.book = JobRegistry(fake_checks(self._check), ("quick-check",), self._may, self.clock, lambda: None)
+        terms = LoopTerms(follow_ups=self.desk, run_job=self.book.run)
         self.scheduler = Scheduler([YEARLY], FakeLedger(), self.book, FakeShelf(), self.clock, terms)
 
     async def _may(self, who: str) -> bool:
@@ -131,7 +132,8 @@ class Bench:
 
     async def pushed(self, control: Control | None = None) -> tuple[str, str]:
         """Let the desk push proposal 4; the word and the sentence that the alarm's line says."""
-        state = await self.desk._pushed(Approved(4, 9, NO_ALARM), YEARLY, control or Control())
+        job = self.desk.push_job(Approved(4, 9, NO_ALARM), YEARLY)
+        state = await carry_out(job, NOON, control or Control())
         last = self.lines()[-1]
         assert (last.kind, state) == (AlarmKind.PUSHED, f"done: {last.doc['word']}")
         return last.doc["word"], last.doc["text"]
@@ -229,12 +231,7 @@ async def test_a_push_is_a_job_and_is_not_paused_while_a_table_is_not_verified(b
         return JobOutcome("refused", "not today")
 
     bench.push = push
-    from abbe.service.scheduler.ports import FollowUp
-
-    def work(control: Control) -> Awaitable[str]:
-        return bench.desk._pushed(Approved(4, 9, NO_ALARM), YEARLY, control)
-
-    assert await bench.book.errand(FollowUp("push of proposal 4", YEARLY, work, "push")) == "done: refused"
+    assert await bench.book.run(bench.desk.push_job(Approved(4, 9, NO_ALARM), YEARLY)) == "done: refused"
     assert seen == [("conflict", "it cannot be paused now: a table that nobody has verified may be in force"), ("done", "")]
     (job,) = bench.jobs()
     assert (job.kind, job.state, job.text) == ("push", "done: refused", "not today")

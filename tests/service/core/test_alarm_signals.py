@@ -23,7 +23,7 @@ from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
 from abbe.service.scheduler import record
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
-from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.job import Checks, carry_out
 from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
@@ -113,7 +113,7 @@ class Bench:
         self.asked: list[Alarm] = []
         self.trouble: Exception | None = None
         self.outcome: Result | Exception = result(0)
-        channels = AlarmChannels(TOPICS[1], lambda: None, AuditBook(store, url), [self.watcher])
+        channels = AlarmChannels(TOPICS[1], lambda: None, AuditBook(store, url))
 
         async def look_into(one: Alarm, note: Note, progress: Any, control: Any) -> None:
             self.asked.append(one)
@@ -127,7 +127,7 @@ class Bench:
         duties = Duties(14.0, "identification", look_into, push_one if push else None)
         self.desk = AlarmManager(store, self.clock, "mill-7", [DAILY], duties, channels)
         shelf = StoreShelf(store, self.clock, ("mill-7", self.machine_id), TOPICS, lambda: None)
-        self.job = CheckJob("mill-7", self._check, shelf, [], self.clock, self.desk.checked)
+        self.checks = Checks("mill-7", self._check, shelf, self.clock, self.desk.checked)
 
     async def _check(self, recipe: str, progress: Any, control: Any) -> Result:
         if isinstance(self.outcome, Exception):
@@ -136,19 +136,19 @@ class Bench:
 
     async def check(self, outcome: Result | Exception) -> str:
         self.outcome = outcome
-        state = await self.job(DAILY, START)
+        state = await carry_out(self.checks(DAILY, START), START, Control())
         return state.reason
 
     def told(self) -> list[tuple[str, int]]:
         rows = [json.loads(m.payload) for m in self.store.outbox_pending() if m.topic == TOPICS[1]]
         return [(row["code"], row.get("alarm", 0)) for row in rows]
 
-    async def errand(self) -> str:
+    async def follow_up(self) -> str:
         found = await self.desk.due()
         if found is None:
             return ""
-        if found.work is not None:
-            await found.work(Control())
+        if found.job is not None:
+            await carry_out(found.job, START, Control(), [self.watcher])
         return found.name
 
 
@@ -186,16 +186,16 @@ async def test_raised_held_acknowledged_cleared_with_messages_and_audit(bench: B
 
 async def test_an_investigation_is_asked_for_once_and_a_failure_once_more(bench: Bench) -> None:
     await bench.check(result(0))
-    assert await bench.errand() == ""
+    assert await bench.follow_up() == ""
     await bench.check(result(1, 25.0))
     bench.trouble = LinkDown("laser", "read", "gone")
-    assert await bench.errand() == "investigation of alarm 1"
-    assert await bench.errand() == ""  # not until the next check holds the alarm
+    assert await bench.follow_up() == "investigation of alarm 1"
+    assert await bench.follow_up() == ""  # not until the next check holds the alarm
     await bench.check(result(2, 25.0))
     bench.trouble = None
-    assert await bench.errand() == "investigation of alarm 1"
+    assert await bench.follow_up() == "investigation of alarm 1"
     await bench.check(result(3, 25.0))
-    assert await bench.errand() == ""
+    assert await bench.follow_up() == ""
     assert alarms_of(bench.store, "mill-7")[0].outcome == "no proposal: the tables promise too little"
     assert bench.told() == [("ALM-001", 1), ("ALM-005", 1), ("ALM-004", 1)]
     assert bench.watcher.heard == ["started investigation of alarm 1", "ended None"] * 2
@@ -206,25 +206,25 @@ async def test_a_defect_of_an_investigation_is_not_hidden(bench: Bench) -> None:
     bench.trouble = KeyError("a defect")
     for day in (2, 3):
         with pytest.raises(KeyError):
-            await bench.errand()
-        assert await bench.errand() == ""  # nor does it end each service that is started after this one
+            await bench.follow_up()
+        assert await bench.follow_up() == ""  # nor does it end each service that is started after this one
         await bench.check(result(day, 25.0))
-    assert await bench.errand() == ""
+    assert await bench.follow_up() == ""
 
 
 async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_anew(bench: Bench) -> None:
     await bench.check(result(0))
     await bench.check(result(1, 25.0))
-    await bench.errand()
+    await bench.follow_up()
     at = START + timedelta(days=1, hours=3)
     entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="KEEP", utc=utc_text(at), prev=GENESIS, digest="d" * 64)
     bench.store.add_push_entry(entry)
     assert series_begins(bench.store, "mill-7") == at
     last = alarms_of(bench.store, "mill-7")[0].last_seq
     bench.store.add_alarm_entry("mill-7", 1, last + 1, "pushed", {"word": "kept", "proposal": 1, "text": "proposal 1 kept"})
-    errand = await bench.desk.due()
-    assert errand is not None
-    assert (errand.name, errand.schedule.recipe, errand.work) == ("daily (after push)", "quick-check", None)
+    follow_up = await bench.desk.due()
+    assert follow_up is not None
+    assert (follow_up.name, follow_up.schedule.recipe, follow_up.job) == ("daily (after push)", "quick-check", None)
     again = await bench.desk.due()
     assert again is not None  # it could not start: it is offered until it has begun
     assert again.begun is not None
@@ -238,12 +238,12 @@ async def test_a_push_that_the_service_did_not_survive_is_said_and_not_begun_aga
     with ServiceStore.open(url) as store:
         store.add_alarm_entry("mill-7", NO_ALARM, 0, "pushing", {"proposal": 7, "approval": 1, "text": "proposal 7 is being pushed"})
         bench = Bench(store, url, push=True)
-        assert await bench.errand() == ""
+        assert await bench.follow_up() == ""
         begun, ended = store.alarm_entries("mill-7")
         assert (begun.kind, ended.kind, ended.doc["word"]) == ("pushing", "pushed", "failed")
         assert ended.doc["text"].startswith("proposal 7 failed: the service ended before anything was written")
         assert bench.told() == [("ALM-006", 0)]
-        assert await bench.errand() == ""
+        assert await bench.follow_up() == ""
         assert len(store.alarm_entries("mill-7")) == 2
 
 

@@ -24,7 +24,7 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.users.roles import ALLOWED, Permission, Role
-from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
+from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 
 NOON = utc(2026, 6, 1, 12)
 HOURLY = Schedule("hourly", "0 * * * *", "UTC", "verify", grace_s=600.0)
@@ -44,7 +44,7 @@ class Bench:
     numbers: int = 0
 
     def __post_init__(self) -> None:
-        self.book = JobRegistry(self.run, ("quick-check", "verify"), self.may, self.clock, self.changed)
+        self.book = JobRegistry(fake_checks(self.run), ("quick-check", "verify"), self.may, self.clock, self.changed)
         self.scheduler = Scheduler([HOURLY], self.ledger, self.book, self.shelf, self.clock)
 
     def changed(self) -> None:

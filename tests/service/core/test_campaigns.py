@@ -20,7 +20,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, DoneByHand, How, StartJob, SteerJob
 from abbe.service.core.board import Board
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import CampaignOrder, Ground, full_campaigns
+from abbe.service.core.orders import CampaignOrder, OrderContext, full_campaigns
 from abbe.service.core.snapshot import SnapshotSource
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.errors import StoreError, TableMismatch
@@ -29,7 +29,7 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, Prompts
 from tests.patience import within
-from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
+from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 
 LED = JobOutcome("proposed", "proposal 4 waits for approval", 7, 4)
 BAR, LASER = "hang in the bar", "set up the laser"
@@ -57,10 +57,10 @@ class Bench:
         async def may_propose(who: str) -> bool:
             return who in self.proposers
 
-        self.book = JobRegistry(self.check, ("quick-check",), may, self.clock, self.news.set)
         self.board = Board({}, self.clock)
-        ground = Ground("mill-7", may, self.audit, [self.board])
-        self.book.full = full_campaigns(ground, ("identification", "own.toml"), self.measure, may_propose)
+        self.book = JobRegistry(fake_checks(self.check), ("quick-check",), may, self.clock, self.news.set, [self.board])
+        context = OrderContext("mill-7", may, self.audit)
+        self.book.full = full_campaigns(context, ("identification", "own.toml"), self.measure, may_propose)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
         self.snapshots = SnapshotSource(self.board, self.book, list, self.clock)
 

@@ -13,7 +13,7 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MeasurementFault
-from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.job import Checks, carry_out
 from abbe.service.sequences.control import Control
 from tests.service.core.fakes import STEP, FakeClock, FakeShelf, FakeWatcher, Result, settle, utc
 
@@ -26,9 +26,14 @@ class Bench:
         self.outcome = outcome
         self.shelf = FakeShelf()
         self.watcher = FakeWatcher()
-        self.job = CheckJob("mill-7", self.check, self.shelf, [self.watcher], FakeClock(SLOT))
+        self.check = self.given
 
-    async def check(self, recipe: str, progress: Callable[[Any], None], control: Control) -> Result:
+    async def job(self) -> str:
+        """Run the check of the slot."""
+        job = Checks("mill-7", self.check, self.shelf, FakeClock(SLOT))(SCHEDULE, SLOT)
+        return await carry_out(job, SLOT, Control(), [self.watcher])
+
+    async def given(self, recipe: str, progress: Callable[[Any], None], control: Control) -> Result:
         assert recipe == "verify"
         progress(STEP)
         if isinstance(self.outcome, BaseException):
@@ -38,7 +43,7 @@ class Bench:
 
 async def test_a_result_is_kept_whole() -> None:
     bench = Bench(Result())
-    assert await bench.job(SCHEDULE, SLOT) == "done: pass"
+    assert await bench.job() == "done: pass"
     (doc,) = bench.shelf.docs
     assert json.loads(json.dumps(doc)) == doc
     assert doc["schema"] == 1
@@ -63,7 +68,7 @@ async def test_a_result_is_kept_whole() -> None:
 )
 async def test_a_failure_is_cannot_tell_with_its_cause_in_one_line(error: Exception, code: str, device: str) -> None:
     bench = Bench(error)
-    assert await bench.job(SCHEDULE, SLOT) == "done: cannot tell"
+    assert await bench.job() == "done: cannot tell"
     (doc,) = bench.shelf.docs
     assert doc["verdict"] == "cannot tell"
     assert doc["cause"]["code"] == code
@@ -76,7 +81,7 @@ async def test_a_failure_is_cannot_tell_with_its_cause_in_one_line(error: Except
 async def test_a_defect_is_not_hidden() -> None:
     bench = Bench(ExceptionGroup("check", [LinkDown("bar", "read", "gone"), KeyError("oops")]))
     with pytest.raises(ExceptionGroup):
-        await bench.job(SCHEDULE, SLOT)
+        await bench.job()
     assert bench.shelf.docs == []
     assert bench.watcher.heard[-1] == "ended None"
 
@@ -90,7 +95,8 @@ async def test_a_stop_is_not_a_result() -> None:
         await asyncio.Event().wait()
         raise AssertionError
 
-    task = asyncio.create_task(CheckJob("m", check, bench.shelf, [bench.watcher], FakeClock(SLOT))(SCHEDULE, SLOT))
+    bench.check = check
+    task = asyncio.create_task(bench.job())
     await started.wait()
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -102,5 +108,5 @@ async def test_a_stop_is_not_a_result() -> None:
 
 async def test_what_is_no_number_and_what_is_no_verdict() -> None:
     bench = Bench(Result(verdict="PASS!", values={"helix_rms_um": math.nan}))
-    assert await bench.job(SCHEDULE, SLOT) == "done: cannot tell"
+    assert await bench.job() == "done: cannot tell"
     assert bench.shelf.docs[0]["values"] == {"helix_rms_um": None}

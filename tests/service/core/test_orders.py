@@ -20,7 +20,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, RollBack, StartJob
 from abbe.service.compensation.ordered_rollback import BackOrder
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import Ground, Hands, Orders
+from abbe.service.core.orders import OrderActions, OrderContext, Orders
 from abbe.service.core.rights import may
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.errors import StoreError
@@ -36,7 +36,7 @@ from abbe.service.users.people import People
 from abbe.service.users.roles import Permission, Role
 from tests.patience import within
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed
-from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
+from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 
 MACHINE, OLD, NEW, OTHER = "mill-7", b"the old one", b"the new one", b"another one"
 
@@ -62,9 +62,10 @@ class Bench:
         async def anybody(_: str) -> bool:
             return True
 
-        self.book = JobRegistry(self.check, ("quick-check",), anybody, self.clock, self.news.set)
+        self.book = JobRegistry(fake_checks(self.check), ("quick-check",), anybody, self.clock, self.news.set)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
-        self.orders = Orders(self.store, self.clock, self.book, Ground(MACHINE, allowed, self.audit), Hands(self.ordered_rollback))
+        self.context = OrderContext(MACHINE, allowed, self.audit)
+        self.orders = Orders(self.store, self.clock, self.book, self.context, OrderActions(self.ordered_rollback))
 
     async def check(self, schedule: object, slot: datetime, control: Control) -> SlotState:
         await self.may_end.wait()
@@ -220,7 +221,7 @@ async def test_what_cannot_be_recorded_is_not_begun(bench: Bench, monkeypatch: p
 
 async def test_a_service_without_a_controller_takes_no_order(bench: Bench) -> None:
     await bench.push({}, OLD, NEW, KEPT)
-    bench.orders = Orders(bench.store, bench.clock, bench.book, bench.orders._ground, Hands())
+    bench.orders = Orders(bench.store, bench.clock, bench.book, bench.context, OrderActions())
     assert (await bench.ask()).outcome == "conflict"
 
 

@@ -12,9 +12,10 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.schedule import Schedule
 from abbe.service.events import ProgressSink
 from abbe.service.scheduler.heartbeat import Heartbeat
-from abbe.service.scheduler.job import CheckJob
+from abbe.service.scheduler.job import Checks, carry_out
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.scheduler.store import ServiceStore
+from abbe.service.sequences.control import Control
 
 QUICK = Schedule("quick", "*/1 * * * *", "UTC", "quick-check")
 FIRST = datetime(2026, 11, 22, 9, tzinfo=UTC)
@@ -48,7 +49,7 @@ async def main() -> None:
 
         shelf = StoreShelf(store, clock, (name, machine_id), ("v", "a"), lambda: None)
         heartbeat = Heartbeat(name, "0", store, lambda: [], clock)
-        job, ledger = CheckJob(name, check, shelf, [heartbeat], clock), StoreLedger(store, clock, name)
+        checks, ledger = Checks(name, check, shelf, clock), StoreLedger(store, clock, name)
         sys.stdout.write("ready\n")
         sys.stdout.flush()
         sys.stdin.readline()
@@ -57,7 +58,7 @@ async def main() -> None:
             slot = FIRST + timedelta(minutes=done[0])
             assert await ledger.claim("quick", slot)
             await ledger.begin("quick", slot)
-            await ledger.finish("quick", slot, await job(QUICK, slot))
+            await ledger.finish("quick", slot, await carry_out(checks(QUICK, slot), slot, Control(), [heartbeat]))
         told.cancel()
 
 

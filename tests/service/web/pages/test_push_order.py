@@ -16,7 +16,7 @@ from abbe.service.channel.messages import Answer, PushNow
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import Ground, Hands, Orders
+from abbe.service.core.orders import OrderActions, OrderContext, Orders
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
@@ -25,7 +25,7 @@ from abbe.service.web.pages.proposals import approve_as
 from tests.pages_world import Filled, Served
 from tests.patience import within
 from tests.pretended_push import TAKEN_BACK, as_if_pushed
-from tests.service.core.fakes import FakeLedger, FakeShelf
+from tests.service.core.fakes import FakeLedger, FakeShelf, fake_checks
 
 
 @dataclass
@@ -40,12 +40,12 @@ class Bench:
 
     def __post_init__(self) -> None:
         self.news = asyncio.Event()
-        self.book = JobRegistry(self.never, (), self.anybody, self.clock, self.news.set)
+        self.book = JobRegistry(fake_checks(self.never), (), self.anybody, self.clock, self.news.set)
         self.scheduler = Scheduler([], FakeLedger(), self.book, FakeShelf(), self.clock)
-        self.orders = self.with_hands(Hands(push=self.push))
+        self.orders = self.with_actions(OrderActions(push=self.push))
 
-    def with_hands(self, hands: Hands) -> Orders:
-        return Orders(self.store, self.clock, self.book, Ground(self.filled.machine, self.anna, self.audit), hands)
+    def with_actions(self, actions: OrderActions) -> Orders:
+        return Orders(self.store, self.clock, self.book, OrderContext(self.filled.machine, self.anna, self.audit), actions)
 
     async def never(self, *_: object) -> SlotState:
         raise AssertionError
@@ -104,6 +104,6 @@ async def test_only_what_is_approved_is_pushed_and_the_journal_has_the_word(benc
 
 
 async def test_a_service_that_pushes_by_itself_takes_no_order(bench: Bench) -> None:
-    bench.orders = bench.with_hands(Hands())
+    bench.orders = bench.with_actions(OrderActions())
     answer = await bench.ask(bench.filled.proposals[2])
     assert (answer.outcome, "by itself" in answer.text) == ("conflict", True)
