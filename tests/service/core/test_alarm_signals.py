@@ -217,7 +217,7 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
     await bench.check(result(1, 25.0))
     await bench.follow_up()
     at = START + timedelta(days=1, hours=3)
-    entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="KEEP", utc=utc_text(at), prev=GENESIS, digest="d" * 64)
+    entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="KEEP", doc={}, utc=utc_text(at), prev=GENESIS, digest="d" * 64)
     bench.store.add_push_entry(entry)
     assert series_begins(bench.store, "mill-7") == at
     last = alarms_of(bench.store, "mill-7")[0].last_seq
