@@ -29,9 +29,9 @@ from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of
 from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.events import ignore_progress
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc
 from abbe.service.queries.reader import Reader

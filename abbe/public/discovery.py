@@ -14,8 +14,8 @@ from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, prep
 from abbe.service.discovery.discover import discover as run_discovery
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_words import UNITS
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue, checked
-from abbe.service.events import Progress, ProgressSink
 from abbe.service.rendering.discovery_page import render_discovery
 from abbe.service.rendering.page_file import write_page
 from abbe.service.report.discovery_pages import discovery_page, page_facts

@@ -13,8 +13,8 @@ from abbe.drivers.errors import DriverError
 from abbe.models.arrays import F1, F2
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.devices.session import Session
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import AbbeError, MeasurementFault, PushNotBegun, TableRefused
-from abbe.service.events import ProgressSink
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control

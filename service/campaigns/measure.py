@@ -22,8 +22,8 @@ from abbe.service.devices.clock_notes import notes_since
 from abbe.service.devices.session import Session
 from abbe.service.domain.measured import DISK_FULL
 from abbe.service.domain.owner import this_process
+from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
-from abbe.service.events import ProgressSink, ignore_progress
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.guard import warnings_of

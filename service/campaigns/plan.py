@@ -14,8 +14,8 @@ from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, feed_mm_min
 from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, PlanStep, plan_campaign
 from abbe.service.campaigns.plan_instruments import at_this_machine
+from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import ConfigError
-from abbe.service.events import Progress, ProgressSink, ignore_progress
 from abbe.service.rendering.plan_page import PlanPage, render_plan
 from abbe.service.rendering.plots.setups import SetupPath, setups_picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced

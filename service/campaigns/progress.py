@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from abbe.service.clock import Clock
-from abbe.service.events import Place, Progress, ProgressSink
-from abbe.service.sequences.control import Control, Situation, State
+from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.sequences.control import Control, State
 
 WAITING = (State.PAUSED, State.SUSPENDED)
 
@@ -39,7 +39,7 @@ class ProgressMeter:
         """Report how far the job is, and how long the last step waited for a person."""
         self.waited_s += waited_s
         self.message, self._at_s = message, done_s
-        self.sink(Progress(self.stage, done_s, self.total_s, self._eta_s(done_s), message, self._place()))
+        self._report(self._eta_s(done_s))
 
     async def tell(self) -> None:
         """Report every pause and suspension as it begins and ends; a suspension's time is left out of the ETA."""
@@ -48,7 +48,7 @@ class ProgressMeter:
         async for now in self.control.watch():
             if now.state in WAITING:
                 self.waits()
-                self.sink(Progress(self.stage, self._at_s, self.total_s, None, self.message, self._place()))
+                self._report(None)
             else:
                 self.goes_on()
 
@@ -72,6 +72,6 @@ class ProgressMeter:
         elapsed, made_s = self.clock.monotonic_s() - self.start_s - self.waited_s, done_s - self.skipped_s
         return elapsed / made_s * (self.total_s - done_s) if made_s > 0.02 * self.total_s else None
 
-    def _place(self) -> Place:
-        now = self.control.situation if self.control is not None else Situation(State.RUNNING)
-        return Place(str(now.state), now.why, self.message, now.step, now.steps, now.points)
+    def _report(self, eta_s: float | None) -> None:
+        now = self.control.progress if self.control is not None else Progress()
+        self.sink(replace(now, stage=self.stage, done=self._at_s, total=self.total_s, eta_s=eta_s, message=self.message))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import MachineFile
     from abbe.service.devices.session import Session
-    from abbe.service.events import ProgressSink
+    from abbe.service.domain.progress import ProgressSink
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site

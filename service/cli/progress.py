@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from abbe.service.events import Progress, ProgressSink
+    from abbe.service.domain.progress import Progress, ProgressSink
 
 
 @contextmanager
@@ -54,5 +54,4 @@ def display() -> Iterator[ProgressSink]:
 
 def _waits(p: Progress) -> str:
     """What a measurement waits for; empty while it goes on."""
-    place = p.place
-    return f"{place.state}: {place.why}" if place is not None and place.state in ("paused", "suspended") else ""
+    return f"{p.state}: {p.why}" if p.state in ("paused", "suspended") else ""

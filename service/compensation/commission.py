@@ -23,8 +23,8 @@ from abbe.service.compensation.proved_levels import identity
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.events import ProgressSink
 from abbe.service.push.operations import Verdict
 from abbe.service.sequences.interlocks import Suspending
 from abbe.service.site import Site

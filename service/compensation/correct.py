@@ -28,8 +28,8 @@ from abbe.service.compensation.proposals import (
     solved_again,
 )
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
+from abbe.service.domain.progress import Progress
 from abbe.service.errors import AbbeError, TakenBack
-from abbe.service.events import Progress
 from abbe.service.identification.solve import Solved, helix_misfit
 from abbe.service.identification.table_removal import less, taken
 from abbe.service.push.operations import Verdict

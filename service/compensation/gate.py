@@ -18,8 +18,8 @@ from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proved_levels import check_level
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
+from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.errors import TableRefused
-from abbe.service.events import ProgressSink, ignore_progress
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.validate import promise_reason
 from abbe.service.sequences.control import Control

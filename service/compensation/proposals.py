@@ -22,8 +22,8 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.candidates import Promise, candidate_of, scene_of
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.domain.measured import CampaignRecord, RunRecord
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.events import Progress, ProgressSink
 from abbe.service.identification.effect_removal import TakenOut, taken_out
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc

@@ -22,9 +22,9 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
-from abbe.service.events import ProgressSink
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import verification

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import datetime
 
 from abbe.service.clock import Clock
 from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.progress import Progress, RunningCheck
 from abbe.service.domain.schedule import Schedule
-from abbe.service.events import Progress
 from abbe.service.scheduler.ports import Doc
 
 
@@ -45,10 +44,7 @@ class Board:
     def job_progress(self, progress: Progress) -> None:
         """Note how far it is."""
         if self.job is not None:
-            now = {name: getattr(progress, name) for name in ("stage", "message", "done", "total", "eta_s")}
-            if progress.place is not None:
-                now |= {name: getattr(progress.place, name) for name in ("step", "steps", "points")}
-            self.job = replace(self.job, **now)
+            self.job = replace(self.job, **{field.name: getattr(progress, field.name) for field in fields(Progress)})
 
     def job_ended(self, doc: Doc | None) -> None:
         """Note how it ended. A check that was stopped or failed says nothing about the devices it does not name."""

@@ -211,8 +211,8 @@ class JobRegistry:
     def _look(self, entry: _Entry) -> JobState:
         if entry.seen.ended_utc is not None:
             return entry.seen
-        control, now, prompt = entry.control, entry.control.situation, entry.control.prompts.now
-        state = now.state
+        control, now, prompt = entry.control, entry.control.progress, entry.control.prompts.now
+        state = control.state
         if state is State.READY:  # the work has not reported yet; what a person has asked for waits for it
             asked = ((State.ABORTING, control.aborting), (State.STOPPING, control.stopping), (State.PAUSING, control.pausing))
             state = next((one for one, is_asked in asked if is_asked), State.RUNNING)

@@ -28,8 +28,8 @@ from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_ha
 from abbe.service.core.rights import person
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobKind, JobOutcome
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import AbbeError, NotStored, TableRefused
-from abbe.service.events import ProgressSink
 from abbe.service.jobs.guided_campaign import is_full
 from abbe.service.scheduler.job import Job, failure
 from abbe.service.scheduler.ports import SlotState

@@ -14,7 +14,7 @@ from abbe.service.clock import Clock
 from abbe.service.core.board import Board
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.domain.bounds import TEXT, WORD
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 
 AGAIN = timedelta(minutes=1)
@@ -71,6 +71,7 @@ class SnapshotSource:
             recipe=check.recipe[:WORD],
             stage=check.stage[:WORD],
             message=check.message[:TEXT],
+            why=check.why[:TEXT],
             done=check.done if math.isfinite(check.done) else 0.0,
             total=check.total if math.isfinite(check.total) else 0.0,
             eta_s=check.eta_s if check.eta_s is not None and math.isfinite(check.eta_s) else None,

@@ -9,9 +9,9 @@ from datetime import datetime
 
 from abbe.service.clock import Clock
 from abbe.service.core.board import Board
+from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
-from abbe.service.events import Progress
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.scheduler.ports import Doc
 from abbe.service.verification.verified_by import VerifiedBy

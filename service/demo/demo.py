@@ -21,7 +21,7 @@ from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import DeviceUrls, Session, open_session
-from abbe.service.events import Progress, ProgressSink
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.push.limits import PushLimits
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.site import Site, machine_doc, machine_from_doc

@@ -26,10 +26,10 @@ from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, disc
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.new_measurement import NewMeasurement, judged_anew
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current
 from abbe.service.errors import NotObservable, TableRefused
-from abbe.service.events import Progress, ProgressSink
 from abbe.service.sequences.recipes.discovery_campaign import BACK, discovery_campaign, new_measurement
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -27,8 +27,8 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
 from abbe.service.demo.simulator_process import SimulatorProcess, running_simulators
 from abbe.service.devices.session import Session, open_session
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.errors import AbbeError, StoreError
-from abbe.service.events import ignore_progress
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import solution_doc
 from abbe.service.sequences.check import paced

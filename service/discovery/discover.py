@@ -26,12 +26,12 @@ from abbe.service.campaign_data.provenance import code_digest, machine_digest, r
 from abbe.service.discovery.changed_since import Since
 from abbe.service.discovery.discovery_doc import finding_doc
 from abbe.service.discovery.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering, taken_back
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.results import ModelRecord
 from abbe.service.effects.axis_test import SLOW_DRIFT
 from abbe.service.effects.known_effects import applies, readings_of, without
 from abbe.service.effects.model_book import grown
 from abbe.service.errors import NotObservable
-from abbe.service.events import ProgressSink
 from abbe.service.identification.solve import ALL_READINGS
 from abbe.service.identification.table_removal import NO_TABLE, TABLE_OUT, TableThen, as_left, table_line
 from abbe.service.runs.cases import case_of

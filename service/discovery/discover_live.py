@@ -17,9 +17,9 @@ from abbe.service.devices.session import Session
 from abbe.service.discovery.discover import DiscoveryJob, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
 from abbe.service.domain.measured import RUNNING, CampaignRecord
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.effects.model_book import version
 from abbe.service.errors import CampaignRefused, UnsafeToMove
-from abbe.service.events import ProgressSink
 from abbe.service.identification.table_removal import table_then
 from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.steps import CampaignPlan, TestPlan, Unmount

@@ -6,8 +6,8 @@ from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.case import Case
 from abbe.models.effects.effect import Effect
 from abbe.service.clock import SystemClock
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.axis_test import is_axis_test
-from abbe.service.events import Progress, ProgressSink
 
 
 def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:

@@ -16,7 +16,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.config_schema import MachineFile
 from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.events import ProgressSink
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.needed import BALLBAR, LASER

@@ -32,10 +32,10 @@ from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_words import size_text, verdict_of
 from abbe.service.discovery.linear_change import linear_words
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import REMEDIES, current, name_of
 from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
-from abbe.service.events import Progress, ProgressSink
 from abbe.service.identification.table_removal import table_then
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State

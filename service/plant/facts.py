@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Protocol
 
 from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.progress import RunningCheck
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import Literal, Protocol
 from pydantic import TypeAdapter
 
 from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.checks import latest_checks

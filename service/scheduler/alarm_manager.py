@@ -15,10 +15,10 @@ from abbe.service.clock import Clock
 from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
-from abbe.service.events import ProgressSink
 from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FollowUp, Job, failure

@@ -10,9 +10,9 @@ from typing import Protocol
 import structlog
 
 from abbe.service.clock import Clock
+from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
-from abbe.service.events import Progress
 from abbe.service.scheduler.ports import Doc
 
 log = structlog.get_logger("abbe.station")

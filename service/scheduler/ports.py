@@ -7,8 +7,8 @@ from datetime import datetime
 from typing import Any, Literal, NamedTuple, Protocol, Self
 
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
-from abbe.service.events import Progress, ProgressSink
 from abbe.service.sequences.control import Control
 
 Verdict = Literal["pass", "fail", "cannot tell"]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, TypeVar
 
+from abbe.service.domain.progress import Progress
 from abbe.service.errors import Aborted, Stopped
 
 # What a measurement asks a person to do where nobody sits at its console, and the word that it is done: for the prompt that stands alone.
@@ -77,22 +78,11 @@ class State(StrEnum):
     ENDED = "ended"
 
 
-@dataclass(frozen=True, slots=True)
-class Situation:
-    """State and, where it waits, why; step of the test in hand (from 1) and points read in it."""
-
-    state: State
-    why: str = ""
-    step: int = 0
-    steps: int = 0
-    points: int = 0
-
-
 class Control:
     """Pauses, resumes, stops and aborts one measurement."""
 
     def __init__(self) -> None:
-        self._now = Situation(State.READY)
+        self._now = Progress(state=State.READY)
         self._pause = self._stop = self._abort = False
         self.hurry = ""
         """Why it cannot be paused now; empty: it can. What was asked for before stays asked for: look at `gate` first."""
@@ -132,18 +122,18 @@ class Control:
     # ---- what can be watched --------------------------------------------------------------------------------------
 
     @property
-    def situation(self) -> Situation:
-        """State now, and why it waits."""
+    def progress(self) -> Progress:
+        """State now, why it waits, and how far the test in hand is."""
         return self._now
 
     @property
     def state(self) -> State:
         """State now."""
-        return self._now.state
+        return State(self._now.state)
 
-    async def watch(self) -> AsyncIterator[Situation]:
+    async def watch(self) -> AsyncIterator[Progress]:
         """Every state from now on, the present one first; ends with the measurement. A slow watcher sees the newest, not all."""
-        seen: Situation | None = None
+        seen: Progress | None = None
         while True:
             changed = self._changed
             if seen is None or (self._now.state, self._now.why) != (seen.state, seen.why):
@@ -178,7 +168,7 @@ class Control:
         self._set(replace(self._now, state=state if state == State.ENDED else wanted, why=why))
 
     def place(self, step: int, steps: int, points: int) -> None:
-        """Tell how far the test in hand is. Nobody is woken for it: whoever draws progress looks when it changes."""
+        """Note how far the test in hand is: step (from 1) and points read. Watchers are not woken for it."""
         self._now = replace(self._now, step=step, steps=steps, points=points)
 
     def check(self) -> None:
@@ -290,8 +280,8 @@ class Control:
         event, self._asked = self._asked, asyncio.Event()
         event.set()
 
-    def _set(self, situation: Situation) -> None:
-        self._now = situation
+    def _set(self, now: Progress) -> None:
+        self._now = now
         event, self._changed = self._changed, asyncio.Event()
         event.set()
 

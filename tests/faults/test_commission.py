@@ -11,8 +11,8 @@ import pytest
 
 from abbe.service.compensation.commission import check_commissioned, commission, commissioned
 from abbe.service.compensation.recover import recover
+from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.errors import Interlock, StillActive, TableRefused
-from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.sequences.interlocks import Suspending, Watching
@@ -90,7 +90,7 @@ async def test_a_door_in_the_middle_ends_it_with_the_old_table_and_says_what_is_
     seen: list[str] = []
 
     def progress(now: Progress) -> None:
-        if now.stage.endswith(" X") and now.place is not None and now.place.points == 5 and not seen:
+        if now.stage.endswith(" X") and now.points == 5 and not seen:
             seen.append(now.stage)
             b.sim.world.controller.set_door(is_open=True)
             asyncio.get_running_loop().call_later(0.2, lambda: b.sim.world.controller.set_door(is_open=False))

@@ -20,6 +20,7 @@ from abbe.service.campaigns import campaign_run
 from abbe.service.campaigns.campaign_run import decline
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import begun_source
+from abbe.service.domain.progress import Progress
 from abbe.service.errors import (
     ConfigError,
     DoorOpen,
@@ -28,7 +29,6 @@ from abbe.service.errors import (
     StatusUnknown,
     Stopped,
 )
-from abbe.service.events import Progress
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Suspending, Watching
 from abbe.service.sequences.journal import StoreJournal
@@ -96,7 +96,7 @@ async def test_a_pause_that_is_taken_back_at_once_is_not_told_for_ever(place):
     plan = CampaignPlan("c", (small("Linear"),))
     states: list[str] = []
     control = AtStep(8, lambda: (control.pause(), control.resume()))
-    sink = lambda p: states.append(p.place.state)  # noqa: E731
+    sink = lambda p: states.append(p.state)  # noqa: E731
     await measure(b.session, store, b.site, plan, progress=sink, manner=Manner(control))
     assert control.done
     assert set(states[8:]) == {"running"}

@@ -25,9 +25,9 @@ from abbe.service.config import load_machine
 from abbe.service.config_timetable import AlarmSection
 from abbe.service.core.board import Board
 from abbe.service.devices.session import open_session
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
-from abbe.service.events import ProgressSink
 from abbe.service.jobs.check import CheckResult, run_check
 from abbe.service.push.limits import PushLimits
 from abbe.service.queries.reader import Reader

@@ -19,8 +19,8 @@ from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.errors import MeasurementFault, StillActive, TableMismatch, TableRefused
-from abbe.service.events import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.semantic_digest import semantic_digest_of_tables

@@ -22,8 +22,8 @@ import pytest
 
 from abbe.service import cli
 from abbe.service.config import load_machine
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.errors import ConfigError, DevicesNotReady
-from abbe.service.events import ignore_progress
 from abbe.service.jobs.check import run_check
 from abbe.service.sequences.recipes.recipe import Helix, Linear
 from abbe.service.sequences.recipes.recipe_file import recipe_text

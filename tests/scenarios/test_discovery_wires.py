@@ -15,7 +15,7 @@ import pytest
 
 from abbe.service.demo.demo_hidden import ANEW, CAMPAIGN, run_hidden_demo
 from abbe.service.demo.demo_hidden_words import judged, story
-from abbe.service.events import ignore_progress
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.storage.store import Store
 from abbe.simulators.hidden.suite import packaged, picked
 from tests.scenarios.test_demo import bar_run_under_way

@@ -27,8 +27,8 @@ from abbe.service.compensation.push_approved import Approved, PushOrder, next_ap
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.decisions import ProposalApproval
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.errors import StoreError, TableRefused
-from abbe.service.events import ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching

@@ -20,8 +20,8 @@ from abbe.service.compensation import pushing
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
-from abbe.service.events import ignore_progress
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import check_chain
 from abbe.service.push.operations import Verdict

@@ -20,7 +20,7 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.compensation.correct import load_runs
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import Session, open_session
-from abbe.service.events import Progress, ignore_progress
+from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import check_chain
 from abbe.service.push.operations import Verdict

@@ -15,8 +15,8 @@ from typing import Any
 import aiomqtt
 
 from abbe.service.core.setup import ServiceSetup
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
-from abbe.service.events import Progress, ProgressSink
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.broker import parse
 from abbe.service.mqtt.topics import Topics

@@ -21,8 +21,8 @@ from abbe.service.core.setup import ServiceSetup
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
-from abbe.service.events import Progress
 from abbe.service.jobs.at_start import recover_at_start
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.topics import Topics

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from abbe.service.core.orders import CampaignOrder, MeasureCampaign, OrderActions
     from abbe.service.core.setup import ServiceSetup
     from abbe.service.domain.job_state import JobOutcome
-    from abbe.service.events import ProgressSink
+    from abbe.service.domain.progress import ProgressSink
     from abbe.service.jobs.investigate import Note
     from abbe.service.mqtt.broker import Broker
     from abbe.service.plant.opcua.setup import OpcUaSetup

@@ -31,9 +31,9 @@ def simulate(
     from abbe.service.discovery.discover import prepare
     from abbe.service.discovery.simulate import simulate as work
     from abbe.service.discovery.simulate import simulation_doc
+    from abbe.service.domain.progress import Progress
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
-    from abbe.service.events import Progress
     from abbe.service.identification.table_removal import NO_TABLE, table_then
 
     with opened(campaign, db, machine, without or []) as (found, store), display() as sink:

@@ -128,7 +128,7 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
 def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[str, Any]]:
     """The solution and its document, with progress on stderr."""
     from abbe.service.cli.progress import display
-    from abbe.service.events import Progress
+    from abbe.service.domain.progress import Progress
     from abbe.service.identification.solve import solve_runs
     from abbe.service.identification.solve_report import account, solution_doc
 

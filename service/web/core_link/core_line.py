@@ -27,7 +27,7 @@ from abbe.service.channel.wire import Wire
 from abbe.service.clock import Clock
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import CoreSilent
 from abbe.service.web.core_link.sample_board import MOST_EACH, MOST_LISTENERS, SampleBoard

@@ -309,7 +309,7 @@ def main() -> None:
     told = [0.0]
 
     def say(progress: Any) -> None:
-        if time.monotonic() - told[0] > 10.0 and progress.place is not None:
+        if time.monotonic() - told[0] > 10.0 and progress.steps:
             told[0] = time.monotonic()
             print(f"{progress.stage}: {progress.done:.0f} of {progress.total:.0f} s, {progress.message}", flush=True)  # noqa: T201
 

@@ -12,8 +12,8 @@ from abbe.service.campaign_data import decimation as module
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.campaign_data.decimation import picked, thinned, thinning
 from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.events import ignore_progress
 from abbe.service.rendering.discovery_page import render_discovery
 from abbe.service.report.discovery_pages import discovery_page, page_facts
 from abbe.service.runs.discovery_file import DiscoveryFile

@@ -10,8 +10,8 @@ from datetime import UTC, datetime, timedelta
 from itertools import count
 from typing import Any, Protocol
 
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
-from abbe.service.events import Progress, ProgressSink
 from abbe.service.scheduler.job import Job
 from abbe.service.scheduler.ports import OpenSlot, SlotState
 from abbe.service.sequences.control import Control

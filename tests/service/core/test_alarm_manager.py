@@ -22,10 +22,10 @@ from abbe.service.compensation.push_approved import Approved, PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.devices.machine_lock import ENVIRONMENT
 from abbe.service.domain.job_state import JobOutcome, JobState
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import StillActive, StoreError, TableRefused
-from abbe.service.events import ProgressSink
 from abbe.service.jobs.at_start import push_is_open
 from abbe.service.jobs.investigate import InvestigationContext as Investigation
 from abbe.service.jobs.investigate import Note, investigate

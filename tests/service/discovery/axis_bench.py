@@ -10,8 +10,8 @@ from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.case import Case
 from abbe.service.discovery.discovery_doc import finding_doc
 from abbe.service.discovery.discovery_engine import search
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.events import ignore_progress
 from abbe.service.runs.cases import case_of
 from abbe.service.site import machine_from_doc
 

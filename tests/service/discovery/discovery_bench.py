@@ -12,7 +12,7 @@ import numpy as np
 from abbe.models.discovery.answer import Agreement, Discovery, Gap, NamedEffect, NextTest, Significance, Verdict, Where
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.effect import Effect
-from abbe.service.events import ProgressSink
+from abbe.service.domain.progress import ProgressSink
 
 Doc = dict[str, Any]
 MACHINE: Doc = {

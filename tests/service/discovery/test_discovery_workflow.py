@@ -23,10 +23,10 @@ from abbe.service.discovery.discovery_states import closed, entering, judge, not
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
 from abbe.service.discovery.discovery_words import lines_of, next_of, rival_lines, verdict_of
 from abbe.service.discovery.simulate import gap_doc, simulate
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current
 from abbe.service.errors import CampaignRefused, NotObservable, StoreError
-from abbe.service.events import ignore_progress
 from abbe.service.report.discovery_pages import discovery_page, gap_rows
 from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.storage.store import Store
@@ -352,7 +352,7 @@ def test_states_keep_their_order(folder: Path, book: Store) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from abbe.service.events import ignore_progress
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.storage.store import Store
 from abbe.service.discovery.discover import discover
 from abbe.service.discovery.discovery_store import journal_of

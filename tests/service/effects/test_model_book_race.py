@@ -19,11 +19,11 @@ from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.discovery.discover import DiscoveryJob, discover, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
 from abbe.service.domain.document import Doc
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.results import NewVersion
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current, revert
 from abbe.service.errors import ModelMovedOn
-from abbe.service.events import ignore_progress
 from abbe.service.storage.store import Store
 from tests.patience import within
 from tests.service.discovery.discovery_bench import Search, write_case

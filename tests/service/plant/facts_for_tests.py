@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.progress import RunningCheck
 from abbe.service.errors import StoreError
 from abbe.service.plant.facts import Alarm, Check, Facts, PlantFigure, TableInForce
 from tests.patience import within

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
 from abbe.service.clock import SystemClock
+from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Schedule
-from abbe.service.events import ProgressSink
 from abbe.service.scheduler.heartbeat import Heartbeat
 from abbe.service.scheduler.job import Checks, carry_out
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf

@@ -22,9 +22,9 @@ from abbe.service.compensation.proposals import Gathered, make
 from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.events import ignore_progress
 from abbe.service.push.book import StoreBook
 from abbe.service.push.states import PushState
 from abbe.service.queries.reader import Reader

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from abbe.service.domain.running_check import RunningCheck
+from abbe.service.domain.progress import RunningCheck
 from abbe.service.identification.solution_field import stored_field
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.report_parts import Rules

@@ -1,0 +1,57 @@
+"""How far long work is: one record from the work itself to the page, JSON, OPC UA and MTConnect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+
+from abbe.service.domain.bounds import Number, Text, Word
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far work is.
+
+    ``done`` of ``total`` in the work's own unit (by default seconds of planned machine time); ``eta_s``: wall seconds left, None without a
+    basis for an estimate; time in which it waited is not counted. Of a measurement: ``state`` (of `abbe.service.sequences.control`) and
+    ``why`` it waits, ``step`` of ``steps`` and ``points`` read in the test in hand.
+    """
+
+    stage: Word = ""
+    done: float = 0.0
+    total: float = 0.0
+    eta_s: float | None = None
+    message: Text = ""
+    state: Word = "running"
+    why: Text = ""
+    step: Number = 0
+    steps: Number = 0
+    points: Number = 0
+
+
+ProgressSink = Callable[[Progress], None]
+
+
+def ignore_progress(_: Progress) -> None:
+    """Ignore it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunningCheck(Progress):
+    """The check that runs now, and how far it is. ``prompt``: number of what a person is asked to do, ``ask``: what that is; 0: nothing.
+
+    ``state`` is that of its job.
+    """
+
+    schedule: Word
+    recipe: Word
+    since_utc: datetime
+    id: Word = ""
+    prompt: Number = 0
+    ask: Word = ""
+
+    @property
+    def percent(self) -> float | None:
+        """Share of the planned time that is over; None: it is not planned."""
+        return 100.0 * self.done / self.total if self.total > 0 else None
