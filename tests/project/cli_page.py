@@ -25,7 +25,7 @@ Exit codes: 0 done, 1 the answer is no, 2 bad input or a fault (one line with a 
 `--db URL` a database directly; without both it is the one that `ABBE_DB` names, else `abbe.sqlite3`
 in the current folder. The tables below leave these three out where they say nothing else.
 """
-_COMMON = ("Print JSON on stdout.", "Use the database of this machine file.", "Database. Default:")
+_COMMON = ("Print JSON on stdout.", "Machine file.", "Use the database of this machine file.", "Database. Default:")
 
 
 def page() -> str:
