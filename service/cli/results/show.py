@@ -43,6 +43,7 @@ def show(
 ) -> None:
     """Show one run: state, setup and what its columns hold (--json: as an exchange file). Or a campaign: runs and incidents."""
     from abbe.service.cli.results.show_campaign import show_campaign
+    from abbe.service.domain.measured import RunRecord
     from abbe.service.queries.measured import run_summary
     from abbe.service.queries.reader import json_value
     from abbe.service.runs.columns import run_document, whole_document
