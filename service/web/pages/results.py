@@ -13,9 +13,11 @@ from abbe.models.arrays import F1, F2
 from abbe.models.machine import Machine
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.models.volumetric import volume_grid
-from abbe.service.domain.results import DiscoveryRecord, SolutionRecord, StepRecord
+from abbe.service.domain.results import SolutionRecord
 from abbe.service.errors import AbbeError
 from abbe.service.identification.stored_prediction import stored_prediction
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.results import DiscoveryDetail, discovery
 from abbe.service.rendering.document import Document, Sign
 from abbe.service.rendering.model import Contribution
 from abbe.service.rendering.numbers import plain, with_uncertainty
@@ -103,7 +105,6 @@ def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, flo
     return size, float(np.sqrt(max(along @ spread @ along, 0.0)))
 
 
-MOST = 50
 MOST_SOLUTIONS = 20
 """Each is half a megabyte: more of them would make the list slow."""
 
@@ -141,22 +142,10 @@ class ResultScreen:
 
 
 @dataclass(frozen=True, slots=True)
-class DiscoveryLine:
-    """One search in the list: the last state that it reached, and why."""
-
-    id: int
-    campaign: str
-    state: str
-    why: str
-    created_utc: str
-
-
-@dataclass(frozen=True, slots=True)
 class DiscoveryScreen:
     """One search: its states in order, and its report, None while it has not ended (then ``trouble`` says so)."""
 
-    line: DiscoveryLine
-    steps: Sequence[StepRecord]
+    found: DiscoveryDetail
     document: Document | None
     trouble: str = ""
 
@@ -202,28 +191,14 @@ def _ranked(doc: dict[str, Any], machine: dict[str, Any]) -> list[Ranked]:
     return ranking(doc["prediction"], doc.get("motions") or {}, geometry)
 
 
-def discovery_lines(store: Store) -> list[DiscoveryLine]:
-    """Searches, newest first."""
-    names = {c.id: c.name for c in store.campaigns()}
-    newest = list(reversed(store.discoveries()))[:MOST]
-    return [_discovery_line(d, names.get(d.campaign_id, ""), store.discovery_steps(d.id)) for d in newest]
-
-
-def _discovery_line(record: DiscoveryRecord, campaign: str, steps: Sequence[StepRecord]) -> DiscoveryLine:
-    last = steps[-1] if steps else None
-    why = "" if last is None else str(last.doc.get("why", ""))
-    return DiscoveryLine(record.id, campaign, "" if last is None else last.state, why, record.created_utc)
-
-
-def discovery_screen(store: Store, record: DiscoveryRecord, rules: Rules) -> DiscoveryScreen:
-    """A search as it was stored; nothing is searched again."""
-    steps = store.discovery_steps(record.id)
-    line = _discovery_line(record, store.campaign(record.campaign_id).name, steps)
-    story = [(s.state, str(s.doc.get("why", ""))) for s in steps]
+def discovery_screen(reader: Reader, number: int, rules: Rules) -> DiscoveryScreen:
+    """A search as it was stored; nothing is searched again. Raises NotStored."""
+    found = discovery(reader, number)
+    states = [(one.state, one.why) for one in found.states]
     try:
-        told = discovery_report(store, record.id, rules)
+        told = discovery_report(reader.store, number, rules)
         # The states stand above with their times: the report's table of them would only say it again.
-        tables = [t for t in told.tables if [tuple(row) for row in t.rows] != story]
-        return DiscoveryScreen(line, steps, replace(told, tables=tables))
+        tables = [t for t in told.tables if [tuple(row) for row in t.rows] != states]
+        return DiscoveryScreen(found, replace(told, tables=tables))
     except AbbeError as error:
-        return DiscoveryScreen(line, steps, None, error.detail)
+        return DiscoveryScreen(found, None, error.detail)

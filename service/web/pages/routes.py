@@ -11,7 +11,11 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import AfterValidator
 
-from abbe.service.errors import NotStored, StoreError, TableRefused
+from abbe.service.compensation.proposal_states import approve_waiting
+from abbe.service.errors import NotStored, TableRefused, Unusable
+from abbe.service.queries import measured
+from abbe.service.queries.proposals import proposals
+from abbe.service.queries.results import discoveries
 from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
 from abbe.service.users.roles import Permission
@@ -19,10 +23,10 @@ from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.pages import times
 from abbe.service.web.pages.desk import PageContext, can_be_stored, found
-from abbe.service.web.pages.proposals import approve_as, proposal_lines, proposal_screen
+from abbe.service.web.pages.proposals import MOST, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
-from abbe.service.web.pages.results import discovery_lines, discovery_screen, result_screen, solution_lines
-from abbe.service.web.pages.runs import STATES, TESTS, RunsQuery, newest_run, run_list, run_screen
+from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
+from abbe.service.web.pages.runs import STATES, TESTS, RunsQuery, run_list, run_screen
 from abbe.service.web.pages.table import ends
 from abbe.service.web.problems import problem
 
@@ -73,18 +77,18 @@ def _add_runs(app: FastAPI, desk: PageContext) -> None:
     @needs(Permission.READ)
     async def runs(campaign: Text = "", test: Text = "", state: Text = "") -> HTMLResponse:
         wanted = RunsQuery(campaign, test, state)
-        listed = await desk.read(run_list, desk.store, wanted)
+        listed = await desk.read(run_list, desk.reader, wanted)
         return await desk.show("runs.html", listed=listed, wanted=wanted, tests=TESTS, states=STATES)
 
     @app.get("/run", include_in_schema=False)
     @needs(Permission.READ)
     async def run(id: Number = None) -> HTMLResponse:
         if id is None:
-            record = await desk.read(newest_run, desk.store)
-        else:
-            record = await desk.read(found, desk.store.run, id)
-            if record is None:
-                return await desk.missing("run", id)
+            newest, _ = await desk.read(measured.runs, desk.reader, {}, None, 1)
+            id = newest[0].number if newest else None
+        record = None if id is None else await desk.read(found, desk.store.run, id)
+        if record is None and id is not None:
+            return await desk.missing("run", id)
         screen = None if record is None else await desk.read(run_screen, desk.store, record, desk.rules)
         told = None if screen is None or screen.document is None else shown(screen.document)
         return await desk.show("run.html", screen=screen, told=told)
@@ -109,18 +113,18 @@ def _add_results(app: FastAPI, desk: PageContext) -> None:
 
     @app.get("/discoveries", include_in_schema=False)
     @needs(Permission.READ)
-    async def discoveries() -> HTMLResponse:
-        return await desk.show("discoveries.html", lines=await desk.read(discovery_lines, desk.store))
+    async def searches() -> HTMLResponse:
+        return await desk.show("discoveries.html", lines=(await desk.read(discoveries, desk.reader, None, None, None, MOST))[0])
 
     @app.get("/discovery", include_in_schema=False)
     @needs(Permission.READ)
     async def discovery(id: Number = None) -> HTMLResponse:
-        newest = (await desk.read(discovery_lines, desk.store))[:1] if id is None else []
-        number = newest[0].id if newest else id
-        record = None if number is None else await desk.read(found, desk.store.discovery, number)
-        if record is None and number is not None:
-            return await desk.missing("discovery", number)
-        screen = None if record is None else await desk.read(discovery_screen, desk.store, record, desk.rules)
+        newest = (await desk.read(discoveries, desk.reader, None, None, None, 1))[0] if id is None else []
+        number = newest[0].number if newest else id
+        try:
+            screen = None if number is None else await desk.read(discovery_screen, desk.reader, number, desk.rules)
+        except NotStored:
+            return await desk.missing("discovery", number or 0)
         told = None if screen is None or screen.document is None else shown(screen.document)
         return await desk.show("discovery.html", screen=screen, told=told)
 
@@ -128,24 +132,25 @@ def _add_results(app: FastAPI, desk: PageContext) -> None:
 def _add_proposals(app: FastAPI, desk: PageContext) -> None:
     @app.get("/proposals", include_in_schema=False)
     @needs(Permission.READ)
-    async def proposals() -> HTMLResponse:
-        return await desk.show("proposals.html", lines=await desk.read(proposal_lines, desk.store))
+    async def screen_of_all() -> HTMLResponse:
+        lines, _ = await desk.read(proposals, desk.reader, None, None, MOST)
+        return await desk.show("proposals.html", lines=lines, sign=sign, promise=promise)
 
     @app.get("/proposal", include_in_schema=False)
     @needs(Permission.READ)
     async def proposal(id: Number = None) -> HTMLResponse:
-        newest = (await desk.read(proposal_lines, desk.store))[:1] if id is None else []
+        newest = (await desk.read(proposals, desk.reader, None, None, 1))[0] if id is None else []
         number = newest[0].number if newest else id
-        record = None if number is None else await desk.read(found, desk.store.proposal, number)
         if number is None:
             return await desk.show("proposal.html", screen=None)
-        if record is None:
-            return await desk.missing("proposal", number)
         try:
-            screen = await desk.read(proposal_screen, desk.store, number)
-        except StoreError as error:
+            screen = await desk.read(proposal_screen, desk.reader, number)
+        except NotStored:
+            return await desk.missing("proposal", number)
+        except Unusable as error:
             return await desk.show("changed.html", 409, number=number, text=error.detail)
-        return await desk.show("proposal.html", screen=screen, hours=HOURS, key=secrets.token_hex(8), words=ends("table.word"))
+        key, words = secrets.token_hex(8), ends("table.word")
+        return await desk.show("proposal.html", screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, words=words)
 
 
 def _add_approval(app: FastAPI, desk: PageContext) -> None:
@@ -161,7 +166,7 @@ def _add_approval(app: FastAPI, desk: PageContext) -> None:
         account = visit.principal.name
         name = account.partition(":")[2].partition("/")[0]
         try:
-            await desk.read(approve_as, desk.store, number, name, account, hours)
+            await desk.read(approve_waiting, desk.store, number, name, hours, desk.reader.clock, account)
         except TableRefused as error:
             return problem(409, str(error), error.code)
         except NotStored as error:

@@ -7,8 +7,10 @@ from typing import Any
 
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.devices.urls import DeviceUrls
-from abbe.service.domain.measured import INCOMPLETE, RUNNING, RunRecord
+from abbe.service.domain.measured import RunRecord
 from abbe.service.errors import AbbeError
+from abbe.service.queries.measured import RunSummary, campaigns, runs_by_state
+from abbe.service.queries.reader import Reader
 from abbe.service.rendering.document import Document
 from abbe.service.report.report_measured import Measured, run_report
 from abbe.service.report.report_parts import Rules
@@ -21,7 +23,6 @@ TESTS = ("ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear")
 STATES = ("complete", "running", "incomplete", "stopped", "aborted", "failed", "interrupted", "disk_full")
 MOST = 100
 MOST_CAMPAIGNS = 50
-MOST_RUNNING = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +35,10 @@ class RunsQuery:
 
 
 @dataclass(frozen=True, slots=True)
-class RunList:
+class RunListing:
     """The newest runs that fit, whether there are more, and the campaigns to choose from."""
 
-    runs: list[RunRecord]
+    runs: list[RunSummary]
     more: bool
     campaigns: list[str]
 
@@ -51,20 +52,11 @@ class RunScreen:
     trouble: str = ""
 
 
-def run_list(store: Store, wanted: RunsQuery) -> RunList:
+def run_list(reader: Reader, wanted: RunsQuery) -> RunListing:
     """The newest runs that fit."""
-    names = [c.name for c in reversed(store.campaigns())][:MOST_CAMPAIGNS]
-    if wanted.state in (INCOMPLETE, RUNNING):  # both are written as running; which it is depends on whether its process still lives
-        running = store.latest_runs(MOST_RUNNING, campaign=wanted.campaign, test=wanted.test, status=RUNNING)
-        fitting = [run for run in running if run.visible_status == wanted.state]
-    else:
-        fitting = store.latest_runs(MOST + 1, campaign=wanted.campaign, test=wanted.test, status=wanted.state)
-    return RunList(fitting[:MOST], len(fitting) > MOST, names)
-
-
-def newest_run(store: Store) -> RunRecord | None:
-    """The run that was started last."""
-    return next(iter(store.latest_runs(1)), None)
+    names = [one.name for one in campaigns(reader, None, None, MOST_CAMPAIGNS)[0]]
+    found, more = runs_by_state(reader, wanted.campaign, wanted.test, wanted.state, MOST)
+    return RunListing(found, more, names)
 
 
 def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:

@@ -14,6 +14,7 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, PushNow
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.proposal_states import approve_waiting
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders
@@ -21,7 +22,6 @@ from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.web.pages.proposals import approve_as
 from tests.pages_world import Filled, Served
 from tests.patience import within
 from tests.pretended_push import TAKEN_BACK, as_if_pushed
@@ -92,7 +92,7 @@ async def test_only_what_is_approved_is_pushed_and_the_journal_has_the_word(benc
     assert (await bench.ask(999)).outcome == "unknown"
     answer = await bench.ask(refused)
     assert (answer.outcome, answer.text.startswith(f"proposal {refused} is refused")) == ("conflict", True)
-    approve_as(bench.store, number, "anna", "user:anna", 1.0)
+    approve_waiting(bench.store, number, "anna", 1.0, SystemClock(), "user:anna")
     first = await bench.ask(number, key="k")
     assert first.outcome == "done", first.text
     done = await bench.ended()
