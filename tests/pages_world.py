@@ -163,7 +163,7 @@ def _import(store: ServiceStore, folder: Path, campaign: str, site: Site, runs: 
 
 def _broken_run(store: ServiceStore, campaign: str, evil: str) -> None:
     number = store.start_run(store.campaign(campaign).id, f"late{evil}", "ballbar_circle", "identify", {"setup": {}})
-    store.finish_run(number, "stopped", f"SEQ-003: the door was opened{evil}", None)
+    store.finish_run(number, "stopped", f"SEQ-003: the auth was opened{evil}", None)
 
 
 def _proposals(
@@ -222,7 +222,7 @@ class Served:
     filled: Filled
     store: ServiceStore
     people: People
-    door: Authenticator
+    auth: Authenticator
     board: Board
     tail: LogTail
 
@@ -236,7 +236,7 @@ def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
         for name, role in USERS.items() if users else ():
             if store.user(name) is None:
                 people.add(name, role, PHRASE)
-        door = Authenticator(store, people, AuditBook(store, filled.url), rate_hz=1e6, burst=1e6)
+        auth = Authenticator(store, people, AuditBook(store, filled.url), rate_hz=1e6, burst=1e6)
         board = Board(filled.devices, clock)
         soon = datetime.now(UTC) + timedelta(hours=30)
         view = StatusReader(Reader(store, filled.machine, clock), "0.1.0", board, lambda: [(s, soon) for s in filled.schedules], "")
@@ -244,11 +244,11 @@ def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
         rules = Rules({"circularity": 20.0}, {"ballbar": (soon + timedelta(days=90)).date(), "laser": date(2026, 1, 1)})
         sources = Sources(reader=view.reader, schedules=filled.schedules, devices=lambda: board.devices, rules=rules, tail=tail)
         listening = bind("127.0.0.1", 0)
-        server = make_server(create_app(view, version="0.1.0", door=door, api=sources))
+        server = make_server(create_app(view, version="0.1.0", auth=auth, api=sources))
         thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listening])))
         thread.start()
         try:
-            yield Served(f"http://127.0.0.1:{listening.getsockname()[1]}", filled, store, people, door, board, tail)
+            yield Served(f"http://127.0.0.1:{listening.getsockname()[1]}", filled, store, people, auth, board, tail)
         finally:
             server.should_exit = True
             thread.join()

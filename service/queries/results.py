@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from abbe.service.discovery.changed_words import proved
 from abbe.service.discovery.discovery_states import taken_back
+from abbe.service.domain.results import StepRecord
 from abbe.service.errors import Unusable
 from abbe.service.identification.solution_field import node_map, stored_field
 from abbe.service.queries.reader import Doc, Reader, as_stored, of_row, read_as
@@ -36,12 +37,14 @@ class SolutionDetail(SolutionSummary):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoverySummary:
-    """One search for what a campaign's model lacks."""
+    """One search for what a campaign's model lacks. ``state``, ``why``: the last state that it reached; empty: none yet."""
 
     number: int
     campaign: str
     machine: str
     created_utc: str
+    state: str
+    why: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,17 +211,25 @@ def discoveries(
 ) -> tuple[list[DiscoverySummary], int | None]:
     """Searches for missing effects, newest first."""
     rows, after = reader.page("discoveries", {"campaign": campaign, "machine": machine}, cursor, limit)
-    return [of_row(DiscoverySummary, row) for row in rows], after
+    return [of_row(DiscoverySummary, row, **_last(_states(reader.store.discovery_steps(row["id"])))) for row in rows], after
 
 
 def discovery(reader: Reader, number: int) -> DiscoveryDetail:
     """A search: its states, and what it found. Raises NotStored."""
     row = reader.row("discoveries", number, "discovery")
     steps = reader.store.discovery_steps(number)
-    states = [DiscoveryState(state=one.state, utc=one.utc, why=str(one.doc.get("why", ""))) for one in steps]
+    states = _states(steps)
     found: Doc | None = next((taken_back(one.doc["finding"]) for one in steps if "finding" in one.doc), None)
     answer = None if found is None else read_as(DiscoveryFile, found.get("answer"))
-    return of_row(DiscoveryDetail, row, states=states, answer=answer, changed=_changed(found))
+    return of_row(DiscoveryDetail, row, **_last(states), states=states, answer=answer, changed=_changed(found))
+
+
+def _states(steps: Sequence[StepRecord]) -> list[DiscoveryState]:
+    return [DiscoveryState(state=one.state, utc=one.utc, why=str(one.doc.get("why", ""))) for one in steps]
+
+
+def _last(states: Sequence[DiscoveryState]) -> dict[str, str]:
+    return {"state": states[-1].state, "why": states[-1].why} if states else {"state": "", "why": ""}
 
 
 def _changed(found: Doc | None) -> ChangedSince | None:

@@ -25,7 +25,7 @@ from abbe.service.web.api.install import add_api
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.api.table_orders import add_table_orders
 from abbe.service.web.core_link.core_line import CoreLine
-from abbe.service.web.core_link.core_unavailable import add_silence
+from abbe.service.web.core_link.core_unavailable import add_core_unavailable
 from abbe.service.web.document import SecurityHeaders, complete
 from abbe.service.web.frame import Framed
 from abbe.service.web.jobs import add_jobs
@@ -37,7 +37,7 @@ from abbe.service.web.login.login import add_login
 from abbe.service.web.metrics import add_metrics
 from abbe.service.web.mtconnect import add_mtconnect
 from abbe.service.web.page import HERE, ICON, environment, render
-from abbe.service.web.pages.desk import PageContext
+from abbe.service.web.pages.context import PageContext
 from abbe.service.web.pages.live import add_live_page
 from abbe.service.web.pages.new import add_new_page
 from abbe.service.web.pages.plant_screens import add_plant_screens
@@ -108,7 +108,7 @@ def create_app(
     *,
     version: str,
     hosts: Sequence[str] = ("127.0.0.1", "localhost", "[::1]"),
-    door: Authenticator | None = None,
+    auth: Authenticator | None = None,
     plant: FactsSource | None = None,
     parts: Parts | None = None,
     api: Sources | None = None,
@@ -123,7 +123,7 @@ def create_app(
         Of this program, for the OpenAPI document.
     hosts : sequence of str
         Names under which the page may be asked for: a foreign page must not reach it through a name of its own (DNS rebinding).
-    door : Authenticator, optional
+    auth : Authenticator, optional
         Users and audit; without it everybody may look, and nobody may change anything.
     plant : FactsSource, optional
         What MTConnect documents tell; without it what the status says.
@@ -134,22 +134,22 @@ def create_app(
     """
     # FastAPI's own /docs loads its scripts from a CDN; plants have none.
     app = Application(title="Abbe", version=version, docs_url=None, redoc_url=None, openapi_url=None)
-    app.behind_tls = door is not None and door.behind_tls
+    app.behind_tls = auth is not None and auth.behind_tls
     problems.install(app)
-    add_silence(app, environment())
+    add_core_unavailable(app, environment())
     _add_routes(app, source)
     add_mtconnect(app, plant or Gatherer(source.status))
     if api is not None:
         add_api(app, api)
-    if door is not None:
-        add_login(app, environment(), door)
-        desk = _desk(source, door, api)
-        add_pages(app, desk)
-        add_live_page(app, desk, parts.core.jobs if parts is not None else tuple)
-        add_new_page(app, desk, parts.plans if parts is not None else Rehearsals())
+    if auth is not None:
+        add_login(app, environment(), auth)
+        context = _desk(source, auth, api)
+        add_pages(app, context)
+        add_live_page(app, context, parts.core.jobs if parts is not None else tuple)
+        add_new_page(app, context, parts.plans if parts is not None else Rehearsals())
         if api is not None:
-            add_plant_screens(app, desk, api)
-            add_table_screen(app, desk)
+            add_plant_screens(app, context, api)
+            add_table_screen(app, context)
     if parts is not None:
         add_jobs(app, parts.core, parts.recipes, parts.campaigns)
         add_table_orders(app, parts.core)
@@ -157,15 +157,15 @@ def create_app(
         add_metrics(app, parts.store, parts.core, parts.machine, parts.control)
     app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
     app.add_middleware(Framed, routes=app.router.routes, behind_tls=app.behind_tls)  # inside of the guard: it knows who asks
-    app.add_middleware(AuthMiddleware, routes=app.router.routes, door=door)
+    app.add_middleware(AuthMiddleware, routes=app.router.routes, auth=auth)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[as_in_host_header(host) for host in hosts])
     return app
 
 
-def _desk(source: StatusSource, door: Authenticator, api: Sources | None) -> PageContext:
+def _desk(source: StatusSource, auth: Authenticator, api: Sources | None) -> PageContext:
     if api is None:
-        return PageContext(environment(), door, source, Reader(door.store, "", SystemClock()))
-    return PageContext(environment(), door, source, api.reader, api.rules)
+        return PageContext(environment(), auth, source, Reader(auth.store, "", SystemClock()))
+    return PageContext(environment(), auth, source, api.reader, api.rules)
 
 
 def _add_routes(app: FastAPI, source: StatusSource) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from urllib.parse import parse_qs
+
 from starlette.datastructures import Headers
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 from starlette.types import Message, Receive, Scope
@@ -11,6 +14,18 @@ from abbe.service.web.problems import problem
 
 LONGEST_B = 64 * 1024
 """Of any request that changes something; a route may have a limit of its own (``max_body_size``)."""
+
+
+MOST_FIELDS = 8
+
+
+async def form_of(request: Request) -> dict[str, str] | None:
+    """Fields of a short form, whose route limits its length; None: too many fields, or the request was broken off."""
+    try:
+        text = (await request.body()).decode("utf-8", "replace")
+        return {key: values[0] for key, values in parse_qs(text, max_num_fields=MOST_FIELDS).items()}
+    except (ValueError, ClientDisconnect):
+        return None
 
 
 class Body:

@@ -36,19 +36,19 @@ class MtconnectAccess:
 
 def add_mtconnect(app: FastAPI, source: FactsSource) -> None:
     """Mount the three questions. They are in no OpenAPI document: MTConnect describes them."""
-    door = MtconnectAccess(source)
+    auth = MtconnectAccess(source)
 
     @app.get("/mtconnect/probe", include_in_schema=False)
     @needs(Permission.READ)
     async def probe(request: Request) -> Response:
-        return await door.answer(request, lambda agent, facts, _: agent.probe(facts))
+        return await auth.answer(request, lambda agent, facts, _: agent.probe(facts))
 
     @app.get("/mtconnect/current", include_in_schema=False)
     @needs(Permission.READ)
     async def current(request: Request) -> Response:
-        return await door.answer(request, lambda agent, facts, query: agent.current(facts, query))
+        return await auth.answer(request, lambda agent, facts, query: agent.current(facts, query))
 
     @app.get("/mtconnect/sample", include_in_schema=False)
     @needs(Permission.READ)
     async def sample(request: Request) -> Response:
-        return await door.answer(request, lambda agent, facts, query: agent.sample(facts, query))
+        return await auth.answer(request, lambda agent, facts, query: agent.sample(facts, query))

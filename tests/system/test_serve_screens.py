@@ -158,8 +158,8 @@ def test_nothing_from_a_store_is_run(chromium, tmp_path) -> None:
     filled = fill(tmp_path, EVIL)
     hits: list[int] = []
     with served(filled) as one, context(chromium) as made:
-        one.door.book.write(AuditEvent(who=EVIL, action=EVIL, target=EVIL, outcome=EVIL, doc={"note": EVIL}))
-        one.board.job_started(filled.schedules[0], one.door.store._utcnow())
+        one.auth.book.write(AuditEvent(who=EVIL, action=EVIL, target=EVIL, outcome=EVIL, doc={"note": EVIL}))
+        one.board.job_started(filled.schedules[0], one.auth.store._utcnow())
         page = made.new_page()
         page.expose_function("hit", lambda: hits.append(1))
         watch = Watch(page, one.base)

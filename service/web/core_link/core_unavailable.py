@@ -12,14 +12,14 @@ from abbe.service.web.problems import problem_of
 RETRY_S = "5"
 
 
-def add_silence(app: FastAPI, env: Environment) -> None:
+def add_core_unavailable(app: FastAPI, env: Environment) -> None:
     """Answer `CoreSilent` on every address, by what was asked for."""
 
     async def silent(request: Request, error: Exception) -> Response:
         assert isinstance(error, CoreSilent)
         if not for_people(request):
             return problem_of(error)
-        return HTMLResponse(env.get_template("silent.html").render(text=str(error)), 503, {"Retry-After": RETRY_S})
+        return HTMLResponse(env.get_template("core_unavailable.html").render(text=str(error)), 503, {"Retry-After": RETRY_S})
 
     app.add_exception_handler(CoreSilent, silent)
 

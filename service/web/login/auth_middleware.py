@@ -48,13 +48,13 @@ class AuthMiddleware:
         Behind it.
     routes : sequence of routes
         Of the application, as they are at the time of a request.
-    door : Authenticator, optional
+    auth : Authenticator, optional
         Without one there are no users: everybody is an onlooker, and nothing can be changed.
     """
 
-    def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute], door: Authenticator | None) -> None:
-        self._app, self._routes, self._door = app, routes, door
-        self._behind_tls = door is not None and door.behind_tls
+    def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute], auth: Authenticator | None) -> None:
+        self._app, self._routes, self._auth = app, routes, auth
+        self._behind_tls = auth is not None and auth.behind_tls
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let pass, or answer."""
@@ -63,7 +63,7 @@ class AuthMiddleware:
             return
         request = HTTPConnection(scope)
         address = address_of(request, behind_tls=self._behind_tls)
-        if self._door is not None and not self._door.requests.take(address):
+        if self._auth is not None and not self._auth.requests.take(address):
             await _answer(problem(429, "too many requests from this address", headers={"Retry-After": "1"}), scope, receive, send)
             return
         route = route_of(self._routes, scope)
@@ -78,8 +78,8 @@ class AuthMiddleware:
             refused = await self._refusal(request, need_of(route), visit, body)
         except AbbeError as error:  # the store does not answer: then nobody is known
             refused = problem(503, error.detail, error.code, {"Retry-After": "5"})
-        if body is not None and self._door is not None:
-            await self._recorded(self._door, route, visit, refused, (scope, body.receive, send))
+        if body is not None and self._auth is not None:
+            await self._recorded(self._auth, route, visit, refused, (scope, body.receive, send))
         elif refused is not None:
             await _answer(refused, scope, receive, send)
         else:
@@ -92,10 +92,10 @@ class AuthMiddleware:
         changes = body is not None
         bearer = _bearer(request)
         tls = is_tls(request, behind_tls=self._behind_tls)
-        secret = None if self._door is None else request.cookies.get(self._door.cookie(tls=tls))
+        secret = None if self._auth is None else request.cookies.get(self._auth.cookie(tls=tls))
         if need is not PUBLIC or (changes and secret):
             used = changes or in_use(request.url.path, request.headers.get(ACTIVE_HEADER))
-            visit.principal = ONLOOKER if self._door is None else await self._door.who(bearer, secret, in_use=used)
+            visit.principal = ONLOOKER if self._auth is None else await self._auth.who(bearer, secret, in_use=used)
         visit.secret = (secret or "") if visit.principal.by == "session" else ""
         if need is not PUBLIC and (unknown := _unknown(request, visit.principal, changes=changes)) is not None:
             return unknown
@@ -120,14 +120,14 @@ class AuthMiddleware:
         return None
 
     async def _recorded(
-        self, door: Authenticator, route: BaseRoute, visit: Visit, refused: Response | None, call: tuple[Scope, Receive, Send]
+        self, auth: Authenticator, route: BaseRoute, visit: Visit, refused: Response | None, call: tuple[Scope, Receive, Send]
     ) -> None:
         """Answer, with a record of it on disk before the answer leaves. What could not be recorded is not begun."""
         scope, receive, send = call
-        log = _Log(door, visit, f"{scope['method']} {getattr(route, 'path', '')}", scope["path"], refused=refused is not None)
+        log = _Log(auth, visit, f"{scope['method']} {getattr(route, 'path', '')}", scope["path"], refused=refused is not None)
         if refused is None:
             try:
-                await door.ready()
+                await auth.ready()
             except AbbeError as error:
                 await problem(503, f"not done, since it could not be recorded: {error.detail}", error.code, {"Retry-After": "5"})(*call)
                 return
@@ -153,7 +153,7 @@ class AuthMiddleware:
 class _Log:
     """The record of one changing request, however it ends."""
 
-    door: Authenticator
+    auth: Authenticator
     visit: Visit
     action: str
     path: str
@@ -163,7 +163,7 @@ class _Log:
 
     async def answered(self, status: int) -> None:
         """Record how it was answered. Refusals of one address are not all recorded; what may have changed something always is."""
-        if status == 429 or (status >= 400 and (status < 500 or self.refused) and not self.door.noise.take(self.visit.address)):
+        if status == 429 or (status >= 400 and (status < 500 or self.refused) and not self.auth.noise.take(self.visit.address)):
             return
         kind = "replayed" if self.visit.replayed else "done" if status < 400 else "refused" if status < 500 or self.refused else "failed"
         await self._write(f"{kind} {status}")
@@ -186,7 +186,7 @@ class _Log:
             outcome=outcome,
             doc={"address": visit.address},
         )
-        await self.door.record(event)
+        await self.auth.record(event)
         self.written = True
 
 

@@ -73,7 +73,7 @@ class Authenticator:
         self.lockout = Lockout(now_s)
         self.requests = Buckets(rate_hz, burst, now_s)
         self.noise = Buckets(1 / 6, 20.0, now_s)
-        """Refusals of one address that are recorded: who hammers at the door may not fill the audit."""
+        """Refusals of one address that are recorded: who floods the login must not fill the audit."""
 
     def cookie(self, *, tls: bool) -> str:
         """Name of the cookie of a session. With TLS nobody but this host can set it."""

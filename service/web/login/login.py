@@ -5,16 +5,15 @@ from __future__ import annotations
 import asyncio
 from math import ceil
 from typing import Annotated
-from urllib.parse import parse_qs
 
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
-from starlette.requests import ClientDisconnect
 
 from abbe.service.queries import people
 from abbe.service.users.lockout import Came
 from abbe.service.users.roles import Permission
+from abbe.service.web.bodies import form_of
 from abbe.service.web.listening import is_local
 from abbe.service.web.login.access import PUBLIC, needs
 from abbe.service.web.login.auth_middleware import Visit
@@ -28,7 +27,7 @@ DEVICE_S = 90 * 86_400
 """So long a browser is known again; what that is good for stands in `service/users/lockout.py`."""
 
 
-def add_login(app: FastAPI, env: Environment, door: Authenticator) -> None:
+def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
     """Add the routes of users to the application."""
 
     def page(status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
@@ -44,29 +43,29 @@ def add_login(app: FastAPI, env: Environment, door: Authenticator) -> None:
     @needs(PUBLIC)
     async def login(request: Request) -> Response:
         visit: Visit = request.state.visit
-        fields = await _form(request)
+        fields = await form_of(request)
         if fields is None:
             return problem(413, "a login is a short form of two fields")
         name, password = fields.get("name", ""), fields.get("password", "")
         visit.target = "unknown user"
-        came = await asyncio.to_thread(_came, door, request, name)
-        wait_s = door.lockout.wait_s(name, came)
+        came = await asyncio.to_thread(_came, auth, request, name)
+        wait_s = auth.lockout.wait_s(name, came)
         if wait_s > 0:
             return page(429, f"Too many tries. Wait {ceil(wait_s)} s.", wait_s)
         # Counted before the password is looked at: tries that come together must not all see a free account.
-        wait_s = door.lockout.failed(name, came)
-        user = await asyncio.to_thread(door.people.check, name, password)
-        visit.target = name if await asyncio.to_thread(door.people.known, name) else "unknown user"
+        wait_s = auth.lockout.failed(name, came)
+        user = await asyncio.to_thread(auth.people.check, name, password)
+        visit.target = name if await asyncio.to_thread(auth.people.known, name) else "unknown user"
         if user is None:
             return page(401, "Name or password is wrong." + (f" Next try in {ceil(wait_s)} s." if wait_s else ""))
-        door.lockout.succeeded(name, came)
+        auth.lockout.succeeded(name, came)
         visit.who = f"user:{user.name}"
-        secret = await asyncio.to_thread(door.people.begin, user, visit.secret)
+        secret = await asyncio.to_thread(auth.people.begin, user, visit.secret)
         answer = RedirectResponse("/", 303)
-        _set_cookie(door, request, answer, secret)
+        _set_cookie(auth, request, answer, secret)
         if not came.device:
-            made, tls = await asyncio.to_thread(door.people.new_device, user), is_tls(request, behind_tls=door.behind_tls)
-            answer.set_cookie(door.device_cookie(), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
+            made, tls = await asyncio.to_thread(auth.people.new_device, user), is_tls(request, behind_tls=auth.behind_tls)
+            answer.set_cookie(auth.device_cookie(), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
         return answer
 
     @app.post("/logout", include_in_schema=False)
@@ -74,15 +73,15 @@ def add_login(app: FastAPI, env: Environment, door: Authenticator) -> None:
     async def logout(request: Request) -> Response:
         visit: Visit = request.state.visit
         if visit.secret:
-            await asyncio.to_thread(door.people.end, visit.secret)
+            await asyncio.to_thread(auth.people.end, visit.secret)
         answer = RedirectResponse("/login", 303)
-        _set_cookie(door, request, answer, "")
+        _set_cookie(auth, request, answer, "")
         return answer
 
-    _add_reading(app, door)
+    _add_reading(app, auth)
 
 
-def _add_reading(app: FastAPI, door: Authenticator) -> None:
+def _add_reading(app: FastAPI, auth: Authenticator) -> None:
     refusals: dict[int | str, dict[str, object]] = {
         401: {"model": Problem, "description": "Nobody is logged in"},
         403: {"model": Problem, "description": "The role does not allow it"},
@@ -103,36 +102,23 @@ def _add_reading(app: FastAPI, door: Authenticator) -> None:
     @needs(Permission.USERS)
     async def users() -> UserList:
         """List users with their roles."""
-        return UserList(users=await asyncio.to_thread(people.users, door.store))
+        return UserList(users=await asyncio.to_thread(people.users, auth.store))
 
     @app.get("/api/v1/audit", responses=refusals)
     @needs(Permission.AUDIT)
     async def audit(limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> AuditList:
         """List the newest records of the audit, oldest first."""
-        return AuditList(records=await asyncio.to_thread(people.audit, door.store, limit))
+        return AuditList(records=await asyncio.to_thread(people.audit, auth.store, limit))
 
 
-async def _form(request: Request) -> dict[str, str] | None:
-    """Fields of a short form; None: it is too long, has too many fields, or did not come to its end."""
-    body = b""
-    try:
-        async for piece in request.stream():
-            body += piece
-            if len(body) > LONGEST_FORM:
-                return None
-        return {key: values[0] for key, values in parse_qs(body.decode("utf-8", "replace"), max_num_fields=8).items()}
-    except (ValueError, ClientDisconnect):
-        return None
-
-
-def _came(door: Authenticator, request: Request, name: str) -> Came:
+def _came(auth: Authenticator, request: Request, name: str) -> Came:
     visit: Visit = request.state.visit
-    device = door.people.device_of(name, request.cookies.get(door.device_cookie(), ""))
-    return Came(visit.address, device, here=is_local(visit.address) and not door.behind_tls)
+    device = auth.people.device_of(name, request.cookies.get(auth.device_cookie(), ""))
+    return Came(visit.address, device, here=is_local(visit.address) and not auth.behind_tls)
 
 
-def _set_cookie(door: Authenticator, request: Request, answer: Response, secret: str) -> None:
+def _set_cookie(auth: Authenticator, request: Request, answer: Response, secret: str) -> None:
     """The cookie dies with the browser; how long the session lasts is decided here, not there."""
-    tls = is_tls(request, behind_tls=door.behind_tls)
+    tls = is_tls(request, behind_tls=auth.behind_tls)
     age = None if secret else 0
-    answer.set_cookie(door.cookie(tls=tls), secret, max_age=age, path="/", httponly=True, samesite="strict", secure=tls)
+    answer.set_cookie(auth.cookie(tls=tls), secret, max_age=age, path="/", httponly=True, samesite="strict", secure=tls)

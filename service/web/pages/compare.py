@@ -29,7 +29,7 @@ from abbe.service.verification.compare_runs import (
     remarks,
 )
 from abbe.service.web.frame import current
-from abbe.service.web.pages.desk import found
+from abbe.service.web.pages.context import found
 from abbe.service.web.pages.runs import run_document
 
 LETTERS = "ABCD"

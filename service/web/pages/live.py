@@ -12,7 +12,7 @@ from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.pages.desk import PageContext
+from abbe.service.web.pages.context import PageContext
 
 SCRIPT_WORDS = (
     "live.abort", "live.ended", "live.gone", "live.old", "live.pause", "live.resume", "live.stop", "live.no_path",
@@ -21,14 +21,14 @@ SCRIPT_WORDS = (
 """What the script fills in; the states of a measurement, and how one ends, come on top."""
 
 
-def add_live_page(app: FastAPI, desk: PageContext, jobs: Callable[[], Sequence[JobState]] = tuple) -> None:
+def add_live_page(app: FastAPI, context: PageContext, jobs: Callable[[], Sequence[JobState]] = tuple) -> None:
     """Add the screen to the application. ``jobs``: those since the service began, newest first; the screen shows how the last one ended."""
 
     @app.get("/live", include_in_schema=False)
     @needs(Permission.READ)
     async def live() -> HTMLResponse:
-        status = await desk.source.status()
-        return await desk.show(
+        status = await context.source.status()
+        return await context.show(
             "live.html",
             moment=status,
             last=next((job for job in jobs() if job.ended_utc is not None), None),

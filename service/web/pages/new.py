@@ -15,25 +15,25 @@ from abbe.service.channel.messages import RulesSummary
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.pages.desk import PageContext
+from abbe.service.web.pages.context import PageContext
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 
 Recipe = Annotated[str, Query(max_length=200)]
 Rate = Annotated[int, Query(ge=1, le=1000)]
 
 
-def add_new_page(app: FastAPI, desk: PageContext, plans: Rehearsals) -> None:
+def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
     """Add the screen to the application."""
 
     @app.get("/new", include_in_schema=False)
     @needs(Permission.READ)
     async def new(recipe: Recipe = "", rate_hz: Rate = USUAL_HZ) -> HTMLResponse:
-        status = await desk.source.status()
+        status = await context.source.status()
         rate_hz = rate_hz if rate_hz in plans.rates_hz else USUAL_HZ
         choices = plans.choices()
         chosen = recipe if recipe in choices else next(iter(choices), "")
         dry = await asyncio.to_thread(plans.run, chosen, rate_hz, current().drawn("mm"))
-        return await desk.show(
+        return await context.show(
             "new.html",
             moment=status,
             choices=choices,

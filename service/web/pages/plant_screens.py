@@ -17,7 +17,7 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.frame import THEMES, current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.pages.desk import PageContext, can_be_stored
+from abbe.service.web.pages.context import PageContext, can_be_stored
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
 from abbe.service.web.pages.fleet import SORTS, FleetQuery, fleet_csv, fleet_lines
@@ -28,25 +28,25 @@ Sort = Literal["worst", "machine", "due"]
 BUNDLE_ACTION = "support bundle"
 
 
-def add_plant_screens(app: FastAPI, desk: PageContext, sources: Sources) -> None:
+def add_plant_screens(app: FastAPI, context: PageContext, sources: Sources) -> None:
     """Add the screens."""
-    _add_fleet(app, desk, sources)
-    _add_devices(app, desk, sources)
-    _add_settings(app, desk, sources)
+    _add_fleet(app, context, sources)
+    _add_devices(app, context, sources)
+    _add_settings(app, context, sources)
 
 
-def _add_fleet(app: FastAPI, desk: PageContext, sources: Sources) -> None:
+def _add_fleet(app: FastAPI, context: PageContext, sources: Sources) -> None:
     @app.get("/fleet", include_in_schema=False)
     @needs(Permission.READ)
     async def fleet(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> HTMLResponse:
         asked, now, lang = FleetQuery(name, verdict, sort), sources.reader.clock.utc(), current().lang
-        lines = await desk.read(fleet_lines, sources.reader.store, now, asked)
+        lines = await context.read(fleet_lines, sources.reader.store, now, asked)
 
         def named(key: str) -> tuple[str, str]:
             words, unit = language.figure(lang, key)
             return words, current().unit(unit)
 
-        return await desk.show(
+        return await context.show(
             "fleet.html",
             lines=lines,
             asked=asked,
@@ -60,47 +60,47 @@ def _add_fleet(app: FastAPI, desk: PageContext, sources: Sources) -> None:
     @app.get("/fleet.csv", include_in_schema=False)
     @needs(Permission.READ)
     async def as_csv(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> Response:
-        lines = await desk.read(fleet_lines, sources.reader.store, sources.reader.clock.utc(), FleetQuery(name, verdict, sort))
+        lines = await context.read(fleet_lines, sources.reader.store, sources.reader.clock.utc(), FleetQuery(name, verdict, sort))
         headers = {"Content-Disposition": 'attachment; filename="fleet.csv"'}
         return Response(fleet_csv(lines), media_type="text/csv; charset=utf-8", headers=headers)
 
 
-def _add_devices(app: FastAPI, desk: PageContext, sources: Sources) -> None:
+def _add_devices(app: FastAPI, context: PageContext, sources: Sources) -> None:
     @app.get("/devices", include_in_schema=False)
     @needs(Permission.READ)
     async def devices() -> HTMLResponse:
-        status, now = await desk.source.status(), sources.reader.clock.utc()
+        status, now = await context.source.status(), sources.reader.clock.utc()
         until = sources.rules.calibrated_until
-        screen = await desk.read(device_screen, sources.reader.store, sources.reader.machine, status.devices, until, now.date())
+        screen = await context.read(device_screen, sources.reader.store, sources.reader.machine, status.devices, until, now.date())
         lang = current().lang
-        return await desk.show("devices.html", screen=screen, ago=lambda at: language.ago(lang, at, now))
+        return await context.show("devices.html", screen=screen, ago=lambda at: language.ago(lang, at, now))
 
 
 def _lines(sources: Sources) -> list[str]:
     return [] if sources.tail is None else sources.tail.lines()
 
 
-def _add_settings(app: FastAPI, desk: PageContext, sources: Sources) -> None:
+def _add_settings(app: FastAPI, context: PageContext, sources: Sources) -> None:
     @app.get("/settings", include_in_schema=False)
     @needs(Permission.READ)
     async def settings() -> HTMLResponse:
-        users = await desk.read(sources.reader.store.users) if current().may(Permission.USERS) else []
-        return await desk.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, users=users)
+        users = await context.read(sources.reader.store.users) if current().may(Permission.USERS) else []
+        return await context.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, users=users)
 
     @app.get("/diagnostics", include_in_schema=False)
     @needs(Permission.CONFIGURE)
     async def diagnostics() -> HTMLResponse:
-        found = await desk.read(diagnosis, sources, app.version)
-        return await desk.show("diagnostics.html", found=found, log=_lines(sources), megabytes=megabytes)
+        found = await context.read(diagnosis, sources, app.version)
+        return await context.show("diagnostics.html", found=found, log=_lines(sources), megabytes=megabytes)
 
     @app.get("/support.zip", include_in_schema=False)
     @needs(Permission.CONFIGURE)
     async def support(request: Request) -> Response:
         visit: Visit = request.state.visit
-        status = await desk.source.status()
-        found = await desk.read(diagnosis, sources, app.version)
+        status = await context.source.status()
+        found = await context.read(diagnosis, sources, app.version)
         log = _lines(sources)
-        made = await desk.read(bundle, found, config_of(sources, status, status.mqtt.broker), status, log)
+        made = await context.read(bundle, found, config_of(sources, status, status.mqtt.broker), status, log)
         # It takes what is known of the plant out of the house: that stands in the audit, or it does not happen.
         event = AuditEvent(
             who=visit.principal.name,
@@ -109,6 +109,6 @@ def _add_settings(app: FastAPI, desk: PageContext, sources: Sources) -> None:
             outcome="done",
             doc={"address": visit.address, "bytes": len(made)},
         )
-        await desk.door.record(event)
+        await context.auth.record(event)
         headers = {"Content-Disposition": 'attachment; filename="abbe-support.zip"', "Cache-Control": "no-store"}
         return Response(made, media_type="application/zip", headers=headers)

@@ -13,7 +13,7 @@ from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen
 from abbe.service.web.pages.compare import compare_screen
-from abbe.service.web.pages.desk import PageContext, found
+from abbe.service.web.pages.context import PageContext, found
 from abbe.service.web.pages.results import solution_lines
 from abbe.service.web.pages.volume import NODES, VolumeQuery, volume_screen
 from abbe.service.web.pages.whatif import whatif_screen
@@ -25,26 +25,26 @@ Runs = Annotated[list[Annotated[int, Query(ge=1, le=LARGEST)]], Query(max_length
 Plane = Literal["XY", "XZ", "YZ"]
 
 
-def add_result_pages(app: FastAPI, desk: PageContext) -> None:
+def add_result_pages(app: FastAPI, context: PageContext) -> None:
     """Add the screens to the application."""
-    _add_volume(app, desk)
-    _add_whatif(app, desk)
-    _add_budget(app, desk)
-    _add_compare(app, desk)
+    _add_volume(app, context)
+    _add_whatif(app, context)
+    _add_budget(app, context)
+    _add_compare(app, context)
 
 
-async def _solution(desk: PageContext, number: int | None) -> SolutionRecord | HTMLResponse | None:
+async def _solution(context: PageContext, number: int | None) -> SolutionRecord | HTMLResponse | None:
     """The solution that was asked for, or the newest; None: there is none at all; or the answer that it is not there."""
     if number is None:
-        newest = await desk.read(solution_lines, desk.store, 1)
+        newest = await context.read(solution_lines, context.store, 1)
         if not newest:
             return None
         number = newest[0].id
-    record = await desk.read(found, desk.store.solution, number)
-    return record if record is not None else await desk.missing("solution", number)
+    record = await context.read(found, context.store.solution, number)
+    return record if record is not None else await context.missing("solution", number)
 
 
-def _add_volume(app: FastAPI, desk: PageContext) -> None:
+def _add_volume(app: FastAPI, context: PageContext) -> None:
     @app.get("/volume", include_in_schema=False)
     @needs(Permission.READ)
     async def volume(
@@ -54,39 +54,39 @@ def _add_volume(app: FastAPI, desk: PageContext) -> None:
         at: Annotated[int, Query(ge=-1, le=99)] = -1,
         nodes: Annotated[int, Query(ge=NODES[0], le=NODES[-1])] = NODES[-1],
     ) -> HTMLResponse:
-        record = await _solution(desk, id)
+        record = await _solution(context, id)
         if isinstance(record, HTMLResponse):
             return record
         asked = VolumeQuery(tuple(motion), plane, at, nodes)
-        screen = None if record is None else await desk.read(volume_screen, desk.store, record, asked, current().say)
-        return await desk.show("volume.html", screen=screen, counts=NODES)
+        screen = None if record is None else await context.read(volume_screen, context.store, record, asked, current().say)
+        return await context.show("volume.html", screen=screen, counts=NODES)
 
 
-def _add_whatif(app: FastAPI, desk: PageContext) -> None:
+def _add_whatif(app: FastAPI, context: PageContext) -> None:
     @app.get("/whatif", include_in_schema=False)
     @needs(Permission.READ)
     async def whatif(id: Number = None, take: Names = [], everything: bool = False) -> HTMLResponse:  # noqa: B006
-        record = await _solution(desk, id)
+        record = await _solution(context, id)
         if isinstance(record, HTMLResponse):
             return record
-        screen = None if record is None else await desk.read(whatif_screen, desk.store, record, take, everything, current().say)
-        return await desk.show("whatif.html", 409 if screen is not None and screen.trouble else 200, screen=screen)
+        screen = None if record is None else await context.read(whatif_screen, context.store, record, take, everything, current().say)
+        return await context.show("whatif.html", 409 if screen is not None and screen.trouble else 200, screen=screen)
 
 
-def _add_budget(app: FastAPI, desk: PageContext) -> None:
+def _add_budget(app: FastAPI, context: PageContext) -> None:
     @app.get("/budget", include_in_schema=False)
     @needs(Permission.READ)
     async def budget(id: Number = None) -> HTMLResponse:
-        record = await _solution(desk, id)
+        record = await _solution(context, id)
         if isinstance(record, HTMLResponse):
             return record
-        screen = None if record is None else await desk.read(budget_screen, desk.store, record, current().say)
-        return await desk.show("budget.html", screen=screen)
+        screen = None if record is None else await context.read(budget_screen, context.store, record, current().say)
+        return await context.show("budget.html", screen=screen)
 
 
-def _add_compare(app: FastAPI, desk: PageContext) -> None:
+def _add_compare(app: FastAPI, context: PageContext) -> None:
     @app.get("/compare", include_in_schema=False)
     @needs(Permission.READ)
     async def compare(run: Runs = []) -> HTMLResponse:  # noqa: B006
-        screen = await desk.read(compare_screen, desk.store, run, current().say, desk.rules)
-        return await desk.show("compare.html", 409 if screen.trouble else 200, screen=screen)
+        screen = await context.read(compare_screen, context.store, run, current().say, context.rules)
+        return await context.show("compare.html", 409 if screen.trouble else 200, screen=screen)

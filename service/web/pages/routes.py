@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import secrets
 from typing import Annotated
-from urllib.parse import parse_qs
 
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
@@ -19,10 +18,11 @@ from abbe.service.queries.results import discoveries
 from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
 from abbe.service.users.roles import Permission
+from abbe.service.web.bodies import form_of
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.pages import times
-from abbe.service.web.pages.desk import PageContext, can_be_stored, found
+from abbe.service.web.pages.context import PageContext, can_be_stored, found
 from abbe.service.web.pages.proposals import MOST, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
@@ -56,7 +56,7 @@ Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 PLOT_STYLE = themed(style_rules())
 
 
-def add_pages(app: FastAPI, desk: PageContext) -> None:
+def add_pages(app: FastAPI, context: PageContext) -> None:
     """Add the screens to the application."""
 
     @app.get("/plots.css", include_in_schema=False)
@@ -64,101 +64,101 @@ def add_pages(app: FastAPI, desk: PageContext) -> None:
     async def plots() -> Response:
         return Response(PLOT_STYLE, media_type="text/css")
 
-    _add_runs(app, desk)
-    _add_results(app, desk)
-    add_result_pages(app, desk)
-    _add_proposals(app, desk)
-    _add_approval(app, desk)
-    _add_times(app, desk)
+    _add_runs(app, context)
+    _add_results(app, context)
+    add_result_pages(app, context)
+    _add_proposals(app, context)
+    _add_approval(app, context)
+    _add_times(app, context)
 
 
-def _add_runs(app: FastAPI, desk: PageContext) -> None:
+def _add_runs(app: FastAPI, context: PageContext) -> None:
     @app.get("/runs", include_in_schema=False)
     @needs(Permission.READ)
     async def runs(campaign: Text = "", test: Text = "", state: Text = "") -> HTMLResponse:
         wanted = RunsQuery(campaign, test, state)
-        listed = await desk.read(run_list, desk.reader, wanted)
-        return await desk.show("runs.html", listed=listed, wanted=wanted, tests=TESTS, states=STATES)
+        listed = await context.read(run_list, context.reader, wanted)
+        return await context.show("runs.html", listed=listed, wanted=wanted, tests=TESTS, states=STATES)
 
     @app.get("/run", include_in_schema=False)
     @needs(Permission.READ)
     async def run(id: Number = None) -> HTMLResponse:
         if id is None:
-            newest, _ = await desk.read(measured.runs, desk.reader, {}, None, 1)
+            newest, _ = await context.read(measured.runs, context.reader, {}, None, 1)
             id = newest[0].number if newest else None
-        record = None if id is None else await desk.read(found, desk.store.run, id)
+        record = None if id is None else await context.read(found, context.store.run, id)
         if record is None and id is not None:
-            return await desk.missing("run", id)
-        screen = None if record is None else await desk.read(run_screen, desk.store, record, desk.rules)
+            return await context.missing("run", id)
+        screen = None if record is None else await context.read(run_screen, context.store, record, context.rules)
         told = None if screen is None or screen.document is None else shown(screen.document)
-        return await desk.show("run.html", screen=screen, told=told)
+        return await context.show("run.html", screen=screen, told=told)
 
 
-def _add_results(app: FastAPI, desk: PageContext) -> None:
+def _add_results(app: FastAPI, context: PageContext) -> None:
     @app.get("/results", include_in_schema=False)
     @needs(Permission.READ)
     async def results() -> HTMLResponse:
-        return await desk.show("results.html", lines=await desk.read(solution_lines, desk.store))
+        return await context.show("results.html", lines=await context.read(solution_lines, context.store))
 
     @app.get("/result", include_in_schema=False)
     @needs(Permission.READ)
     async def result(id: Number = None) -> HTMLResponse:
-        newest = await desk.read(solution_lines, desk.store, 1) if id is None else []
+        newest = await context.read(solution_lines, context.store, 1) if id is None else []
         number = newest[0].id if newest else id
-        record = None if number is None else await desk.read(found, desk.store.solution, number)
+        record = None if number is None else await context.read(found, context.store.solution, number)
         if record is None and number is not None:
-            return await desk.missing("solution", number)
-        screen = None if record is None else await desk.read(result_screen, desk.store, record)
-        return await desk.show("result.html", screen=screen)
+            return await context.missing("solution", number)
+        screen = None if record is None else await context.read(result_screen, context.store, record)
+        return await context.show("result.html", screen=screen)
 
     @app.get("/discoveries", include_in_schema=False)
     @needs(Permission.READ)
     async def searches() -> HTMLResponse:
-        return await desk.show("discoveries.html", lines=(await desk.read(discoveries, desk.reader, None, None, None, MOST))[0])
+        return await context.show("discoveries.html", lines=(await context.read(discoveries, context.reader, None, None, None, MOST))[0])
 
     @app.get("/discovery", include_in_schema=False)
     @needs(Permission.READ)
     async def discovery(id: Number = None) -> HTMLResponse:
-        newest = (await desk.read(discoveries, desk.reader, None, None, None, 1))[0] if id is None else []
+        newest = (await context.read(discoveries, context.reader, None, None, None, 1))[0] if id is None else []
         number = newest[0].number if newest else id
         try:
-            screen = None if number is None else await desk.read(discovery_screen, desk.reader, number, desk.rules)
+            screen = None if number is None else await context.read(discovery_screen, context.reader, number, context.rules)
         except NotStored:
-            return await desk.missing("discovery", number or 0)
+            return await context.missing("discovery", number or 0)
         told = None if screen is None or screen.document is None else shown(screen.document)
-        return await desk.show("discovery.html", screen=screen, told=told)
+        return await context.show("discovery.html", screen=screen, told=told)
 
 
-def _add_proposals(app: FastAPI, desk: PageContext) -> None:
+def _add_proposals(app: FastAPI, context: PageContext) -> None:
     @app.get("/proposals", include_in_schema=False)
     @needs(Permission.READ)
     async def screen_of_all() -> HTMLResponse:
-        lines, _ = await desk.read(proposals, desk.reader, None, None, MOST)
-        return await desk.show("proposals.html", lines=lines, sign=sign, promise=promise)
+        lines, _ = await context.read(proposals, context.reader, None, None, MOST)
+        return await context.show("proposals.html", lines=lines, sign=sign, promise=promise)
 
     @app.get("/proposal", include_in_schema=False)
     @needs(Permission.READ)
     async def proposal(id: Number = None) -> HTMLResponse:
-        newest = (await desk.read(proposals, desk.reader, None, None, 1))[0] if id is None else []
+        newest = (await context.read(proposals, context.reader, None, None, 1))[0] if id is None else []
         number = newest[0].number if newest else id
         if number is None:
-            return await desk.show("proposal.html", screen=None)
+            return await context.show("proposal.html", screen=None)
         try:
-            screen = await desk.read(proposal_screen, desk.reader, number)
+            screen = await context.read(proposal_screen, context.reader, number)
         except NotStored:
-            return await desk.missing("proposal", number)
+            return await context.missing("proposal", number)
         except Unusable as error:
-            return await desk.show("changed.html", 409, number=number, text=error.detail)
+            return await context.show("changed.html", 409, number=number, text=error.detail)
         key, words = secrets.token_hex(8), ends("table.word")
-        return await desk.show("proposal.html", screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, words=words)
+        return await context.show("proposal.html", screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, words=words)
 
 
-def _add_approval(app: FastAPI, desk: PageContext) -> None:
+def _add_approval(app: FastAPI, context: PageContext) -> None:
     @app.post("/proposal/approve", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.APPROVE)
     async def approve(request: Request) -> Response:
         visit: Visit = request.state.visit
-        asked = _approval(await _form(request))
+        asked = _approval(await form_of(request) or {})
         if asked is None:
             return problem(422, "the form names no proposal, or hours that are not between 0.01 and 720")
         number, hours = asked
@@ -166,7 +166,7 @@ def _add_approval(app: FastAPI, desk: PageContext) -> None:
         account = visit.principal.name
         name = account.partition(":")[2].partition("/")[0]
         try:
-            await desk.read(approve_waiting, desk.store, number, name, hours, desk.reader.clock, account)
+            await context.read(approve_waiting, context.store, number, name, hours, context.reader.clock, account)
         except TableRefused as error:
             return problem(409, str(error), error.code)
         except NotStored as error:
@@ -183,35 +183,22 @@ def _approval(fields: dict[str, str]) -> tuple[int, float] | None:
     return (number, hours) if 1 <= number < 2**31 and 0.01 <= hours <= 720.0 else None
 
 
-async def _form(request: Request) -> dict[str, str]:
-    """Fields of a short form; empty where it is too long."""
-    body = b""
-    async for piece in request.stream():
-        body += piece
-        if len(body) > LONGEST_FORM:
-            return {}
-    try:
-        return {key: values[0] for key, values in parse_qs(body.decode("utf-8", "replace"), max_num_fields=8).items()}
-    except ValueError:  # more fields than that
-        return {}
-
-
-def _add_times(app: FastAPI, desk: PageContext) -> None:
+def _add_times(app: FastAPI, context: PageContext) -> None:
     @app.get("/trends", include_in_schema=False)
     @needs(Permission.READ)
     async def trends() -> HTMLResponse:
-        past, moment = await desk.source.verifications(times.CHECKS), await desk.source.status()
-        screen = await desk.read(times.trend_screen, desk.reader, past, moment)
-        return await desk.show("trends.html", verified=moment.verified, plots=screen.plots, charts=screen.charts, checks=len(past))
+        past, moment = await context.source.verifications(times.CHECKS), await context.source.status()
+        screen = await context.read(times.trend_screen, context.reader, past, moment)
+        return await context.show("trends.html", verified=moment.verified, plots=screen.plots, charts=screen.charts, checks=len(past))
 
     @app.get("/schedule", include_in_schema=False)
     @needs(Permission.READ)
     async def schedule() -> HTMLResponse:
-        moment = await desk.source.status()
-        return await desk.show("schedule.html", lines=await desk.read(times.schedule_lines, desk.reader, moment))
+        moment = await context.source.status()
+        return await context.show("schedule.html", lines=await context.read(times.schedule_lines, context.reader, moment))
 
     @app.get("/audit", include_in_schema=False)
     @needs(Permission.AUDIT)
     async def audit() -> HTMLResponse:
-        records = await desk.read(desk.store.audit, times.AUDIT_ROWS)
-        return await desk.show("audit.html", records=list(reversed(records)))
+        records = await context.read(context.store.audit, times.AUDIT_ROWS)
+        return await context.show("audit.html", records=list(reversed(records)))

@@ -12,7 +12,7 @@ from abbe.service.queries.pushes import tables
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.pages.desk import PageContext
+from abbe.service.web.pages.context import PageContext
 
 MOST = 50
 SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}
@@ -25,18 +25,18 @@ def ends(group: str) -> dict[str, str]:
     return {word: current().state(group, word) for word in ENDS}
 
 
-def add_table_screen(app: FastAPI, desk: PageContext) -> None:
+def add_table_screen(app: FastAPI, context: PageContext) -> None:
     """Add the screen to the application."""
 
     @app.get("/table", include_in_schema=False)
     @needs(Permission.READ)
     async def table() -> HTMLResponse:
         try:
-            told = await desk.read(tables, desk.reader)
+            told = await context.read(tables, context.reader)
         except JournalChanged as error:
-            return await desk.show("table.html", 409, broken=error.detail, told=None)
-        status = await desk.source.status()
-        return await desk.show(
+            return await context.show("table.html", 409, broken=error.detail, told=None)
+        status = await context.source.status()
+        return await context.show(
             "table.html",
             told=told,
             broken="",

@@ -17,7 +17,7 @@ from abbe.service.verification.trend_table import FigureTrend
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.page import trends as trend_plots
-from abbe.service.web.pages.desk import zone_of
+from abbe.service.web.pages.context import zone_of
 
 CHECKS = 300
 SLOTS = 30

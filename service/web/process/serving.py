@@ -147,7 +147,7 @@ async def _serve(wire: Wire, begin: Begin, store: ServiceStore, listening: socke
     core = CoreLine(wire, clock)
     reader = Reader(store, begin.machine, clock, begin.control)
     view = StatusReader(reader, begin.version, core, core.next_due, begin.broker)
-    door = Authenticator(store, people, AuditBook(store, begin.store_url), Front(begin.port, begin.behind_tls))
+    auth = Authenticator(store, people, AuditBook(store, begin.store_url), Front(begin.port, begin.behind_tls))
     parts = Parts(
         core, store, begin.machine, begin.recipes, Rehearsals(begin.plan, begin.recipes, rules=begin.rules), begin.campaigns, begin.control
     )
@@ -159,7 +159,7 @@ async def _serve(wire: Wire, begin: Begin, store: ServiceStore, listening: socke
         rules=Rules(**asdict(begin.rules)),
         tail=keep_log(),
     )
-    app = create_app(view, version=begin.version, hosts=begin.hosts, door=door, parts=parts, plant=plant, api=api)
+    app = create_app(view, version=begin.version, hosts=begin.hosts, auth=auth, parts=parts, plant=plant, api=api)
     server = make_server(app, begin.certificate, begin.key)
     app.state.end = lambda: setattr(server, "should_exit", True)
     heard = asyncio.create_task(core.listen(), name="core")

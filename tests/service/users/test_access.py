@@ -44,7 +44,7 @@ class Somebody:
 class Gate:
     world: World
     app: FastAPI
-    door: Authenticator
+    auth: Authenticator
     client: httpx.AsyncClient
 
     def session(self, name: str) -> dict[str, str]:
@@ -60,11 +60,11 @@ class Gate:
         return answer
 
 
-def app_of(world: World, door: Authenticator | None) -> FastAPI:
+def app_of(world: World, auth: Authenticator | None) -> FastAPI:
     board = Board({}, world.clock)
     none: list[tuple[Schedule, Any]] = []
     view = StatusReader(Reader(world.store, "mill-7", world.clock), "0.1.0", board, lambda: none, "")
-    return create_app(view, version="0.1.0", door=door)
+    return create_app(view, version="0.1.0", auth=auth)
 
 
 def with_one_route_for_each_right(app: FastAPI) -> None:
@@ -84,11 +84,11 @@ async def gate(world: World) -> AsyncIterator[Gate]:
     for role in Role:
         world.people.add(f"a-{role}", role, PHRASE)
     world.people.add("a-second-admin", "admin", PHRASE)
-    door = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s, rate_hz=1e6, burst=1e6)
-    door.noise._burst = 1e6
-    app = app_of(world, door)
+    auth = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s, rate_hz=1e6, burst=1e6)
+    auth.noise._burst = 1e6
+    app = app_of(world, auth)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:
-        yield Gate(world, app, door, client)
+        yield Gate(world, app, auth, client)
 
 
 def everybody(gate: Gate) -> list[Somebody]:
@@ -241,7 +241,7 @@ async def test_guessing_is_slowed_and_told_from_nothing(gate: Gate) -> None:
     """A user that exists and one that does not are answered alike, and a thousand tries are few hashes."""
     answers = {}
     for name in ("a-operator", "nobody"):
-        gate.door.lockout.__init__(gate.world.clock.monotonic_s)  # type: ignore[misc]
+        gate.auth.lockout.__init__(gate.world.clock.monotonic_s)  # type: ignore[misc]
         begin = gate.world.people.passwords.hashes
         answers[name] = [await log_in(gate, name, f"guess number {n}") for n in range(30)]
         assert gate.world.people.passwords.hashes - begin == 5
@@ -252,7 +252,7 @@ async def test_guessing_is_slowed_and_told_from_nothing(gate: Gate) -> None:
     told = " ".join(r.target for r in gate.world.store.audit())
     assert "nobody" not in told  # people type their password where the name belongs
     gate.world.clock.later(seconds=3)
-    gate.door.lockout.__init__(gate.world.clock.monotonic_s)  # type: ignore[misc]
+    gate.auth.lockout.__init__(gate.world.clock.monotonic_s)  # type: ignore[misc]
     assert (await log_in(gate, "a-operator", PHRASE)).status_code == 303
 
 
@@ -281,20 +281,20 @@ async def test_a_login_is_a_short_form(gate: Gate) -> None:
 
 async def test_a_flood_from_one_address_is_turned_away(world: World) -> None:
     world.people.add("root", "admin", PHRASE)
-    door = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
-    async with httpx.AsyncClient(transport=httpx.ASGITransport(app_of(world, door), False), base_url=BASE) as client:
+    auth = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app_of(world, auth), False), base_url=BASE) as client:
         codes = [(await client.get("/healthz")).status_code for _ in range(300)]
         assert codes == [200] * 200 + [429] * 100
         world.clock.later(seconds=4)
         assert (await client.get("/healthz")).status_code == 200
         refused = [(await client.post("/logout", headers=OWN)).status_code for _ in range(100)]
         assert set(refused) == {401}
-    assert len(world.store.audit()) == 20  # who hammers at the door does not fill the audit
+    assert len(world.store.audit()) == 20  # who hammers at the auth does not fill the audit
 
 
 async def test_without_users_everybody_may_look_and_nobody_may_change(world: World) -> None:
-    door = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
-    app = app_of(world, door)
+    auth = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s)
+    app = app_of(world, auth)
     with_one_route_for_each_right(app)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:
         for method, path, need in cells(app.routes):

@@ -26,8 +26,8 @@ __all__ = ["gate"]  # the fixture
 
 
 def behind(world: World, front: Front) -> tuple[FastAPI, Authenticator]:
-    door = Authenticator(world.store, world.people, world.book, front, now_s=world.clock.monotonic_s)
-    return app_of(world, door), door
+    auth = Authenticator(world.store, world.people, world.book, front, now_s=world.clock.monotonic_s)
+    return app_of(world, auth), auth
 
 
 @asynccontextmanager
@@ -82,7 +82,7 @@ async def test_a_change_whose_answer_breaks_off_is_recorded_as_that(gate: Gate) 
 
 async def test_defects_are_recorded_however_many(gate: Gate) -> None:
     """Refusals of one address are thinned out; what may have changed something is not."""
-    gate.door.noise._burst = 1.0
+    gate.auth.noise._burst = 1.0
 
     @gate.app.post("/api/v1/bad")
     @needs(Permission.USERS)
@@ -199,7 +199,7 @@ async def test_tls_is_said_to_be_here_to_stay(world: World, front: Front) -> Non
 async def test_two_services_on_one_host_do_not_log_each_other_out(world: World) -> None:
     """Browsers send a cookie to every port of a host: here one jar for both, as a browser has it."""
     world.people.add("ana", "admin", PHRASE)
-    (first, _), (second, door) = behind(world, Front(8080)), behind(world, Front(8081))
+    (first, _), (second, auth) = behind(world, Front(8080)), behind(world, Front(8081))
     jar: dict[str, str] = {}
 
     async def ask(app: FastAPI, port: int, method: str, path: str, **more: Any) -> httpx.Response:
@@ -218,7 +218,7 @@ async def test_two_services_on_one_host_do_not_log_each_other_out(world: World) 
     token = (await ask(second, 8081, "GET", "/api/v1/session")).json()["csrf_token"]
     assert (await ask(second, 8081, "POST", "/logout", headers={CSRF_HEADER: token})).status_code == 303
     assert (await ask(first, 8080, "GET", "/api/v1/status")).status_code == 200
-    assert door.cookie(tls=True) == "__Host-abbe-8081"
+    assert auth.cookie(tls=True) == "__Host-abbe-8081"
 
 
 async def test_behind_a_proxy_with_tls_cookies_are_secure_and_origins_https(world: World) -> None:
@@ -255,7 +255,7 @@ async def test_behind_a_proxy_the_visitor_is_who_the_proxy_says_last(world: Worl
 async def test_an_address_with_colons_is_a_name_as_well(world: World) -> None:
     given = ["::1", "[fd00:0::5]", "FD00::6", "192.0.2.1", "abbe.plant"]
     assert [as_in_host_header(host) for host in given] == ["[::1]", "[fd00::5]", "[fd00::6]", "192.0.2.1", "abbe.plant"]
-    app = create_app(_view(world), version="0.1.0", hosts=given, door=None)
+    app = create_app(_view(world), version="0.1.0", hosts=given, auth=None)
     async with client_of(app) as client:
         for host in ("[::1]:8080", "[fd00::5]", "[fd00::6]:8080", "192.0.2.1:1", "Abbe.Plant"):
             assert (await client.get("/healthz", headers={"Host": host})).status_code == 200, host

@@ -78,7 +78,7 @@ class Plant:
     people: People
     book: AuditBook
     app: FastAPI
-    door: Authenticator
+    auth: Authenticator
     approvable: list[int]
     """Proposals that can be approved."""
 
@@ -197,18 +197,18 @@ def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
     for role in Role:
         people.add(f"a-{role}", role, PHRASE)
     book = AuditBook(store, url)
-    door = Authenticator(store, people, book, now_s=clock.monotonic_s, rate_hz=1e9, burst=1e9)
-    door.noise._burst = 1e9
-    app = app_of(store, clock, door)
-    return Plant(store, url, clock, people, book, app, door, approvable), stack
+    auth = Authenticator(store, people, book, now_s=clock.monotonic_s, rate_hz=1e9, burst=1e9)
+    auth.noise._burst = 1e9
+    app = app_of(store, clock, auth)
+    return Plant(store, url, clock, people, book, app, auth, approvable), stack
 
 
-def app_of(store: ServiceStore, clock: Hour, door: Authenticator | None) -> FastAPI:
+def app_of(store: ServiceStore, clock: Hour, auth: Authenticator | None) -> FastAPI:
     board = Board({"cnc": "modbus://127.0.0.1:5020"}, clock)
     schedules = (Schedule("daily", "0 6 * * *", "Europe/Berlin", "quick-check"), Schedule("hours", "", "UTC", "verification", every_h=8.0))
     view = StatusReader(Reader(store, NAME, clock), "0.1.0", board, list, "")
     sources = Sources(reader=view.reader, schedules=schedules, devices=lambda: board.devices)
-    return create_app(view, version="0.1.0", door=door, api=sources)
+    return create_app(view, version="0.1.0", auth=auth, api=sources)
 
 
 @contextlib.contextmanager

@@ -35,7 +35,7 @@ def filled(path: str, number: str = "1") -> str:
 
 
 async def test_every_route_by_every_role(plant: Plant) -> None:
-    """Whoever may is not kept out at the door; whoever may not gets no further, whatever there is behind."""
+    """Whoever may is not kept out at the auth; whoever may not gets no further, whatever there is behind."""
     table = [cell for cell in cells(plant.app.routes) if cell[1] not in {"/login", "/logout", "/static"}]
     asserted = 0
     async with httpx.AsyncClient(transport=httpx.ASGITransport(plant.app, False), base_url=BASE) as client:

@@ -81,7 +81,7 @@ async def desk(plant: Plant) -> AsyncIterator[Desk]:
     view = StatusReader(Reader(plant.store, NAME, plant.clock), "0.1.0", core, core.next_due, "")
     names = ("quick-check", CAMPAIGN)
     parts = Parts(core, plant.store, NAME, names, Rehearsals(TOLD, names), (CAMPAIGN,))
-    app = create_app(view, version="0.1.0", door=plant.door, parts=parts)
+    app = create_app(view, version="0.1.0", auth=plant.auth, parts=parts)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE, headers={"Origin": BASE}) as client:
         made = Desk(client, far, core)
         tasks = [asyncio.create_task(core.listen()), asyncio.create_task(made.serve())]

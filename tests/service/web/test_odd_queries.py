@@ -42,11 +42,11 @@ async def test_every_text_of_every_query(url: str) -> None:
     with ServiceStore.open(url) as store:
         people = People(store, clock, Passwords(memory_kib=64, passes=1))
         people.add("adam", "admin", PHRASE)
-        door = Authenticator(store, people, AuditBook(store, url), rate_hz=1e9, burst=1e9)
+        auth = Authenticator(store, people, AuditBook(store, url), rate_hz=1e9, burst=1e9)
         board = Board({}, clock)
         schedules = (Schedule("s", "0 6 * * *", "UTC", "r"),)
         view = StatusReader(Reader(store, "m", clock), "0", board, list, "")
-        app = create_app(view, version="0", door=door, api=Sources(reader=view.reader, schedules=schedules))
+        app = create_app(view, version="0", auth=auth, api=Sources(reader=view.reader, schedules=schedules))
         secret = people.begin(people.get("adam"))
         headers = {"Cookie": f"{COOKIE}={secret}", CSRF_HEADER: csrf_token(secret), "Origin": "http://127.0.0.1"}
         found: dict[str, int] = {}

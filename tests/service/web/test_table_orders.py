@@ -1,4 +1,4 @@
-"""The order that takes a table back, over HTTP: the right is asked at the door, the rest is the core's answer."""
+"""The order that takes a table back, over HTTP: the right is asked at the auth, the rest is the core's answer."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ async def desk(plant: Plant) -> AsyncIterator[Desk]:
     core = CoreLine(near, SystemClock())
     view = StatusReader(Reader(plant.store, NAME, plant.clock), "0.1.0", Board({}, plant.clock), list, "")
     sources = Sources(reader=view.reader)
-    app = create_app(view, version="0.1.0", door=plant.door, api=sources, parts=Parts(core, plant.store, NAME, ()))
+    app = create_app(view, version="0.1.0", auth=plant.auth, api=sources, parts=Parts(core, plant.store, NAME, ()))
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:
         made = Desk(app, client)
         tasks = [asyncio.create_task(core.listen()), asyncio.create_task(made.core(far))]

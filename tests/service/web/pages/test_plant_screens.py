@@ -96,7 +96,7 @@ async def test_a_choice_is_kept_by_a_screen_alone_and_over_tls_only_where_there_
         asked = [client.get(f"{path}?theme=dark").headers for path in ("/healthz", "/api/v1/status", "/settings")]
         assert ["set-cookie" in headers for headers in asked] == [False, False, True]
         assert "Secure" not in asked[2]["set-cookie"]
-    app = create_app(StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, ""), version="0", door=running.door)
+    app = create_app(StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, ""), version="0", auth=running.auth)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="https://127.0.0.1") as client:
         assert "Secure" in (await client.get("/login?theme=dark")).headers["set-cookie"]
 
@@ -185,7 +185,7 @@ async def test_a_screen_that_is_not_there_is_not_in_the_bar(running: Served) -> 
         there = set(re.findall(entries, client.get("/settings").text))
         headers = {"Cookie": client.headers["Cookie"]}
     assert {"/fleet", "/devices", "/settings", "/runs"} <= there
-    app = create_app(StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, ""), version="0", door=running.door)
+    app = create_app(StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, ""), version="0", auth=running.auth)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://127.0.0.1", headers=headers) as client:
         assert (await client.get("/fleet")).status_code == 404
         fewer = set(re.findall(entries, (await client.get("/runs")).text))

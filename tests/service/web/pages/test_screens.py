@@ -195,7 +195,7 @@ def test_a_language_is_kept_by_a_cookie(running: Served) -> None:
 
 def test_every_address_says_what_it_needs(running: Served) -> None:
     view = StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, "")
-    app = create_app(view, version="0", door=running.door)
+    app = create_app(view, version="0", auth=running.auth)
     own = {path: need for _, path, need in cells(app.routes)}
     assert all(need is not None for need in own.values())
     assert own["/run"] is Permission.READ

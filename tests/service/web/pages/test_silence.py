@@ -28,7 +28,7 @@ class Silent:
 
 async def test_every_screen_says_so_and_the_api_gives_a_problem(running: Served) -> None:
     store = running.store
-    app = create_app(Silent(), version="0", door=running.door, api=Sources(reader=Reader(store, running.filled.machine, SystemClock())))
+    app = create_app(Silent(), version="0", auth=running.auth, api=Sources(reader=Reader(store, running.filled.machine, SystemClock())))
     with as_user(running, "adam") as known:
         headers = dict(known.headers) | {"host": "127.0.0.1"}
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url="http://127.0.0.1", headers=headers) as client:

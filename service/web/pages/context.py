@@ -1,4 +1,4 @@
-"""What every screen of the store is made with: templates, door and the moment; and how a screen is answered."""
+"""What every screen of the store is made with: templates, authentication and the status; and how a screen is answered."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PageContext:
     ----------
     env : Environment
         The templates; they escape everything.
-    door : Authenticator
+    auth : Authenticator
         Its store is read, and its users approve.
     source : StatusSource
         How things stand now.
@@ -42,7 +42,7 @@ class PageContext:
     """
 
     env: Environment
-    door: Authenticator
+    auth: Authenticator
     source: StatusSource
     reader: Reader
     rules: Rules = field(default_factory=Rules)
@@ -50,7 +50,7 @@ class PageContext:
     @property
     def store(self) -> Store:
         """The open store."""
-        return self.door.store
+        return self.auth.store
 
     async def show(self, template: str, status: int = 200, /, **values: object) -> HTMLResponse:
         """Answer with a screen; times stand in the zone of the timetable."""
