@@ -199,8 +199,8 @@ def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) 
         x_mm=x,
         y_mm=y,
         z_mm=z,
-        deviation_um=found.deviation_um.round(3).tolist(),
-        expanded_um=(2.0 * found.u_um).round(3).tolist(),
+        deviation_um=[(dx, dy, dz) for dx, dy, dz in found.deviation_um.round(3).tolist()],
+        expanded_um=[(ux, uy, uz, u) for ux, uy, uz, u in (2.0 * found.u_um).round(3).tolist()],
         told=found.told.tolist(),
         hidden=[HiddenMotion(motion=name, reason=why) for name, why in stored.hidden.items()],
     )
