@@ -7,7 +7,6 @@ from pathlib import Path
 
 from abbe.service.rendering.page_file import write_page
 from abbe.service.rendering.palette import style_rules
-from abbe.service.rendering.plots.signed import signed_rules
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +16,7 @@ class Picture:
     svg: str
 
     def _repr_html_(self) -> str:
-        return f"<div><style>{style_rules()}{signed_rules()}</style>{self.svg}</div>"
+        return f"<div><style>{style_rules()}</style>{self.svg}</div>"
 
     def save(self, target: str | Path) -> None:
         """Write it as an HTML page.

@@ -19,11 +19,13 @@ from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import TableRefused
 from abbe.service.identification.solve import Say, solve_runs
 from abbe.service.identification.solve_report import Account, account, judged, solution_doc
-from abbe.service.rendering.page_file import write_page
+from abbe.service.rendering.document_page import write_document
+from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.plots.bands import motion_bands
-from abbe.service.rendering.solution_model import MotionCurve
-from abbe.service.rendering.solution_page import render_solution
-from abbe.service.report.solve_pages import motion_curves, parameter_rows, solution_page
+from abbe.service.report.report import solution_report
+from abbe.service.report.report_measured import SolutionResult
+from abbe.service.report.report_parts import Rules
+from abbe.service.report.solution_sections import motion_curves, parameter_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,16 +130,16 @@ class Solution:
         return Picture("".join(motion_bands([c for c in curves if c.unit == unit], key=f"motions{i}") for i, unit in enumerate(units)))
 
     def report(self, target: str | Path) -> None:
-        """Write the page that ``abbe solve --report`` writes.
+        """Write the report that ``abbe solve --report`` writes, as ``.html``, ``.pdf``, ``.csv`` or ``.json``.
 
         Raises
         ------
         FileFormatError
-            The file cannot be written.
+            Another ending, or the file cannot be written.
         """
-        doc = {"campaign": self.campaign.name} | solution_doc(self._found)
-        page = solution_page(self._found, doc, self.campaign.site, datetime.now(UTC).isoformat(timespec="seconds"))
-        write_page(render_solution(page), Path(target))
+        made = datetime.now(UTC).isoformat(timespec="seconds")
+        result = SolutionResult(solution_doc(self._found), account=self._found)
+        write_document(solution_report(None, self.campaign, result, made, Rules()), Path(target))
 
     def __repr__(self) -> str:
         return f"<abbe.Solution of {self.campaign.name}: {self.model}, {self.verdict}>"

@@ -16,7 +16,7 @@ from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, PlanStep, p
 from abbe.service.campaigns.plan_instruments import at_this_machine
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import ConfigError
-from abbe.service.rendering.plan_page import PlanPage, render_plan
+from abbe.service.rendering.document import Document, Lines, Picture, Section, TextTable
 from abbe.service.rendering.plots.setups import SetupPath, setups_picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe
@@ -157,20 +157,28 @@ def step_rows(plan: Plan) -> list[tuple[str, ...]]:
     return rows
 
 
-def plan_page(site: Site, planned: PlannedCampaign) -> str:
-    """A page with the picture of the set-ups and what each measurement buys."""
+def plan_report(site: Site, planned: PlannedCampaign) -> Document:
+    """The picture of the set-ups and what each measurement buys."""
     plan = planned.plan
     paths = [
         SetupPath(int(s.setup_id.removeprefix("S")), _kind(s.test), words(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
         for s, run in zip(plan.steps, plan.runs, strict=True)
     ]
-    lead = (f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_words(plan), *planned.notes)
+    lead = [f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_words(plan), *planned.notes]
     headings = ("No", "Label", "Measurement", "min", "until min", "worst U µm", "mean U µm")
-    picture = setups_picture(site.machine.stroke_mm, paths)
-    rows = tuple(step_rows(plan))
-    return render_plan(
-        PlanPage("Planned measurements", lead, headings, rows, f"{BOUND_NOTE}. {temperature_words(plan)}", plan.open_questions, picture)
+    picture = Picture(
+        "Numbers: set-ups in the order of measuring. Rest the pointer on a dot to read what is set up there.",
+        [setups_picture(site.machine.stroke_mm, paths)],
+        "wide",
     )
+    table = TextTable(headings, step_rows(plan))
+    note = f"{BOUND_NOTE}. {temperature_words(plan)}."
+    sections = (
+        Section("Set-ups", [*lead, picture]),
+        Section("Measurements in order", [table, note]),
+        Section("What stays open", [Lines(plan.open_questions)]),
+    )
+    return Document(kind="plan", title="Planned measurements", sections=sections, signatures=())
 
 
 def _kind(test: Measurement) -> str:

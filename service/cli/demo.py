@@ -50,7 +50,7 @@ def demo(
     from abbe.service.demo.demo import run_demo
     from abbe.service.demo.demo_report import demo_json, demo_report
     from abbe.service.demo.demo_serve import run_served_demo
-    from abbe.service.rendering.html import render_report
+    from abbe.service.rendering.document_page import write_document
 
     folder = _folder(keep)
 
@@ -61,7 +61,7 @@ def demo(
     with display() as sink, work_folder(folder, keep) as work:
         result = run_job(run_demo(seed, speed, work, sink))
     report = folder / "report.html"
-    report.write_text(render_report(demo_report(result)), encoding="utf-8")
+    write_document(demo_report(result), report)
     if as_json:
         sys.stdout.write(json.dumps(demo_json(result), indent=2) + "\n")
     else:

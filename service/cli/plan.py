@@ -31,22 +31,25 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
-    from abbe.service.campaigns.plan import plan_doc, plan_for, plan_page
+    from abbe.service.campaigns.plan import plan_doc, plan_for, plan_report
     from abbe.service.campaigns.plan_instruments import read_instruments
     from abbe.service.cli.progress import display
     from abbe.service.config import load_machine
+    from abbe.service.rendering.document_page import form_of, write_document
     from abbe.service.rendering.page_file import write_page
     from abbe.service.site import site_of
 
     site = site_of(load_machine(machine).machine)
     tools = read_instruments(instruments)
     _check_targets((out, picture), (machine, instruments))
+    if picture is not None:
+        form_of(picture)  # before the work
     with display() as sink:
         planned = plan_for(site, minutes=minutes, goal_um=goal_um, tools=tools, progress=sink)
     if out is not None:
         write_page(planned.text, out)
     if picture is not None:
-        write_page(plan_page(site, planned), picture)
+        write_document(plan_report(site, planned), picture)
     if as_json:
         print_json(plan_doc(planned))
         return

@@ -55,8 +55,9 @@ class Rehearsal:
 
     def run(self, site: Site, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> None:
         """Print, draw or write it."""
+        from abbe.service.rendering.document_page import write_document
         from abbe.service.rendering.page_file import write_page
-        from abbe.service.report.dry_run_page import dry_page
+        from abbe.service.report.dry_run_page import dry_run_report
         from abbe.service.sequences.nc.write import nc_program
 
         if self.nc and self.out is not None:
@@ -68,7 +69,7 @@ class Rehearsal:
             return
         print_path(plan) if self.path else print_dry_run(plan.name, runs)
         if self.picture is not None:
-            write_page(dry_page(site.name, site.machine, plan, runs), self.picture)
+            write_document(dry_run_report(site.name, site.machine, plan, runs), self.picture)
             typer.echo(f"picture: {self.picture}")
 
 

@@ -1,4 +1,4 @@
-"""How two sets of tables differ: nine curves on one grid, largest change and where, and the page that shows them."""
+"""How two sets of tables differ: nine curves on one grid, largest change and where, and the report that shows them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.errors import TableRefused
-from abbe.service.rendering.diff_page import DiffCurve, DiffPage, render_diff
+from abbe.service.rendering.document import Document, Picture, Section, TextTable
+from abbe.service.rendering.plots.table_change import DiffCurve, change_plot
 from abbe.service.storage.store import Store
 
 ACTIVE = "ACTIVE"
@@ -104,8 +105,8 @@ def largest(found: TableDifference) -> str:
     return f"largest change: {size:+.2f} µm (U = {expanded:.2f} µm, k = 2) {where}"
 
 
-def diff_html(found: TableDifference, proposed: Proposed) -> str:
-    """The page: table of numbers and picture."""
+def diff_report(found: TableDifference, proposed: Proposed) -> Document:
+    """What a proposal changes: numbers and picture."""
     p = proposed.predicted
     lead = (
         f"{proposed.candidate.machine}: {found.new}, made from campaign {proposed.campaign} by {proposed.by} at {proposed.utc}.",
@@ -116,7 +117,14 @@ def diff_html(found: TableDifference, proposed: Proposed) -> str:
     )
     curves = tuple(DiffCurve(c.moved, c.corrected, c.position_mm, c.old_mm * 1e3, c.new_mm * 1e3, c.u_mm * 1e3) for c in found.curves)
     title = f"{found.new} against {found.old.split(' (')[0]}"
-    return render_diff(DiffPage(title, lead, HEADINGS, tuple(rows(found)), curves))
+    caption = (
+        "Corrections are added to the command. Band: expanded uncertainty (k = 2) of the new entries against the first one of their table."
+    )
+    sections = (
+        Section("What changes", [*lead, Picture(caption, [change_plot(curves)], "wide")]),
+        Section("The nine tables", [TextTable(HEADINGS, rows(found))]),
+    )
+    return Document(kind="table-change", title=title, sections=sections, signatures=())
 
 
 def _um(mm: float) -> str:

@@ -1,4 +1,4 @@
-"""The demonstration's result as the report's data and as JSON. Sealed-truth figures are always marked as such."""
+"""The demonstration's result as a report and as JSON. Sealed-truth figures are always marked as such."""
 
 from __future__ import annotations
 
@@ -13,18 +13,31 @@ from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.service.compensation.correct import Correction
 from abbe.service.demo.demo import DemoResult
-from abbe.service.rendering.model import (
-    ArrowField,
-    DemoReport,
-    ResidualSeries,
-    RunRow,
+from abbe.service.rendering.document import Block, Document, Lines, Picture, Section
+from abbe.service.rendering.model import SETUP_NOTE, ArrowField, TableCurve
+from abbe.service.rendering.numbers import COVERAGE, tidy
+from abbe.service.rendering.plots.diagonals import diagonal_plot
+from abbe.service.rendering.plots.tables import table_plot
+from abbe.service.rendering.plots.volume import volume_pair
+from abbe.service.report.blocks import (
+    SIGNS,
     SummaryRow,
-    TableCurve,
+    parameter_pictures,
+    parameter_table,
+    residual_picture,
+    run_table,
+    setup_section,
+    summary_table,
 )
-from abbe.service.report.solve_pages import contributions, parameter_rows
+from abbe.service.report.report_parts import machine_facts
+from abbe.service.report.solution_sections import contributions, parameter_rows, residual_series, solution_runs
 from abbe.service.verification.verify import VerificationFigures, figure_rows
 
 TRUTH = "sealed truth of the simulator"
+ALL_SEEN = (
+    "nothing of the model: these runs tell every parameter apart. Errors outside the model remain possible; the residuals are the place to "
+    "look"
+)
 TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
 
 
@@ -63,11 +76,11 @@ def summary_rows(result: DemoResult) -> list[SummaryRow]:
     c = result.correction
     for name, (v, u), (a, ua) in _measured(c.before, c.after) if c is not None else []:
         title = _title(name)
-        rows.append(SummaryRow(title, "µm", v, a, v / a if a > 0 else None, u, ua, "measured"))
+        rows.append(SummaryRow(title, "µm", v, a, u, ua))
     for key, title in zip(TRUTH_KEYS, ("Largest body diagonal", "Volumetric error, rms", "Volumetric error, maximum"), strict=True):
         if key in result.truth_before and key in result.truth_after:
             old, new = float(result.truth_before[key]), float(result.truth_after[key])
-            rows.append(SummaryRow(title, "µm", old, new, old / new if new else None, source="sealed truth of the simulator"))
+            rows.append(SummaryRow(title, "µm", old, new, source="sealed truth of the simulator"))
     return rows
 
 
@@ -97,8 +110,8 @@ def _tables(t: NineTables) -> list[TableCurve]:
     ]
 
 
-def demo_report(result: DemoResult) -> DemoReport:
-    """Everything the report shows, from what the demonstration found.
+def demo_report(result: DemoResult) -> Document:
+    """What the demonstration found: before and after, parameters, tables, residuals.
 
     Raises
     ------
@@ -109,34 +122,56 @@ def demo_report(result: DemoResult) -> DemoReport:
     if c is None:
         raise ValueError("the demonstration holds no correction to report")
     joint = c.solved.joint
-    return DemoReport(
+    rows, runs = parameter_rows(joint), solution_runs(joint)
+    shown = [r for r in rows if r.note != SETUP_NOTE]
+    return Document(
+        kind="cycle",
         title=f"Abbe: measure, correct, verify - {result.site.name}",
-        machine={"chain": result.site.machine.chain, "stroke_mm": result.site.doc["stroke_mm"], "tool_mm": result.site.doc["tool_mm"]},
-        created_utc=result.started_utc,
-        seed=result.seed,
-        versions={"abbe": version("abbe")},
-        verdict=("Table kept: " if c.decision.keep else "Table rolled back: ") + c.decision.text,
-        accepted=c.decision.keep,
-        summary=summary_rows(result),
-        parameters=parameter_rows(joint),
-        not_observable=[g.text for g in observability_of(joint).hidden],
-        runs=_runs(c),
-        residuals=[ResidualSeries(r.label, "reading", list(range(r.residual_mm.size)), (r.residual_mm * 1e3).tolist()) for r in joint.runs],
-        tables=_tables(c.tables),
-        table_lsb_um=c.lsb_nm * 1e-3,
-        arrows_before=_arrows(result.truth_before),
-        arrows_after=_arrows(result.truth_after),
-        diagonals_before=_curves(c.before),
-        diagonals_after=_curves(c.after),
-        contributions=contributions(joint),
-        push_log=list(c.pushed.log),
-        warnings=_warnings(joint),
+        about=machine_facts(result.site.doc) | {"Made": result.started_utc},
+        verdict=("ok" if c.decision.keep else "bad", "Table kept" if c.decision.keep else "Table rolled back", c.decision.text),
+        remarks=_warnings(joint),
+        sections=(
+            Section("Before and after", _before_and_after(result, c)),
+            Section(
+                "Identified parameters", [*parameter_pictures(rows, contributions(joint)), parameter_table(shown), *setup_section(rows)]
+            ),
+        ),
+        not_observable=[g.text for g in observability_of(joint).hidden] or [ALL_SEEN],
+        appendix=(
+            Section("Compensation tables", _compensation(c)),
+            Section("Residuals", residual_picture(residual_series(joint), runs)),
+            Section("Runs", [run_table(runs)]),
+        ),
+        provenance={"Seed": str(result.seed), "abbe": version("abbe")},
+        signatures=(),
     )
 
 
-def _runs(c: Correction) -> list[RunRow]:
-    joint = c.solved.joint
-    return [RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, r.expected_mm * 1e3) for r in joint.runs]
+def _before_and_after(result: DemoResult, c: Correction) -> list[Block]:
+    vectors = volume_pair(_arrows(result.truth_before), _arrows(result.truth_after))
+    caption = "Error vectors over the volume, rigid motion removed; both pictures share one exaggeration and one colour scale."
+    diagonals = (
+        "Deviation along the body diagonals. Before: dashed; after: solid; all on one ordinate. A curve that returns shows the way out and "
+        "the way back."
+    )
+    return [
+        summary_table(summary_rows(result)),
+        f"± is the expanded uncertainty U = k·u with k = {tidy(COVERAGE)} (about 95 %). A figure without ± has no stated uncertainty. "
+        "Volumetric figures: best-fit rigid motion removed. “Sealed truth” rows come from the simulator's own error functions; the "
+        "measurement never saw them.",
+        *([Picture(caption, vectors)] if vectors else []),
+        Picture(diagonals, [diagonal_plot(_curves(c.before), _curves(c.after))], "wide"),
+    ]
+
+
+def _compensation(c: Correction) -> list[Block]:
+    lsb_um = c.lsb_nm * 1e-3
+    caption = (
+        f"Correction added to the commanded position, as stored in the controller (unit {tidy(lsb_um)} µm). The controller interpolates "
+        "linearly between the points."
+    )
+    picture = Picture(caption, [table_plot(_tables(c.tables), lsb_um=lsb_um)], "wide")
+    return [picture, SIGNS, Section("How they got there", [Lines(c.pushed.log, numbered=True)])]
 
 
 def _warnings(joint: JointSolution) -> list[str]:

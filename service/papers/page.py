@@ -19,7 +19,6 @@ from abbe.service.papers.words import NONE, check_cells, computed_cells, note, s
 from abbe.service.rendering.numbers import printable
 from abbe.service.rendering.page_file import write_page as write_text
 from abbe.service.rendering.palette import style_rules
-from abbe.service.rendering.plots.signed import signed_rules
 
 _MARKS = {"reproduced": "✔", "consistent": "≈", "differs": "≠", "input": "▷", "not reproducible": "○"}
 _CHECK_MARKS = {"holds": "✔", "fails": "✘"}
@@ -44,7 +43,7 @@ def render_page(found: Sequence[PaperResult]) -> str:
         _environment()
         .get_template("papers.html")
         .render(
-            style=Markup(style_rules() + signed_rules()),  # noqa: S704 - our own constants
+            style=Markup(style_rules()),  # noqa: S704 - our own constants
             papers=[_paper(f) for f in found],
             version=version("abbe"),
             marks=_MARKS,

@@ -6,12 +6,29 @@ import csv
 import io
 import json
 import math
+import re
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from abbe.service.rendering.document import DECISION_RULE, FORMAT, UNCERTAINTY, Document, Figure
+from abbe.service.rendering.document import (
+    DECISION_RULE,
+    FORMAT,
+    UNCERTAINTY,
+    Block,
+    Document,
+    Facts,
+    Figure,
+    Lines,
+    Picture,
+    Section,
+    TextTable,
+    blocks,
+)
 from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, plain, printable, tidy, with_uncertainty
 
 COLUMNS = ("group", "symbol", "name", "value", "expanded", "k", "unit", "limit", "verdict", "method")
+_NUMBER = r"(?:n/a|[+−-]?\d[\d.]*(?:e[+−-]?\d+)?)"
+_NUMERIC = re.compile(rf"{_NUMBER}(?: (?:±|to) {_NUMBER})?(?: ?[×%])?")
 NOTHING_HIDDEN = "Nothing was found that this measurement should have shown and could not."
 
 
@@ -32,23 +49,28 @@ def document_csv(document: Document) -> str:
 
 
 def _data(document: Document) -> dict[str, Any]:
-    sign, word, text = document.verdict
+    sections = [*document.sections, *document.appendix]
     return {
         "format": FORMAT,
         "kind": document.kind,
         "title": document.title,
         "about": dict(document.about),
-        "verdict": {"sign": sign, "word": word, "text": text},
+        "verdict": None if document.verdict is None else dict(zip(("sign", "word", "text"), document.verdict, strict=True)),
         "figures": [_figure(f) for f in document.figures],
         "coverage_factor": COVERAGE,
         "uncertainty": UNCERTAINTY,
         "decision_rule": DECISION_RULE,
         "instruments": [{"name": i.name, "certificate": i.certificate, "known": i.known} for i in document.instruments],
         "conditions": dict(document.conditions),
-        "not_observable": list(document.not_observable),
+        "not_observable": None if document.not_observable is None else list(document.not_observable),
         "statements": list(document.statements),
         "remarks": list(document.remarks),
-        "tables": [{"title": t.title, "head": list(t.head), "rows": [list(r) for r in t.rows]} for t in document.tables],
+        "sections": [{"title": s.title, "lines": lines} for s in sections if (lines := _lines(s))],
+        "tables": [
+            {"title": title, "head": list(t.head), "rows": [list(r) for r in t.rows]}
+            for title, t in blocks(sections)
+            if isinstance(t, TextTable)
+        ],
         "provenance": dict(document.provenance),
         "signatures": list(document.signatures),
     }
@@ -74,20 +96,66 @@ def _number(value: float | None) -> float | None:
     return float(value) if value is not None and math.isfinite(value) else None
 
 
-def shown(document: Document) -> dict[str, Any]:
-    """What a template prints: words only, numbers rounded with their uncertainty. Pictures are not in it."""
+def _lines(section: Section) -> list[str]:
+    """The words of a section that stand in no table."""
+    out: list[str] = []
+    for _, block in blocks([section]):
+        match block:
+            case str():
+                out.append(block)
+            case Lines():
+                out += block.items
+            case Facts():
+                out += [f"{name}: {value}" for name, value in block.items.items()]
+            case _:
+                pass
+    return out
+
+
+def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any]:
+    """What a template prints: words, numbers rounded with their uncertainty, and pictures as ``draw`` makes them of their SVG."""
     data = _data(document)
     groups: dict[str, list[dict[str, str]]] = {}
     for f in document.figures:
         groups.setdefault(f.group, []).append(_words(f))
-    pairs = {name: [{"name": k, "value": v} for k, v in data[name].items()] for name in ("about", "conditions", "provenance")}
-    words = data | pairs | {"groups": [{"name": name, "rows": rows} for name, rows in groups.items()]}
+    words = data | {name: _pairs(data[name]) for name in ("about", "conditions", "provenance")}
+    words["groups"] = [{"name": name, "rows": rows} for name, rows in groups.items()]
     words["judged"] = any(f.limit is not None for f in document.figures)
-    words["not_observable"] = words["not_observable"] or [NOTHING_HIDDEN]
+    words["not_observable"] = data["not_observable"] if document.not_observable is None else data["not_observable"] or [NOTHING_HIDDEN]
     words["lang"], words["coverage"] = document.lang, tidy(COVERAGE)
+    words["sections"], words["appendix"] = ([_block(s, draw) for s in some] for some in (document.sections, document.appendix))
     del words["figures"]
     clean: dict[str, Any] = _clean(words)
     return clean
+
+
+def _block(block: Block, draw: Callable[[str], str]) -> dict[str, Any]:
+    """A block with its kind, as the templates print it."""
+    match block:
+        case Lines():
+            return {"kind": "lines", "items": list(block.items), "numbered": block.numbered}
+        case Facts():
+            return {"kind": "facts", "items": _pairs(block.items)}
+        case TextTable():
+            rows = [list(r) for r in block.rows]
+            return {"kind": "table", "head": list(block.head), "rows": rows, "right": _right(len(block.head), rows)}
+        case Picture():
+            return {"kind": "picture", "caption": block.caption, "svgs": [draw(s) for s in block.svgs], "layout": block.layout}
+        case Section():
+            inner = [_block(b, draw) for b in block.blocks]
+            return {"kind": "section", "title": block.title, "folded": block.folded, "blocks": inner}
+        case _:
+            return {"kind": "text", "text": block}
+
+
+def _pairs(facts: Mapping[str, str]) -> list[dict[str, str]]:
+    return [{"name": name, "value": value} for name, value in facts.items()]
+
+
+def _right(columns: int, rows: Sequence[Sequence[str]]) -> list[bool]:
+    """Which columns, after the first, hold numbers and nothing else."""
+    cells = [[row[k] for row in rows if row[k]] for k in range(columns)]
+    return [k > 0 and bool(some) and all(_NUMERIC.fullmatch(c) for c in some) for k, some in enumerate(cells)]
 
 
 def _words(figure: Figure) -> dict[str, str]:

@@ -1,18 +1,23 @@
-"""A report as one self-contained HTML page, and as PDF. Both print the same words (`document_data.shown`) and the same pictures."""
+"""A report as HTML page, PDF, CSV or JSON file. Page and PDF print the same words (`document_data.shown`) and the same pictures."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from abbe.service.rendering.document import Document, Picture
-from abbe.service.rendering.document_data import shown
+from abbe.service.errors import FileFormatError
+from abbe.service.rendering.document import Document
+from abbe.service.rendering.document_data import document_csv, document_json, shown
 from abbe.service.rendering.numbers import printable
+from abbe.service.rendering.page_file import write_page
 from abbe.service.rendering.palette import paper_rules, style_rules
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
@@ -22,33 +27,21 @@ FONT = "Libertinus Serif"
 
 def document_html(document: Document) -> str:
     """Self-contained page: no script, no request to anywhere. Equal reports give equal bytes."""
-    page = _environment().get_template("document.html")
-    words = shown(document)
-    return printable(
-        page.render(
-            doc=words,
-            mark=_MARKS[document.verdict[0]],
-            style=Markup(style_rules()),  # noqa: S704 - our own constants
-            # The SVG writer has escaped every text; escaping again would show the reader the tags.
-            pictures=[{"caption": p.caption, "svg": Markup(p.svg), "wide": p.wide} for p in document.pictures],  # noqa: S704
-        )
-    )
+    mark = "" if document.verdict is None else _MARKS[document.verdict[0]]
+    style = Markup(style_rules())  # noqa: S704 - our own constants
+    return printable(_environment().get_template("document.html").render(doc=shown(document), mark=mark, style=style))
 
 
 def document_pdf(document: Document) -> bytes:
     """The report as PDF (A4, tagged), set by typst with the fonts that it brings. No clock, no network: equal reports give equal bytes."""
     import typst
 
-    data: dict[str, Any] = shown(document) | {"pictures": [_picture(p) for p in document.pictures], "font": FONT}
+    data: dict[str, Any] = shown(document, standalone) | {"font": FONT}
     template = files("abbe.service.rendering").joinpath("templates", "document.typ").read_bytes()
     inputs = {"data": json.dumps(data, ensure_ascii=False)}
     made = typst.compile(template, format="pdf", ignore_system_fonts=True, sys_inputs=inputs)
     assert isinstance(made, bytes)  # one document, not one file for each page
     return made
-
-
-def _picture(picture: Picture) -> dict[str, Any]:
-    return {"caption": picture.caption, "svg": standalone(picture.svg), "wide": picture.wide}
 
 
 def standalone(svg: str) -> str:
@@ -60,4 +53,46 @@ def standalone(svg: str) -> str:
 @cache
 def _environment() -> Environment:
     loader = PackageLoader("abbe.service.rendering")
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    # The SVG writer has escaped every text; escaping again would show the reader the tags.
+    environment.filters["svg"] = Markup
+    return environment
+
+
+FORMS: dict[str, Callable[[Document], str | bytes]] = {
+    ".pdf": document_pdf,
+    ".html": document_html,
+    ".csv": document_csv,
+    ".json": document_json,
+}
+"""How a report is written, by the ending of its file."""
+
+
+def default_name(document: Document) -> str:
+    """File name of a report without one: its title in letters, digits and dashes."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", document.title).strip("-").lower()[:60] + ".pdf"
+
+
+def form_of(target: Path) -> Callable[[Document], str | bytes]:
+    """How a file of this name is written.
+
+    Raises
+    ------
+    FileFormatError
+        Its ending is none of ours.
+    """
+    try:
+        return FORMS[target.suffix.lower()]
+    except KeyError:
+        raise FileFormatError(f"{target}: a report is written as {', '.join(FORMS)}", "give a file with one of these endings") from None
+
+
+def write_document(document: Document, target: Path) -> None:
+    """Write a report whole or not at all; the file's ending says how.
+
+    Raises
+    ------
+    FileFormatError
+        Another ending, or the file cannot be written.
+    """
+    write_page(form_of(target)(document), target)

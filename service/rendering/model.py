@@ -1,33 +1,17 @@
-"""What a report says, as plain values. Lengths in µm, positions in mm; every ``u`` is a standard uncertainty (k = 1) in the row's unit."""
+"""What the pictures of a report draw, as plain values. Lengths in µm, positions in mm; every ``u`` is a standard uncertainty (k = 1)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = Sequence[float] | NDArray[np.float64]
-Source = Literal["measured", "sealed truth of the simulator"]
 
 SETUP_NOTE = "set-up"
 """Note of a parameter that belongs to the set-up (cup, bar, mirror) and not to the machine: the report folds these away."""
-
-
-@dataclass(frozen=True, slots=True)
-class SummaryRow:
-    """One figure before and after the correction. ``factor``: how many times smaller it became."""
-
-    name: str
-    unit: str
-    before: float | None
-    after: float | None
-    factor: float | None = None
-    u_before: float | None = None
-    u_after: float | None = None
-    source: Source = "measured"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,22 +25,9 @@ class ParameterRow:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class RunRow:
-    """One measured run: what it was for, how well the model explains it, how noisy the reading itself is."""
-
-    label: str
-    test: str
-    role: str
-    points: int
-    residual_rms_um: float | None
-    noise_um: float | None
-    outliers: int = 0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualSeries:
-    """Measured minus modelled along one run; ``x_label`` names the abscissa with its unit. ``label`` as in the run's row."""
+    """Measured minus modelled along one run; ``x_label`` names the abscissa with its unit. ``label`` as in the table of runs."""
 
     label: str
     x_label: str
@@ -101,32 +72,42 @@ class Contribution:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DemoReport:
-    """All that the report of one measure-correct-verify cycle says.
+class MotionCurve:
+    """One error motion over its stroke. ``value`` and ``u`` in ``unit`` (µm or µrad); ``status``: whether these runs show it by itself."""
 
-    ``accepted`` decides only the sign before the verdict: True, False, or None for "undecided".
-    """
+    name: str
+    axis: str
+    position_mm: NDArray[np.float64]
+    value: NDArray[np.float64]
+    u: NDArray[np.float64]
+    unit: str
+    status: str
 
-    title: str
-    machine: Mapping[str, object]
-    created_utc: str
-    seed: int | None
-    versions: Mapping[str, str]
-    verdict: str
-    accepted: bool | None = None
-    summary: Sequence[SummaryRow] = ()
-    parameters: Sequence[ParameterRow] = ()
-    not_observable: Sequence[str] = ()
-    runs: Sequence[RunRow] = ()
-    residuals: Sequence[ResidualSeries] = ()
-    tables: Sequence[TableCurve] = ()
-    table_lsb_um: float | None = None
-    arrows_before: ArrowField | None = None
-    arrows_after: ArrowField | None = None
-    diagonals_before: Mapping[str, tuple[Floats, Floats]] = field(default_factory=dict)
-    diagonals_after: Mapping[str, tuple[Floats, Floats]] = field(default_factory=dict)
-    polar: Sequence[PolarTrace] = ()
-    contributions: Sequence[Contribution] = ()
-    push_log: Sequence[str] = ()
-    warnings: Sequence[str] = ()
-    lang: str = "en"
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slice:
+    """Values over one plane of the volume: ``values`` in µm, shape (len(y), len(x)); ``at`` says where the plane is."""
+
+    x_axis: str
+    y_axis: str
+    at: str
+    x_mm: NDArray[np.float64]
+    y_mm: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionShare:
+    """One error motion: share of what is known of it that comes from the readings, 0 to 1, and its status in words."""
+
+    name: str
+    share: float
+    status: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlations:
+    """Correlation matrix of some parameters, shape (n, n)."""
+
+    names: Sequence[str]
+    matrix: NDArray[np.float64]

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 
 SERIES = 5
 SEQUENCE = 5
+BANDS = 8
+"""Colours for values of either sign: half of them below zero, half above."""
 
 LIGHT: Mapping[str, str] = {
     "page": "#ffffff",
@@ -29,6 +31,14 @@ LIGHT: Mapping[str, str] = {
     "seq3": "#5a4aa5",
     "seq4": "#7d2a80",
     "seq5": "#7a0c32",
+    "d1": "#123a6e",
+    "d2": "#2d6cab",
+    "d3": "#6ba2cf",
+    "d4": "#b9d5ea",
+    "d5": "#f7d3ae",
+    "d6": "#eba25a",
+    "d7": "#c96a1b",
+    "d8": "#833a00",
 }
 
 DARK: Mapping[str, str] = {
@@ -49,6 +59,14 @@ DARK: Mapping[str, str] = {
     "seq3": "#a3b0ee",
     "seq4": "#e2b2e6",
     "seq5": "#ffd3a6",
+    "d1": "#a9d6ff",
+    "d2": "#66aee6",
+    "d3": "#3a7bb0",
+    "d4": "#254c6b",
+    "d5": "#5e4227",
+    "d6": "#a06430",
+    "d7": "#dd9145",
+    "d8": "#ffcf96",
 }
 
 _PLOT_RULES = """
@@ -68,6 +86,8 @@ svg .key-head{fill:var(--ink);stroke:none}
 svg .dash{stroke-dasharray:7 4}
 svg .dots{stroke-dasharray:1 4}
 svg .ring-zero{fill:none;stroke:var(--frame);stroke-width:1.8}
+svg .level{fill:none;stroke:var(--ink);stroke-width:.8}
+svg .level-zero{fill:none;stroke:var(--ink);stroke-width:1.8}
 svg .t-halo{paint-order:stroke;stroke:var(--page);stroke-width:3}
 """
 
@@ -75,8 +95,10 @@ svg .t-halo{paint-order:stroke;stroke:var(--page);stroke-width:3}
 def _role_rules() -> str:
     names = [f"c{i}" for i in range(1, SERIES + 1)] + [f"seq{i}" for i in range(1, SEQUENCE + 1)]
     lines = (f"svg .s-{name}{{fill:none;stroke:var(--{name});stroke-width:1.6;stroke-linejoin:round}}" for name in names)
-    rows = (*lines, *(f"svg .f-{name}{{fill:var(--{name});stroke:none}}" for name in names))
-    return "\n".join(rows) + "\nsvg .thin{stroke-width:1}\n"
+    signed = [f"d{i}" for i in range(1, BANDS + 1)]
+    rows = (*lines, *(f"svg .f-{name}{{fill:var(--{name});stroke:none}}" for name in (*names, *signed)))
+    facet = "svg .facet{stroke:var(--page);stroke-width:.35;stroke-linejoin:round}"
+    return "\n".join(rows) + f"\n{facet}\nsvg .thin{{stroke-width:1}}\n"
 
 
 def _variables(values: Mapping[str, str]) -> str:

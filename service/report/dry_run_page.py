@@ -1,11 +1,11 @@
-"""The picture of a dry run: from a plan to a page."""
+"""A dry run as a document: paths in three views, and what each test takes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
-from abbe.service.rendering.dry_page import DryPage, render_dry
+from abbe.service.rendering.document import Document, Picture, Section, TextTable
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.rendering.plots.views import DrawnTest, three_views
 from abbe.service.sequences.check import DryRun
@@ -19,8 +19,8 @@ NAMES = {
 }
 
 
-def dry_page(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> str:
-    """The page of a checked plan: paths in three views with strokes, set-ups, bars and cups, and a row for each test."""
+def dry_run_report(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> Document:
+    """A checked plan: paths in three views with strokes, set-ups, bars and cups, and a row for each test."""
     seconds, readings = sum(r.duration_s for r in runs), sum(r.readings for r in runs)
     used = [f"{AXES[a]} {min(r.lowest_mm[a] for r in runs):.0f} to {max(r.highest_mm[a] for r in runs):.0f} mm" for a in range(3)]
     mounted = sum(t.mounts for t in plan.tests)
@@ -30,7 +30,14 @@ def dry_page(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[DryRun
     )
     headings = ("No", "Test", "Set-up", "Kind", "s", "path mm", "X mm", "Y mm", "Z mm", "mm/min", "readings")
     rows = tuple(_row(k, test, run) for k, (test, run) in enumerate(zip(plan.tests, runs, strict=True), start=1))
-    return render_dry(DryPage(f"Dry run: {plan.name}", lead, headings, rows, picture(machine, plan)))
+    caption = (
+        "Numbers: tests that begin a set-up, in the order of measuring. Rest the pointer on a dot to read what is set up there. "
+        "Nothing has moved."
+    )
+    drawn = Picture(caption, [picture(machine, plan)], "wide")
+    note = "Machine time without the minutes that a person needs for mounting."
+    sections = (Section("Paths", [*lead, drawn]), Section("Tests in order", [TextTable(headings, rows), note]))
+    return Document(kind="dry-run", title=f"Dry run: {plan.name}", sections=sections, signatures=())
 
 
 def picture(machine: Machine, plan: CampaignPlan, unit: Unit = MM) -> str:

@@ -1,34 +1,24 @@
-"""One report of anything that is stored, or of a campaign folder: which one is meant, and in which form it is written."""
+"""One report of anything that is stored, of a campaign folder, or of a solution just made: which one is meant."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.measured import CampaignRecord, RunRecord
-from abbe.service.errors import FileFormatError, NotStored, StoreError
+from abbe.service.errors import NotStored, StoreError
 from abbe.service.rendering.document import Document
-from abbe.service.rendering.document_data import document_csv, document_json
-from abbe.service.rendering.document_page import document_html, document_pdf
-from abbe.service.rendering.page_file import write_page
 from abbe.service.report.report_discovery import discovery_report
 from abbe.service.report.report_done import push_report, verification_report
-from abbe.service.report.report_measured import Measured, campaign_report, run_report
+from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report, run_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.report.report_table import table_said
 from abbe.service.report.report_then import of_then
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store
 
-FORMS: dict[str, Callable[[Document], str | bytes]] = {
-    ".pdf": document_pdf,
-    ".html": document_html,
-    ".csv": document_csv,
-    ".json": document_json,
-}
 NUMBERED = ("push", "discovery", "verification")
 
 
@@ -68,8 +58,7 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
 def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules) -> Document:
     """Report of a stored run or campaign."""
     if isinstance(record, CampaignRecord):
-        found = _measured(store, record.name)
-        return of_then(campaign_report(found, rules), store, found.campaign.site.name, record.created_utc, found.campaign.runs)
+        return _of_then(store, _measured(store, record.name), record.created_utc, rules)
     campaign = from_store(store, record.campaign)
     if all(r["run_id"] != record.label for r in campaign.runs):  # incomplete: what is there is reported and said to be so
         campaign = Campaign(campaign.name, campaign.site, [*campaign.runs, load_run(store, record.id)], None, campaign.doc)
@@ -78,6 +67,32 @@ def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules
     table = table_said(store, campaign.site.name, runs)
     document = run_report(Measured(campaign, facts, [_state(record)], table=table), record.label, rules)
     return of_then(document, store, campaign.site.name, record.started_utc, runs)
+
+
+def solution_report(store: Store | None, campaign: Campaign, solution: SolutionResult, made_utc: str, rules: Rules) -> Document:
+    """Report of a campaign with the solution just made of it, and everything that is drawn of it.
+
+    Parameters
+    ----------
+    store : Store or None
+        Where the campaign is stored; its unfinished runs and its table are told then.
+    campaign : Campaign
+        The runs that were solved.
+    made_utc : str
+        When it was solved.
+    """
+    solved = {"Solved": made_utc}
+    if store is None or campaign.folder is not None:
+        return campaign_report(Measured(campaign, solved, solution=solution), rules)
+    found = _measured(store, campaign.name)
+    left_out = {r["run_id"] for r in found.campaign.runs} - {r["run_id"] for r in campaign.runs}
+    states = [s for s in found.states if s[0] not in left_out]
+    found = replace(found, campaign=campaign, facts=found.facts | solved, states=states, solution=solution)
+    return _of_then(store, found, store.campaign(campaign.name).created_utc, rules)
+
+
+def _of_then(store: Store, found: Measured, created_utc: str, rules: Rules) -> Document:
+    return of_then(campaign_report(found, rules), store, found.campaign.site.name, created_utc, found.campaign.runs)
 
 
 def folder_report(folder: Path, rules: Rules) -> Document:
@@ -92,7 +107,7 @@ def _measured(store: Store, name: str) -> Measured:
     if runs:
         ends = [r.ended_utc for r in runs if r.ended_utc]
         facts |= {"First run started": min(r.started_utc for r in runs)} | ({"Last run ended": max(ends)} if ends else {})
-    solution = next(((s.id, s.doc) for s in reversed(store.solutions(record.id)) if "mean_over_volume" in s.doc), None)
+    solution = next((SolutionResult(s.doc, s.id) for s in reversed(store.solutions(record.id)) if "mean_over_volume" in s.doc), None)
     campaign = from_store(store, name)
     table = table_said(store, campaign.site.name, campaign.runs)
     return Measured(campaign, facts, [_state(r) for r in runs], solution, table)
@@ -100,33 +115,3 @@ def _measured(store: Store, name: str) -> Measured:
 
 def _state(run: RunRecord) -> tuple[str, ...]:
     return run.label, run.test, run.role, run.visible_status, run.reason
-
-
-def default_name(document: Document) -> str:
-    """File name of a report that nobody has named: its title in letters, digits and dashes."""
-    return re.sub(r"[^A-Za-z0-9]+", "-", document.title).strip("-").lower()[:60] + ".pdf"
-
-
-def form_of(target: Path) -> Callable[[Document], str | bytes]:
-    """How a file of this name is written.
-
-    Raises
-    ------
-    FileFormatError
-        Its ending is none of ours.
-    """
-    try:
-        return FORMS[target.suffix.lower()]
-    except KeyError:
-        raise FileFormatError(f"{target}: a report is written as {', '.join(FORMS)}", "give a file with one of these endings") from None
-
-
-def write_report(document: Document, target: Path) -> None:
-    """Write a report whole or not at all; the file's ending says how.
-
-    Raises
-    ------
-    FileFormatError
-        Another ending, or the file cannot be written.
-    """
-    write_page(form_of(target)(document), target)

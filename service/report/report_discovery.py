@@ -11,14 +11,16 @@ from abbe.service.discovery.discovery_words import book_lines, rival_lines, unit
 from abbe.service.effects.model_book import name_of
 from abbe.service.errors import StoreError
 from abbe.service.rendering.discovery_model import DiscoveryPage
-from abbe.service.rendering.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
 from abbe.service.rendering.numbers import NOT_AVAILABLE, plain
 from abbe.service.rendering.plots.gap import gap_bars, place_plot, trace_plot
 from abbe.service.report import report_parts as parts
+from abbe.service.report.blocks import picture_section
 from abbe.service.report.discovery_pages import discovery_page
 from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 
+DECIDED = "How it was decided"
 SIGNS: dict[str, Sign] = {"ok": "ok", "open": "open", "bad": "bad"}
 
 
@@ -58,8 +60,7 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
         remarks=[*told["flags"], *book_lines(finding), *remarks],
         statements=["U of a named effect is that of its refit together with everything else that these runs leave free."],
         provenance=parts.provenance(parts.data_digest(campaign.runs), made) | {"Search (SHA-256)": record.digest},
-        tables=_tables(page),
-        pictures=_pictures(page),
+        appendix=[*picture_section(_pictures(page)), *_tables(page)],
     )
 
 
@@ -83,25 +84,29 @@ def _open(finding: dict[str, Any], page: DiscoveryPage) -> list[str]:
     return out + list(page.next_test)
 
 
-def _tables(page: DiscoveryPage) -> list[TextTable]:
+def _tables(page: DiscoveryPage) -> list[Section]:
     runs = [(r.label, r.test, r.role, str(r.readings), plain(r.before_um), plain(r.after_um), plain(r.floor_um)) for r in page.runs]
-    out = [TextTable("Runs", ("Run", "Test", "Role", "Readings", "Before, µm", "After, µm", "Noise, µm"), runs)]
-    out.append(TextTable("How it was decided", ("State", "Why"), page.states))
+    out = [Section("Runs", [TextTable(("Run", "Test", "Role", "Readings", "Before, µm", "After, µm", "Noise, µm"), runs)])]
+    out.append(Section(DECIDED, [TextTable(("State", "Why"), page.states)]))
     if page.changed:
-        out.append(TextTable("What has changed", ("Compared with the solution from before",), [(line.strip(),) for line in page.changed]))
+        out.append(
+            Section(
+                "What has changed", [TextTable(("Compared with the solution from before",), [(line.strip(),) for line in page.changed])]
+            )
+        )
     if page.effects:
         cards = [(c.name, c.where or NOT_AVAILABLE, c.do) for c in page.effects]
-        out.append(TextTable("What to do", ("Effect", "Where", "What to do at the machine"), cards))
+        out.append(Section("What to do", [TextTable(("Effect", "Where", "What to do at the machine"), cards)]))
     if page.rejected:
-        out.append(TextTable("Looked at and rejected", ("Effect", "Why"), page.rejected))
+        out.append(Section("Looked at and rejected", [TextTable(("Effect", "Why"), page.rejected)]))
     return out
 
 
 def _pictures(page: DiscoveryPage) -> list[Picture]:
-    out = [Picture("Gap of every run before and after, against its noise.", gap_bars(page.runs), wide=True)] if page.runs else []
+    out = [Picture("Gap of every run before and after, against its noise.", [gap_bars(page.runs)], "wide")] if page.runs else []
     for i, t in enumerate(page.traces):
-        out.append(Picture(f"Run {t.label} against {t.x_label}: {t.why}.", trace_plot(t, key=f"trace-{i}"), wide=True))
+        out.append(Picture(f"Run {t.label} against {t.x_label}: {t.why}.", [trace_plot(t, key=f"trace-{i}")], "wide"))
     for i, p in enumerate(page.places):
         words = f"Where the gap lives, {p.x_axis}{p.y_axis}: rms over the noise."
-        out.append(Picture(words, place_plot(p, key=f"place-{i}")))
+        out.append(Picture(words, [place_plot(p, key=f"place-{i}")]))
     return out

@@ -15,10 +15,11 @@ from abbe.service.errors import NotStored, TableMismatch
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import WORD, JournalBroken, JournalEntry, check_chain, facts
 from abbe.service.push.states import TERMINAL, PushState
-from abbe.service.rendering.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
 from abbe.service.report import report_parts as parts
+from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_parts import Doc, Rules
 from abbe.service.report.report_table import table_said
 from abbe.service.report.report_then import of_then
@@ -77,7 +78,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
         remarks=[*table.remarks, *told.remarks, *remarks],
         statements=[parts.VERIFICATION_STATEMENT, *told.statements],
         provenance=parts.provenance(parts.data_digest(runs) if runs else parts.doc_digest(record.doc)),
-        pictures=told.pictures,
+        appendix=picture_section(told.pictures),
     )
     return of_then(document, store, machine.name, str(record.doc.get("started_utc") or record.utc), runs)
 
@@ -128,6 +129,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     runs = [r for c in campaigns for r in c.runs]
     condition, remarks = parts.conditions(runs, rules) if runs else ({}, [])
     tables = _tables(str(known.get("image", "")))
+    lines = [(str(e.seq), line) for e, line in zip(journal, push_log(journal), strict=True)]
     document = Document(
         kind="push",
         title=f"Push {number} into {machine}",
@@ -143,14 +145,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
         ],
         provenance=parts.provenance(parts.doc_digest([e.digest for e in journal]))
         | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": str(known.get("meaning", ""))},
-        tables=[
-            TextTable(
-                "Journal", ("Entry", "What happened"), [(str(e.seq), line) for e, line in zip(journal, push_log(journal), strict=True)]
-            )
-        ],
-        pictures=[]
-        if tables is None
-        else [Picture("The new table: what is added to the command.", table_plot(_curves(tables)), wide=True)],
+        appendix=[*_drawn(tables), Section("Journal", [TextTable(("Entry", "What happened"), lines)])],
     )
     return of_then(document, store, machine, journal[-1].utc, []) if journal[-1].state is PushState.KEEP else document
 
@@ -200,6 +195,12 @@ def _tables(image: str) -> NineTables | None:
         return tables_from_image(bytes.fromhex(image)) if image else None
     except (TableMismatch, ValueError):
         return None
+
+
+def _drawn(tables: NineTables | None) -> list[Section]:
+    if tables is None:
+        return []
+    return picture_section([Picture("The new table: what is added to the command.", [table_plot(_curves(tables))], "wide")])
 
 
 def _curves(tables: NineTables) -> list[TableCurve]:

@@ -13,15 +13,18 @@ from abbe.models.solvers.observations import nominal_reading
 from abbe.models.verification import helix_figure
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import AbbeError, MeasurementFault
-from abbe.service.rendering.document import Document, Figure, Picture, Sign, TextTable
+from abbe.service.identification.solve_report import HIDDEN_NOTE, Account
+from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
 from abbe.service.rendering.model import ParameterRow, PolarTrace, ResidualSeries
 from abbe.service.rendering.numbers import plain
 from abbe.service.rendering.plots.bars import uncertainty_bars
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.rendering.plots.residuals import residual_plot
 from abbe.service.report import report_parts as parts
+from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_parts import Doc, Rules
 from abbe.service.report.report_table import NOTHING_SAID, TableSaid
+from abbe.service.report.solution_sections import residual_sections, solution_sections
 from abbe.service.runs.coverage import not_judged
 from abbe.service.runs.helix_axis import about_axis, path_axis
 from abbe.service.runs.observations import run_data
@@ -33,18 +36,31 @@ NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine
 
 
 @dataclass(frozen=True)
+class SolutionResult:
+    """A solution's document. ``number``: of the stored one; ``account``: of one that was solved just now, with all that is drawn of it."""
+
+    doc: Doc
+    number: int | None = None
+    account: Account | None = None
+
+    @property
+    def name(self) -> str:
+        """As the report calls it."""
+        return "solution" if self.number is None else f"solution {self.number}"
+
+
+@dataclass(frozen=True)
 class Measured:
     """What a report of a measurement is made of.
 
-    ``runs``: ``abbe-run/1`` objects that are complete; ``facts``: further lines for the head; ``states``: run, test, role, state, why and
-    when of every run, also of incomplete ones; ``solution``: latest stored solution and its number; ``table``: what is
-    known of the tables in force.
+    ``facts``: further lines for the head; ``states``: run, test, role, state and why of every run, also of incomplete ones;
+    ``solution``: the one just made, or the latest stored one; ``table``: what is known of the tables in force.
     """
 
     campaign: Campaign
     facts: dict[str, str] = field(default_factory=dict)
     states: Sequence[Sequence[str]] = ()
-    solution: tuple[int, Doc] | None = None
+    solution: SolutionResult | None = None
     table: TableSaid = NOTHING_SAID
 
 
@@ -67,9 +83,14 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
         not_observable=[*solved.not_observable, *told.not_observable],
         remarks=remarks,
         statements=[*solved.statements, *([parts.VERIFICATION_STATEMENT] if checked else []), *told.statements],
-        provenance=parts.provenance(parts.data_digest(campaign.runs), _made(found.solution)),
-        tables=[_run_table(found), *_budget(found.solution)],
-        pictures=[*solved.pictures, *told.pictures],
+        provenance=parts.provenance(parts.data_digest(campaign.runs), _made(found.solution)) | _same_as(found.solution),
+        sections=_sections(found.solution),
+        appendix=[
+            *picture_section([*solved.pictures, *told.pictures]),
+            *_residuals(found.solution),
+            *_budget(found.solution),
+            Section("Runs", [_run_table(found)]),
+        ],
     )
 
 
@@ -92,8 +113,10 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
         remarks=[*found.table.remarks, *_unfinished(found.states, [run]), *told.remarks, *remarks],
         statements=told.statements,
         provenance=parts.provenance(parts.data_digest([run])),
-        tables=[TextTable("Set-up", ("Name", "Value"), setup)],
-        pictures=[*told.pictures, *own.pictures],
+        appendix=[
+            *picture_section([*told.pictures, *own.pictures]),
+            Section("Set-up", [TextTable(("Name", "Value"), setup)]),
+        ],
     )
 
 
@@ -109,54 +132,81 @@ def _verification(runs: Sequence[Doc], rules: Rules) -> tuple[list[Figure], Verd
         return [], None
 
 
-def _solution(stored: tuple[int, Doc] | None) -> Evaluated:
-    if stored is None:
+def _solution(solution: SolutionResult | None) -> Evaluated:
+    if solution is None:
         return Evaluated(not_observable=["error motions of the machine: this campaign has no stored solution (abbe solve)"])
-    number, doc = stored
-    group = f"Linear errors, mean over the volume (solution {number}, {doc['model']})"
-    rows = []
-    for name, p in doc["mean_over_volume"].items():
-        scale = name[0] == "E"
-        rows.append(ParameterRow(name, p["value"] * 1e6, p["u"] * 1e6, "µm/m" if scale else "µrad"))
-    words = {"µm/m": "scale error", "µrad": "squareness"}
+    doc = solution.doc
     known = doc["uncertainty"]
     worst = known["worst_point"]
     place = ", ".join(f"{v:.0f}" for v in worst["at_mm"])
     size = float(np.linalg.norm(worst["deviation_um"]))
     note = str(doc["mean_over_volume_note"])
+    name = solution.name[:1].upper() + solution.name[1:]
     statement = (
-        f"Solution {number}: {known['frame']}. At the worst known point ({place}) mm the deviation is {plain(size)} µm, and its 95 % "
+        f"{name}: {known['frame']}. At the worst known point ({place}) mm the deviation is {plain(size)} µm, and its 95 % "
         f"region reaches {plain(worst['expanded_vector_um'])} µm. {note[:1].upper()}{note[1:]}."
     )
+    figures = _parameters(doc, f"Linear errors, mean over the volume ({solution.name}, {doc['model']})")
+    rows = [ParameterRow(f.symbol, f.value, f.u, f.unit) for f in figures]
+    drawn = solution.account is None  # else they stand in the section of the parameters
     return Evaluated(
-        figures=[Figure(group, r.name, words[r.unit], r.value, r.u, r.unit, "joint solution") for r in rows],
-        pictures=[Picture(f"Solution {number}: linear errors with U.", svg) for svg in uncertainty_bars(rows)],
+        figures=figures,
+        pictures=[Picture(f"{name}: linear errors with U.", [svg]) for svg in uncertainty_bars(rows)] if drawn else [],
         remarks=[*doc["flags"]],
         not_observable=[*doc["not_observable"]],
         statements=[statement],
     )
 
 
-def _solution_verdict(stored: tuple[int, Doc] | None) -> tuple[Sign, str, str]:
-    if stored is None:
+def _parameters(doc: Doc, group: str) -> list[Figure]:
+    """Scales, squareness and lost motion; one that the runs do not show by itself says so."""
+    figures = []
+    for name, p in doc["mean_over_volume"].items():
+        words, unit = ("scale error", "µm/m") if name[0] == "E" else ("squareness", "µrad")
+        status = doc.get("motions", {}).get(name, {}).get("status")
+        hidden = f"; {HIDDEN_NOTE}" if status == "not observable" else ""
+        figures.append(Figure(group, name, words + hidden, p["value"] * 1e6, p["u"] * 1e6, unit, "joint solution"))
+    for name, p in doc.get("parameters", {}).items():
+        if name.startswith("backlash_"):
+            words = "lost motion, not compensated"
+            figures.append(Figure(group, name.replace("_", " "), words, p["value"] * 1e3, p["u"] * 1e3, "µm", "joint solution"))
+    return figures
+
+
+def _solution_verdict(solution: SolutionResult | None) -> tuple[Sign, str, str]:
+    if solution is None:
         return "open", "Not judged", NOT_JUDGED
-    told = stored[1]["verdict"]
+    told = solution.doc["verdict"]
     word = str(told["word"])
     return SOLUTION_SIGNS[word], word[:1].upper() + word[1:], str(told["text"])
 
 
-def _made(stored: tuple[int, Doc] | None) -> dict[str, str] | None:
-    if stored is None:
+def _made(solution: SolutionResult | None) -> dict[str, str] | None:
+    if solution is None:
         return None
-    number, doc = stored
-    return {str(k): str(v) for k, v in doc["versions"].items()} | {"solution": f"{number}, inputs SHA-256 {doc['inputs']['digest']}"}
+    doc, number = solution.doc, "" if solution.number is None else f"{solution.number}, "
+    return {str(k): str(v) for k, v in doc["versions"].items()} | {"solution": f"{number}inputs SHA-256 {doc['inputs']['digest']}"}
 
 
-def _budget(stored: tuple[int, Doc] | None) -> list[TextTable]:
-    if stored is None:
+def _same_as(solution: SolutionResult | None) -> dict[str, str]:
+    same = [] if solution is None else solution.doc.get("same_as") or []
+    return {"Same readings and model as": f"solution {', '.join(map(str, same))}"} if same else {}
+
+
+def _sections(solution: SolutionResult | None) -> list[Section]:
+    return [] if solution is None or solution.account is None else solution_sections(solution.account, solution.doc)
+
+
+def _residuals(solution: SolutionResult | None) -> list[Section]:
+    return [] if solution is None or solution.account is None else residual_sections(solution.account)
+
+
+def _budget(solution: SolutionResult | None) -> list[Section]:
+    if solution is None:
         return []
-    rows = [(b["words"], plain(b["u_um"], 2), f"{b['share']:.0%}") for b in stored[1]["uncertainty"]["budget"]]
-    return [TextTable("Uncertainty budget of the predicted deviation, rms over the volume", ("Source", "u in µm", "Share"), rows)]
+    rows = [(b["words"], plain(b["u_um"], 2), f"{b['share']:.0%}") for b in solution.doc["uncertainty"]["budget"]]
+    title = "Uncertainty budget of the predicted deviation, rms over the volume"
+    return [Section(title, [TextTable(("Source", "u in µm", "Share"), rows)])]
 
 
 def _run_table(found: Measured) -> TextTable:
@@ -168,7 +218,7 @@ def _run_table(found: Measured) -> TextTable:
         run = whole.get(label)
         readings = "" if run is None else str(len(run["columns"]["t_s"]))
         rows.append((label, test, role, state, readings, "" if run is None else parts.data_digest([run])[:16]))
-    return TextTable("Runs", head, rows)
+    return TextTable(head, rows)
 
 
 def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[str]:
@@ -201,7 +251,7 @@ def _own(run: Doc) -> Evaluated:
     rows = [Figure(group, "n", f"valid readings of {len(run['columns']['t_s'])}", float(valid), None, "", "count")]
     series = ResidualSeries(data.label, "time of the campaign in s", data.t_s, above)
     pictures = [
-        Picture(f"Run {data.label}: deviation against time, as read.", residual_plot(series, noise_um=None, key="readings"), wide=True)
+        Picture(f"Run {data.label}: deviation against time, as read.", [residual_plot(series, noise_um=None, key="readings")], "wide")
     ]
     if why := not_judged(run):
         return Evaluated(figures=rows, pictures=pictures, not_observable=[f"any figure of the whole path: {why}"])
@@ -228,7 +278,7 @@ def _own(run: Doc) -> Evaluated:
             return Evaluated(figures=rows, pictures=pictures, not_observable=[f"its picture: {error.detail}"])
         angle = np.degrees(about_axis(data.axes_mm - np.asarray(data.centre_mm), axis))
         words = f"Deviation of the helix around its axis ({AXES[axis]}), centre and length of the bar fitted away."
-        pictures.append(Picture(words, polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")))
+        pictures.append(Picture(words, [polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")]))
     return Evaluated(figures=rows, pictures=pictures)
 
 

@@ -27,7 +27,7 @@ def of_then(document: Document, store: Store, machine: str, begun_utc: str, runs
         ``abbe-run/1`` objects that it rests on; empty: only the time counts.
     """
     known = verified_by(store, machine)
-    if _same(known, begun_utc, runs):
+    if document.verdict is None or _same(known, begun_utc, runs):
         return document
     sign, word, text = document.verdict
     now = known.text[:1].upper() + known.text[1:]

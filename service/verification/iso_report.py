@@ -126,7 +126,7 @@ def _positioning(label: str, x_label: str, p: Positioning) -> Picture:
     words = ", ".join(f"{n} {plain(v.value_mm * UM)} µm" for n, v in (("E", p.E), ("B", p.B), ("R", p.R), ("A", p.A)) if v is not None)
     bars = "; bars are two standard deviations to both sides" if p.s_forward_mm is not None else ""
     caption = f"{label}: mean deviation of both directions{bars}. {words}."
-    return Picture(caption, positioning_plot(curves, key=f"positioning-{label}", figures=words), wide=True)
+    return Picture(caption, [positioning_plot(curves, key=f"positioning-{label}", figures=words)], "wide")
 
 
 def _diagonals(out: Evaluated, where: str, tests: list[AxisTest], budget: ScaleBudget) -> None:
@@ -161,7 +161,7 @@ def _circles(out: Evaluated, tests: list[CircleTest]) -> None:
             out.not_observable.append(f"G(b) and H of plane {plane}, set-up {setup}: the circle was driven in one sense only")
         traces = [_trace(t) for t in same]
         caption = f"Plane {plane}, set-up {setup}: radial deviation about the least squares centre."
-        out.pictures.append(Picture(caption, polar_plot(traces, key=f"polar-{plane}-{setup}", heading=f"Circle {plane}")))
+        out.pictures.append(Picture(caption, [polar_plot(traces, key=f"polar-{plane}-{setup}", heading=f"Circle {plane}")]))
 
 
 def _sense(test: CircleTest) -> str:

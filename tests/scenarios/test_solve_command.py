@@ -77,7 +77,7 @@ def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(abbe, folder, t
     for words in (
         "Error motions",
         "Uncertainty in the volume",
-        "What these runs cannot tell",
+        "What this measurement could not show",
         "sensor noise of the laser",
         "SHA-256",
         *pictures,

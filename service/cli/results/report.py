@@ -43,18 +43,19 @@ def report(
     the same data give the same bytes.
     """
     from abbe.service.config import load_machine
-    from abbe.service.report.report import default_name, form_of, rules_of, write_report
+    from abbe.service.rendering.document_page import default_name, form_of, write_document
+    from abbe.service.report.report import rules_of
 
     for target in out or []:
-        form_of(target)  # before the work: a wrong ending is told at once
+        form_of(target)  # before the work
     rules = rules_of(None if machine is None else load_machine(machine).machine)
     # Both may be given: the machine file for its limits, and a database elsewhere (an archive, a fleet's).
     url = database_url(db, machine if db is None else None)
     document = _document(what, number, of, url, rules)
     for target in out or [Path(default_name(document))]:
-        write_report(document, target)
+        write_document(document, target)
         typer.echo(f"report: {target}")
-    _, word, text = document.verdict
+    _, word, text = document.verdict or ("", "", "")
     typer.echo(f"{document.title}: {word}. {text}".strip())
 
 

@@ -53,7 +53,10 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
-    report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
+    ] = None,
     tables: Annotated[bool, typer.Option("--tables", help="Also say what each kind of table could reach.")] = False,
     grid: Annotated[
         Path | None, typer.Option("--grid", metavar="FILE.csv", help="Also write the 3-D grid of corrections.", show_default=False)
@@ -70,14 +73,20 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, keep
     from abbe.service.identification.effect_removal import taken_out
     from abbe.service.identification.table_removal import table_then
+    from abbe.service.rendering.document_page import form_of
 
+    if report is not None:
+        form_of(report)  # before the work
     wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
-        told, doc = _solved(found.without(without or []), wanted)
+        chosen = found.without(without or [])
+        told, doc = _solved(chosen, wanted)
         if db is not None or machine is not None:
             with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: what is refused leaves no database
                 doc |= keep(store, found, doc)
+        if report is not None:
+            _write_report(None, chosen, told, doc, machine, report)
     else:
         with stored_campaign(campaign, database_url(db, machine)) as (store, found):
             chosen = found.without(without or [])
@@ -85,8 +94,8 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
             told, doc = _solved(known.campaign, wanted)
             doc |= known.doc
             doc |= keep(store, found, doc)
-    if report is not None:
-        _write_report(told, doc, found, report)
+            if report is not None:
+                _write_report(store, chosen, told, doc, machine, report)
     if as_json:
         print_json(doc)
         return
@@ -165,14 +174,16 @@ def _more(told: Account, wanted: _SolveRequest, say: Callable[[str], None]) -> d
     return out
 
 
-def _write_report(told: Account, doc: dict[str, Any], campaign: Campaign, target: Path) -> None:
+def _write_report(store: Store | None, campaign: Campaign, told: Account, doc: dict[str, Any], machine: Path | None, target: Path) -> None:
     from abbe.service.clock import SystemClock
-    from abbe.service.rendering.page_file import write_page
-    from abbe.service.rendering.solution_page import render_solution
-    from abbe.service.report.solve_pages import solution_page
+    from abbe.service.config import load_machine
+    from abbe.service.rendering.document_page import write_document
+    from abbe.service.report.report import rules_of, solution_report
+    from abbe.service.report.report_measured import SolutionResult
 
+    rules = rules_of(None if machine is None else load_machine(machine).machine)
     made = SystemClock().utc().isoformat(timespec="seconds")
-    write_page(render_solution(solution_page(told, doc, campaign.site, made)), target)
+    write_document(solution_report(store, campaign, SolutionResult(doc, doc.get("solution_id"), told), made, rules), target)
 
 
 def _print(told: Account, doc: dict[str, Any]) -> None:

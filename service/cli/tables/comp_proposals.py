@@ -120,17 +120,19 @@ def diff(
     as_json: JsonOption = False,
 ) -> None:
     """What a proposal changes: each of the nine tables in numbers, and as a picture."""
-    from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_html, largest, rows
+    from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_report, largest, rows
     from abbe.service.compensation.proposal_doc import load
     from abbe.service.queries.proposals import difference_of
     from abbe.service.queries.reader import json_value
-    from abbe.service.rendering.page_file import write_page
+    from abbe.service.rendering.document_page import form_of, write_document
 
+    if html is not None:
+        form_of(html)  # before the work
     with open_store(database_url(db, machine)) as store:
         found = compare(store, proposal, other)
         proposed = load(store, proposal)
     if html is not None:
-        write_page(diff_html(found, proposed), html)
+        write_document(diff_report(found, proposed), html)
     if as_json:
         print_json(json_value(difference_of(found)))
         return

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from abbe.service.rendering.axes import Panel, data_range
+from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.numbers import COVERAGE, plain
-from abbe.service.rendering.solution_model import MotionCurve
 from abbe.service.rendering.svg import Svg
 
 WIDTH, CELL_HEIGHT = 1010.0, 132.0

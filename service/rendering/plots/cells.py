@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from abbe.service.rendering.axes import Panel, round_up
+from abbe.service.rendering.model import Correlations, Slice
 from abbe.service.rendering.numbers import plain, tidy
 from abbe.service.rendering.palette import SEQUENCE
 from abbe.service.rendering.plots.signed import SignedScale
-from abbe.service.rendering.solution_model import Correlations, Slice
 from abbe.service.rendering.svg import Svg
 
 WIDTH, HEIGHT = 500.0, 420.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from abbe.service.rendering.axes import Panel
+from abbe.service.rendering.model import MotionShare, Slice
 from abbe.service.rendering.numbers import plain
 from abbe.service.rendering.plots.contours import contour_plot
 from abbe.service.rendering.plots.facets import Surface
 from abbe.service.rendering.plots.signed import SignedScale
-from abbe.service.rendering.solution_model import MotionShare, Slice
 from abbe.service.rendering.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM = 500.0, 20.0, 54.0, 50.0

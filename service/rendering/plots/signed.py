@@ -1,6 +1,6 @@
 """Colours for values of either sign: eight bands with edges at -4 .. +4 steps, blue below zero, orange above.
 
-Roles ``d1`` (far below zero) to ``d8`` (far above) get their colour from `signed_rules`, which a page with such pictures adds to its style.
+Roles ``d1`` (far below zero) to ``d8`` (far above) have their colours in `abbe.service.rendering.palette`.
 """
 
 from __future__ import annotations
@@ -12,27 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.service.rendering.axes import round_up, tick_text
+from abbe.service.rendering.palette import BANDS
 from abbe.service.rendering.svg import XY, Svg
 
-BANDS = 8
 HALF = BANDS // 2
-_LIGHT = ("#123a6e", "#2d6cab", "#6ba2cf", "#b9d5ea", "#f7d3ae", "#eba25a", "#c96a1b", "#833a00")
-_DARK = ("#a9d6ff", "#66aee6", "#3a7bb0", "#254c6b", "#5e4227", "#a06430", "#dd9145", "#ffcf96")
-
-
-def signed_rules() -> str:
-    """CSS of the roles ``f-d1`` .. ``f-d8``: light by default and in print, dark where the reader's system asks for it."""
-
-    def colours(values: tuple[str, ...]) -> str:
-        return "".join(f"--d{i}:{v};" for i, v in enumerate(values, 1))
-
-    rules = "\n".join(
-        f"svg .f-d{i}{{fill:var(--d{i});stroke:none}}\nsvg .facet.f-d{i}{{stroke:var(--page);stroke-width:.35;stroke-linejoin:round}}"
-        for i in range(1, BANDS + 1)
-    )
-    dark = f"@media screen and (prefers-color-scheme:dark){{:root{{{colours(_DARK)}}}}}"
-    lines = "svg .level{fill:none;stroke:var(--ink);stroke-width:.8}\nsvg .level-zero{fill:none;stroke:var(--ink);stroke-width:1.8}"
-    return f":root{{{colours(_LIGHT)}}}\n{dark}\n{rules}\n{lines}\n"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,8 @@ from fastapi.responses import Response
 from abbe.service.errors import NotStored
 from abbe.service.queries.reader import as_stored, storable
 from abbe.service.rendering.document import Document
-from abbe.service.report.report import FORMS, default_name, numbered_report, stored_report
+from abbe.service.rendering.document_page import FORMS, default_name
+from abbe.service.report.report import numbered_report, stored_report
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Number, Sources
 from abbe.service.web.login.access import needs

@@ -22,7 +22,7 @@ from abbe.service.rendering.document import Document, Sign
 from abbe.service.rendering.model import Contribution
 from abbe.service.rendering.numbers import plain, with_uncertainty
 from abbe.service.rendering.plots.bars import contribution_bars
-from abbe.service.report.report_discovery import discovery_report
+from abbe.service.report.report_discovery import DECIDED, discovery_report
 from abbe.service.report.report_measured import SOLUTION_SIGNS
 from abbe.service.report.report_parts import Rules
 from abbe.service.site import machine_from_doc
@@ -194,11 +194,10 @@ def _ranked(doc: dict[str, Any], machine: dict[str, Any]) -> list[Ranked]:
 def discovery_screen(reader: Reader, number: int, rules: Rules) -> DiscoveryScreen:
     """A search as it was stored; nothing is searched again. Raises NotStored."""
     found = discovery(reader, number)
-    states = [(one.state, one.why) for one in found.states]
     try:
         told = discovery_report(reader.store, number, rules)
         # The states stand above with their times: the report's table of them would only say it again.
-        tables = [t for t in told.tables if [tuple(row) for row in t.rows] != states]
-        return DiscoveryScreen(found, replace(told, tables=tables))
+        appendix = [s for s in told.appendix if s.title != DECIDED]
+        return DiscoveryScreen(found, replace(told, appendix=appendix))
     except AbbeError as error:
         return DiscoveryScreen(found, None, error.detail)

@@ -12,7 +12,7 @@ from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import InstrumentsDisagree
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import account, solution_doc
-from abbe.service.report.solve_pages import parameter_rows
+from abbe.service.report.solution_sections import parameter_rows
 from abbe.service.site import Site, machine_doc
 from tests.models.solvers.truth import MACHINE, Truth
 

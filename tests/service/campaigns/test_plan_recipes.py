@@ -13,11 +13,12 @@ from abbe.models.paths.lines import DIAGONALS
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
 from abbe.models.planning.plan import PlanStep
-from abbe.service.campaigns.plan import plan_for, plan_page, recipe_of, words
+from abbe.service.campaigns.plan import plan_for, plan_report, recipe_of, words
 from abbe.service.campaigns.plan_instruments import read_instruments
 from abbe.service.cli.app import app
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import AbbeError, ConfigError
+from abbe.service.rendering.document_page import document_html
 from abbe.service.sequences.check import dry_run, dry_run_campaign
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
 from abbe.service.sequences.recipes.recipe_file import parse_recipe, read_recipe, recipe_text
@@ -173,7 +174,7 @@ def test_only_what_the_machine_file_names_is_planned(named, kinds, says):
     assert {type(r) for r in found.recipes} <= kinds
     assert says in found.notes[0]
     assert len(found.notes) == 1 + (named == "ballbar")  # helices of a machine without tool_mm: where is the spindle?
-    assert says in plan_page(site(), found)
+    assert says in document_html(plan_report(site(), found))
 
 
 def test_instruments_that_the_machine_does_not_have_are_refused():

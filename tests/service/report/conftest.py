@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from abbe.service.rendering import (
-    ArrowField,
-    Contribution,
-    DemoReport,
-    ParameterRow,
-    PolarTrace,
-    ResidualSeries,
+from abbe.service.rendering.document import Document, Lines, Picture, Section
+from abbe.service.rendering.model import ArrowField, Contribution, ParameterRow, PolarTrace, ResidualSeries, TableCurve
+from abbe.service.rendering.plots import diagonal_plot, polar_plot, table_plot, volume_pair
+from abbe.service.report.blocks import (
     RunRow,
     SummaryRow,
-    TableCurve,
+    parameter_pictures,
+    parameter_table,
+    residual_picture,
+    run_table,
+    setup_section,
+    summary_table,
 )
 
 STROKES = (600.0, 500.0, 450.0)
@@ -70,65 +72,65 @@ PARAMETERS = [
 ]
 
 
+SUMMARY = [
+    SummaryRow("Volumetric error, largest", "µm", 41.31, 6.12, 0.52, 0.48),
+    SummaryRow("Volumetric error, rms", "µm", 18.204, 2.911, 0.31, 0.28),
+    SummaryRow("Body-diagonal figure", "µm", 33.7, 4.2, 0.6, 0.6),
+    SummaryRow("Volumetric error, largest", "µm", 40.9, 5.8, source="sealed truth of the simulator"),
+]
+RUNS = [
+    RunRow("helix r1", "ballbar_helix", "identify", 6200, 0.47, 0.35, 3),
+    RunRow("helix r2", "ballbar_helix", "holdout", 6200, 0.35, 0.35, 0),
+    RunRow("diagonal ppp", "laser_diagonal", "identify", 152, 0.21, 0.2, 0),
+    RunRow("diagonal npp", "laser_diagonal", "identify", 152, 0.2, 0.2, 1),
+]
+RANKED = [
+    Contribution("EXX (positioning of X)", 25.9, 0.4),
+    Contribution("C0Y (squareness)", 10.5, 0.3),
+    Contribution("EYY (positioning of Y)", 10.2, 0.4),
+    Contribution("backlash X", 3.1, 0.1),
+    Contribution("EZZ (positioning of Z)", 5.5, 1.0),
+]
+
+
 @pytest.fixture
-def full_report() -> DemoReport:
+def full_report() -> Document:
     rng = np.random.default_rng(7)
     angle = np.linspace(0.0, 1080.0, 720)
-    return DemoReport(
-        title="Worn VMC: measured, corrected, verified",
-        machine={"machine": "VMC-1", "chain": "w-X-Y-b-Z-t", "strokes (mm)": {"X": [0.0, 600.0], "Y": [0.0, 500.0], "Z": [0.0, 450.0]}},
-        created_utc="2026-11-21 03:40:12 UTC",
-        seed=7,
-        versions={"abbe": "0.1.0", "numpy": "2.4.6", "active table": "0x1A2B3C4D, CRC 0x99AA17F0"},
-        verdict="The correction is in force. Volumetric error fell from 41.3 µm to 6.1 µm; both verification runs agree.",
-        accepted=True,
-        summary=[
-            SummaryRow("Volumetric error, largest", "µm", 41.31, 6.12, 6.75, 0.52, 0.48),
-            SummaryRow("Volumetric error, rms", "µm", 18.204, 2.911, None, 0.31, 0.28),
-            SummaryRow("Body-diagonal figure", "µm", 33.7, 4.2, 8.0, 0.6, 0.6),
-            SummaryRow("Volumetric error, largest", "µm", 40.9, 5.8, 7.05, source="sealed truth of the simulator"),
-        ],
-        parameters=PARAMETERS,
-        not_observable=[
-            "EAZ together with tool offset: both tests use one tool length.",
-            "A common scale of all axes: the bar length is uncalibrated.",
-        ],
-        runs=[
-            RunRow("helix r1", "ballbar_helix", "identify", 6200, 0.47, 0.35, 3),
-            RunRow("helix r2", "ballbar_helix", "holdout", 6200, 0.35, 0.35, 0),
-            RunRow("diagonal ppp", "laser_diagonal", "identify", 152, 0.21, 0.2, 0),
-            RunRow("diagonal npp", "laser_diagonal", "identify", 152, 0.2, 0.2, 1),
-        ],
-        residuals=_residuals(rng),
-        tables=_tables(rng),
-        table_lsb_um=0.1,
-        arrows_before=_field(rng, 38.0),
-        arrows_after=_field(rng, 3.0),
-        diagonals_before=_diagonals(rng, 24.0),
-        diagonals_after=_diagonals(rng, 3.0),
-        polar=[
+    residuals, tables = _residuals(rng), _tables(rng)
+    vectors = volume_pair(_field(rng, 38.0), _field(rng, 3.0))
+    diagonals = diagonal_plot(_diagonals(rng, 24.0), _diagonals(rng, 3.0))
+    circle = polar_plot(
+        [
             PolarTrace("before", angle, 12.0 * np.sin(np.radians(2.0 * angle + 30.0)) + 0.3 * rng.standard_normal(angle.size)),
             PolarTrace("after", angle, 1.2 * np.sin(np.radians(2.0 * angle)) + 0.3 * rng.standard_normal(angle.size)),
+        ]
+    )
+    log = ["03:38:02 lease taken", "03:38:05 bank 1 written and read back, equal", "03:38:06 activated", "03:39:51 verified"]
+    before = [summary_table(SUMMARY), Picture("Error vectors.", vectors), Picture("Body diagonals.", [diagonals], "wide")]
+    machine = [p for p in PARAMETERS if p.note != "set-up"]
+    parameters = [*parameter_pictures(PARAMETERS, RANKED), Picture("Circle.", [circle])]
+    return Document(
+        kind="cycle",
+        title="Worn VMC: measured, corrected, verified",
+        about={"Machine": "VMC-1", "Chain": "w-X-Y-b-Z-t", "Made": "2026-11-21 03:40:12 UTC"},
+        verdict=("ok", "Accepted", "Volumetric error fell from 41.3 µm to 6.1 µm; both verification runs agree."),
+        remarks=["Air temperature rose by 0.8 K during the session."],
+        sections=[
+            Section("Before and after", before),
+            Section("Identified parameters", [*parameters, parameter_table(machine), *setup_section(PARAMETERS)]),
         ],
-        contributions=[
-            Contribution("EXX (positioning of X)", 25.9, 0.4),
-            Contribution("C0Y (squareness)", 10.5, 0.3),
-            Contribution("EYY (positioning of Y)", 10.2, 0.4),
-            Contribution("backlash X", 3.1, 0.1),
-            Contribution("EZZ (positioning of Z)", 5.5, 1.0),
+        not_observable=["EAZ together with tool offset: both tests use one tool length."],
+        appendix=[
+            Section("Compensation tables", [Picture("Tables.", [table_plot(tables, lsb_um=0.1)], "wide"), Lines(log, numbered=True)]),
+            Section("Residuals", residual_picture(residuals, RUNS)),
+            Section("Runs", [run_table(RUNS)]),
         ],
-        push_log=[
-            "03:38:02 lease taken",
-            "03:38:02 old table archived (CRC 0x00000000, kind 0)",
-            "03:38:05 bank 1 written and read back, equal",
-            "03:38:05 sealed",
-            "03:38:06 activated",
-            "03:39:51 verified",
-        ],
-        warnings=["Air temperature rose by 0.8 K during the session."],
+        provenance={"Seed": "7", "abbe": "0.1.0", "numpy": "2.4.6", "active table": "0x1A2B3C4D, CRC 0x99AA17F0"},
+        signatures=(),
     )
 
 
 @pytest.fixture
-def minimal_report() -> DemoReport:
-    return DemoReport(title="Nothing yet", machine={}, created_utc="2026-11-21", seed=None, versions={}, verdict="No measurement was made.")
+def minimal_report() -> Document:
+    return Document(kind="cycle", title="Nothing yet", verdict=("open", "Undecided", "No measurement was made."), signatures=())

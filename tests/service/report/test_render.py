@@ -9,18 +9,19 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from abbe.service.rendering import (
-    ArrowField,
-    Contribution,
-    DemoReport,
-    ParameterRow,
-    PolarTrace,
-    ResidualSeries,
+from abbe.service.rendering.document import Document, Facts, Figure, Instrument, Lines, Picture, Section, TextTable
+from abbe.service.rendering.document_page import document_html
+from abbe.service.rendering.model import ArrowField, Contribution, ParameterRow, PolarTrace, ResidualSeries, TableCurve
+from abbe.service.rendering.plots import contribution_bars, diagonal_plot, polar_plot, table_plot, volume_pair
+from abbe.service.report.blocks import (
     RunRow,
     SummaryRow,
-    TableCurve,
+    parameter_pictures,
+    parameter_table,
+    residual_picture,
+    run_table,
+    summary_table,
 )
-from abbe.service.rendering.html import render_report
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 HOSTILE = "</title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\x00\x07\ud800"
@@ -60,22 +61,21 @@ def svgs(page: str) -> list[ET.Element]:
     return [ET.fromstring(text) for text in re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)]
 
 
-def test_a_full_report_has_every_section_and_the_verdict_first(full_report: DemoReport) -> None:
-    page = render_report(full_report)
+def test_a_full_report_has_every_section_and_the_verdict_first(full_report: Document) -> None:
+    page = document_html(full_report)
     outline = Outline(page)
     assert "script" not in outline.tags
-    places = [
-        page.index(f'id="{name}"')
-        for name in ("h-verdict", "h-summary", "volume-before-t", "h-parameters", "h-limits", "h-tables", "h-residuals")
-    ]
+    order = ("verdict", "remarks", "section-1", "section-2", "appendix-1", "appendix-2", "appendix-3")
+    places = [page.index(f'id="{name}"') for name in order]
     assert places == sorted(places)
-    assert page.index('id="h-runs"') < page.index('id="h-provenance"')
+    assert page.index("volume-before-t") < page.index('id="section-2"') < page.index("What this measurement could not show")
+    assert page.index('id="appendix-3"') < page.index("Where it comes from")
     assert outline.tags.count("h1") == 1
     assert ("lang", "en") in outline.attributes
 
 
-def test_every_picture_is_xml_with_its_own_title_and_description(full_report: DemoReport) -> None:
-    pictures = svgs(render_report(full_report))
+def test_every_picture_is_xml_with_its_own_title_and_description(full_report: Document) -> None:
+    pictures = svgs(document_html(full_report))
     assert len(pictures) == 2 + 1 + 1 + 1 + 3 + 1 + 1 + 4
     for picture in pictures:
         title, desc = picture.find("title"), picture.find("desc")
@@ -86,66 +86,70 @@ def test_every_picture_is_xml_with_its_own_title_and_description(full_report: De
         assert picture.get("role") == "img"
 
 
-def test_identifiers_are_unique(full_report: DemoReport) -> None:
-    ids = [value for name, value in Outline(render_report(full_report)).attributes if name == "id"]
+def test_identifiers_are_unique(full_report: Document) -> None:
+    ids = [value for name, value in Outline(document_html(full_report)).attributes if name == "id"]
     assert len(ids) == len(set(ids))
 
 
-def test_the_page_asks_no_other_host_for_anything(full_report: DemoReport) -> None:
-    page = render_report(full_report)
+def test_the_page_asks_no_other_host_for_anything(full_report: Document) -> None:
+    page = document_html(full_report)
     assert not re.search(r"https?:|//[a-z]|@import|url\(|\bsrc=|\bhref=", page)
 
 
-def test_equal_reports_give_equal_bytes(full_report: DemoReport) -> None:
-    again = dataclasses.replace(full_report, runs=list(full_report.runs))
-    assert render_report(full_report) == render_report(again)
+def test_equal_reports_give_equal_bytes(full_report: Document) -> None:
+    again = dataclasses.replace(full_report, sections=list(full_report.sections))
+    assert document_html(full_report) == document_html(again)
 
 
-def test_a_report_without_data_still_renders(minimal_report: DemoReport) -> None:
-    page = render_report(minimal_report)
+def test_a_report_without_data_still_renders(minimal_report: Document) -> None:
+    page = document_html(minimal_report)
     Outline(page)
     assert svgs(page) == []
     assert "No measurement was made." in page
     assert "Undecided" in page
 
 
-def test_the_uncertainty_decides_the_digits(full_report: DemoReport) -> None:
-    page = render_report(full_report)
-    assert re.search(r"41\.3</span><span class=\"u\"> ± 1\.0<", page)
-    assert re.search(r"18\.20</span><span class=\"u\"> ± 0\.62<", page)
+def test_the_uncertainty_decides_the_digits(full_report: Document) -> None:
+    page = document_html(full_report)
+    assert re.search(r"41\.3<span class=\"u\"> ± 1\.0<", page)
+    assert re.search(r"18\.20<span class=\"u\"> ± 0\.62<", page)
 
 
-def test_parameters_of_the_set_up_are_folded_away(full_report: DemoReport) -> None:
-    page = render_report(full_report)
+def test_parameters_of_the_set_up_are_folded_away(full_report: Document) -> None:
+    page = document_html(full_report)
     fold = page[page.index("<details>") : page.index("</details>")]
     assert ">cup B1 x<" in fold
     assert ">EXX slope<" not in fold
     assert page.count('<th scope="row">cup B1 x<') == 1
 
 
-def test_hostile_words_stay_words(minimal_report: DemoReport) -> None:
+def test_hostile_words_stay_words(minimal_report: Document) -> None:
     x = [0.0, 1.0]
+    pictures = [
+        *parameter_pictures([ParameterRow(HOSTILE, 1.0, 0.1, HOSTILE)], [Contribution(HOSTILE, 1.0, 0.1)]),
+        *residual_picture([ResidualSeries(HOSTILE, HOSTILE, x, x)], [RunRow(HOSTILE, HOSTILE, HOSTILE, 1, 1.0, 1.0)]),
+        Picture(HOSTILE, [table_plot([TableCurve(HOSTILE, HOSTILE, x, x)]), diagonal_plot({HOSTILE: (x, x)}, {})], "wide"),
+        Picture(HOSTILE, [polar_plot([PolarTrace(HOSTILE, x, x)])]),
+    ]
+    words = [HOSTILE, Lines([HOSTILE]), Facts({HOSTILE: HOSTILE}), TextTable((HOSTILE, HOSTILE), [(HOSTILE, HOSTILE)])]
     report = dataclasses.replace(
         minimal_report,
         title=HOSTILE,
         lang=HOSTILE,
-        machine={HOSTILE: HOSTILE},
-        created_utc=HOSTILE,
-        versions={HOSTILE: HOSTILE},
-        verdict=HOSTILE,
-        summary=[SummaryRow(HOSTILE, HOSTILE, 1.0, 1.0, source=HOSTILE)],  # type: ignore[arg-type]
-        parameters=[ParameterRow(HOSTILE, 1.0, 0.1, HOSTILE, HOSTILE)],
+        about={HOSTILE: HOSTILE},
+        verdict=("open", HOSTILE, HOSTILE),
+        remarks=[HOSTILE],
+        sections=[Section(HOSTILE, [*words, Section(HOSTILE, words, folded=True)]), Section("P", pictures)],
+        figures=[Figure(HOSTILE, HOSTILE, HOSTILE, 1.0, 0.1, HOSTILE, HOSTILE)],
+        statements=[HOSTILE],
         not_observable=[HOSTILE],
-        runs=[RunRow(HOSTILE, HOSTILE, HOSTILE, 1, 1.0, 1.0)],
-        residuals=[ResidualSeries(HOSTILE, HOSTILE, x, x)],
-        tables=[TableCurve(HOSTILE, HOSTILE, x, x)],
-        diagonals_before={HOSTILE: (x, x)},
-        polar=[PolarTrace(HOSTILE, x, x)],
-        contributions=[Contribution(HOSTILE, 1.0, 0.1)],
-        push_log=[HOSTILE],
-        warnings=[HOSTILE],
+        instruments=[Instrument(HOSTILE, HOSTILE, HOSTILE)],
+        conditions={HOSTILE: HOSTILE},
+        appendix=[Section(HOSTILE, words)],
+        provenance={HOSTILE: HOSTILE},
+        signatures=[HOSTILE],
     )
-    page = render_report(report)
+    page = document_html(report)
     outline = Outline(page)
     assert not {"script", "img"} & set(outline.tags)
     assert not [name for name, _ in outline.attributes if name.startswith("on")]
@@ -153,25 +157,34 @@ def test_hostile_words_stay_words(minimal_report: DemoReport) -> None:
     page.encode()
 
 
-def test_missing_numbers_are_named_not_drawn(minimal_report: DemoReport) -> None:
+def test_missing_numbers_are_named_not_drawn(minimal_report: Document) -> None:
     nan, inf = float("nan"), float("inf")
     grid = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, nan], [2.0, 2.0, 2.0]])
-    report = dataclasses.replace(
-        minimal_report,
-        machine={"stroke": nan},
-        summary=[SummaryRow("a", "µm", nan, 0.0, None, nan, inf), SummaryRow("b", "µm", None, None)],
-        parameters=[ParameterRow("p", nan, 1.0, "µm"), ParameterRow("q", 1.0, inf, "µm"), ParameterRow("r", None, None, "µm")],
-        runs=[RunRow("r1", "t", "identify", 0, nan, nan)],
-        residuals=[ResidualSeries("r1", "t in s", [nan, nan], [nan, nan]), ResidualSeries("r2", "t in s", [], []), _gappy()],
-        tables=[TableCurve("X", "X", [0.0, 1.0, 2.0], [nan, 1.0, inf])],
-        table_lsb_um=nan,
-        arrows_before=ArrowField(grid, np.full((3, 3), nan)),
-        arrows_after=ArrowField(np.empty((0, 3)), np.empty((0, 3))),
-        diagonals_after={"ppp": ([0.0, nan, 2.0], [1.0, 2.0, nan])},
-        polar=[PolarTrace("p", [0.0, nan], [nan, 1.0])],
-        contributions=[Contribution("c", nan, nan), Contribution("d", None), Contribution("e", 2.0, nan)],
-    )
-    page = render_report(report)
+    series = [ResidualSeries("r1", "t in s", [nan, nan], [nan, nan]), ResidualSeries("r2", "t in s", [], []), _gappy()]
+    rows = [ParameterRow("p", nan, 1.0, "µm"), ParameterRow("q", 1.0, inf, "µm"), ParameterRow("r", None, None, "µm")]
+    runs = [RunRow("r1", "t", "identify", 0, nan, nan)]
+    summary = [SummaryRow("a", "µm", nan, 0.0, nan, inf), SummaryRow("b", "µm", None, None)]
+    pictures = [
+        *volume_pair(ArrowField(grid, np.full((3, 3), nan)), ArrowField(np.empty((0, 3)), np.empty((0, 3)))),
+        table_plot([TableCurve("X", "X", [0.0, 1.0, 2.0], [nan, 1.0, inf])], lsb_um=nan),
+        diagonal_plot({}, {"ppp": ([0.0, nan, 2.0], [1.0, 2.0, nan])}),
+        polar_plot([PolarTrace("p", [0.0, nan], [nan, 1.0])]),
+        contribution_bars([Contribution("c", nan, nan), Contribution("d", None), Contribution("e", 2.0, nan)]),
+    ]
+    blocks = [
+        summary_table(summary),
+        parameter_table(rows),
+        *parameter_pictures(rows, []),
+        *residual_picture(series, runs),
+        run_table(runs),
+    ]
+    figures = [
+        Figure("g", "a", "missing", nan, 1.0, "µm"),
+        Figure("g", "b", "not known", 1.0, inf, "µm"),
+        Figure("g", "c", "none", None, None, ""),
+    ]
+    report = dataclasses.replace(minimal_report, sections=[Section("s", [*blocks, Picture("c", pictures)])], figures=figures)
+    page = document_html(report)
     Outline(page)
     assert "n/a" in page
     assert not re.search(r"\b(nan|inf)\b", page)
