@@ -10,9 +10,9 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_type_hints
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict
 from pydantic_settings.exceptions import SettingsError
@@ -24,6 +24,8 @@ from abbe.service.secrets import mask_secrets
 from abbe.service.storage.engine import resolve_url
 
 PREFIX = "ABBE_"
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+"""How pydantic calls a key that a model, or a dataclass, does not have."""
 Origin = Literal["default", "file", "environment"]
 
 
@@ -156,12 +158,12 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[str, Any]) -> ConfigError:
     # A mistyped key is both unknown and missing: what stands there says more than what does not.
-    first, more = min(errors, key=lambda one: one["type"] != "extra_forbidden"), len(errors) - 1
+    first, more = min(errors, key=lambda one: one["type"] not in UNKNOWN_KEY), len(errors) - 1
     location = first["loc"]
     source = f"{PREFIX} environment" if _holds(environment, location) else str(path)
     tail = f" (and {more} more)" if more else ""
     key = where(location)
-    if first["type"] == "extra_forbidden":
+    if first["type"] in UNKNOWN_KEY:
         hint = nearest(str(location[-1]), _siblings(location))
         return ConfigError(f"{source}: unknown key {key!r}{tail}", hint)
     if first["type"] == "missing":
@@ -180,10 +182,15 @@ def _holds(values: Any, location: tuple[int | str, ...]) -> bool:
 
 
 def _siblings(location: tuple[int | str, ...]) -> list[str]:
-    model: type[BaseModel] = MachineFile
+    keys = _keys(MachineFile)
     for part in location[:-1]:
-        field = model.model_fields.get(str(part))
-        if field is not None:
-            candidates = [field.annotation, *get_args(field.annotation)]
-            model = next(one for one in candidates if isinstance(one, type) and issubclass(one, BaseModel))
-    return list(model.model_fields)
+        if str(part) in keys:
+            kind = keys[str(part)]
+            keys = next(found for one in (kind, *get_args(kind)) if (found := _keys(one)))
+    return list(keys)
+
+
+def _keys(section: Any) -> dict[str, Any]:
+    """The keys of a table with their types; none of what is no table."""
+    names = section.model_fields if hasattr(section, "model_fields") else getattr(section, "__dataclass_fields__", ())
+    return {name: kind for name, kind in get_type_hints(section).items() if name in names} if names else {}

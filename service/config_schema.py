@@ -6,12 +6,12 @@ from collections import Counter
 from datetime import date
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
 from abbe.service.channel.messages import PAGE_MEMORY_MB
-from abbe.service.config_timetable import AlarmSection, ScheduleEntry, Section, WindowEntry
+from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
 from abbe.service.runs.machine_object import Chain, Interval, Point
@@ -42,8 +42,15 @@ def _certificate(day: date | None) -> date | None:
     return day
 
 
-Window = Annotated[Interval, AfterValidator(_celsius)]
+Temperatures = Annotated[Interval, AfterValidator(_celsius)]
+MachineWindow = Annotated[Window, AfterValidator(complete)]
 Certificate = Annotated[date | None, AfterValidator(_certificate)]
+
+
+class Section(BaseModel):
+    """A table of the machine file: no unknown key, no NaN, no change afterwards."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
 class AxisIntervals(Section):
@@ -137,8 +144,8 @@ class Limits(Section):
         description="a proposed table is only pushed when somebody else than its proposer has approved it (`abbe comp approve`)",
     )
     feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
-    temperature_c: Window = Field(default=(18.0, 24.0), description="air temperature in which a measurement is allowed")
-    run_temperature_c: Window | None = Field(
+    temperature_c: Temperatures = Field(default=(18.0, 24.0), description="air temperature in which a measurement is allowed")
+    run_temperature_c: Temperatures | None = Field(
         default=None, description="air temperature (of the laser) beyond which a running measurement stops; absent: it is not watched"
     )
     continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
@@ -282,6 +289,24 @@ class Signatures(Section):
     )
 
 
+class AlarmSection(Section):
+    """When scheduled checks raise an alarm beside their limits, and what may follow by itself."""
+
+    warn_days: float = Field(
+        default=14.0, ge=0.0, le=3650.0, description="alarm when a limit may be reached within so many days (lower end, 95 %); 0: never"
+    )
+    campaign: str = Field(
+        default="identification", min_length=1, description="what on_alarm measures: identification, or a recipe FILE.toml beside this file"
+    )
+    push: Literal["never", "approved"] = Field(
+        default="never",
+        description="approved: a proposal that a person has approved is pushed by the service when the machine is idle, and verified",
+    )
+    watch_table: bool = Field(
+        default=True, description="look every 10 s whether somebody else put another compensation table into force, and raise an alarm"
+    )
+
+
 class MachineFile(Section):
     """One machine: its geometry, its devices, where results go, and the limits that protect it."""
 
@@ -305,13 +330,13 @@ class MachineFile(Section):
     opcua: OpcUa = OpcUa()
     signatures: Signatures = Signatures()
     alarm: AlarmSection = AlarmSection()
-    schedule: list[ScheduleEntry] = Field(default_factory=list)
-    maintenance: list[WindowEntry] = Field(default_factory=list, description="windows in which no scheduled check starts")
-    staffed: list[WindowEntry] = Field(default_factory=list, description="when an operator is at the machine")
+    schedule: list[Annotated[Schedule, AfterValidator(one_way)]] = Field(default_factory=list)
+    maintenance: list[MachineWindow] = Field(default_factory=list, description="windows in which no scheduled check starts")
+    staffed: list[MachineWindow] = Field(default_factory=list, description="when an operator is at the machine")
 
     @field_validator("schedule")
     @classmethod
-    def _names_differ(cls, entries: list[ScheduleEntry]) -> list[ScheduleEntry]:
+    def _names_differ(cls, entries: list[Schedule]) -> list[Schedule]:
         twice = [name for name, count in Counter(entry.name for entry in entries).items() if count > 1]
         if twice:
             raise ValueError(f"two schedules are named {twice[0]!r}, expected different names")

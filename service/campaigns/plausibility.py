@@ -13,7 +13,7 @@ from pathlib import Path
 from abbe.drivers.links.urls import FixtureConsoleUrl, parse_url
 from abbe.service.campaigns.builtin_recipes import campaign_plan, recipe_plan
 from abbe.service.config_schema import MachineFile
-from abbe.service.config_timetable import ScheduleEntry
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.sequences.check import dry_run_campaign, paced
 from abbe.service.sequences.needed import BALLBAR, LASER, check_configured, needed_by
@@ -92,7 +92,7 @@ def ended_certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMEN
     return {role: day for role, day in site.calibrated_until.items() if role in roles and day < today}
 
 
-def _lines(entry: ScheduleEntry, site: Site, plan: Callable[[], CampaignPlan]) -> list[str]:
+def _lines(entry: Schedule, site: Site, plan: Callable[[], CampaignPlan]) -> list[str]:
     try:
         made = plan()
         dry_run_campaign(site.machine, made, site.max_feed_mm_min)

@@ -12,7 +12,7 @@ from abbe.service.clock import Clock
 from abbe.service.core.orders import MeasureCampaign, OrderActions
 from abbe.service.core.push_recovery import Recover
 from abbe.service.devices.urls import control_of
-from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.schedule import Schedule, Window
 from abbe.service.mqtt.broker import Broker
 from abbe.service.mqtt.topics import Topics
 from abbe.service.plant.opcua.setup import OpcUaSetup
@@ -21,7 +21,6 @@ from abbe.service.scheduler.alarm_manager import Duties
 from abbe.service.scheduler.ports import Check, Readiness
 from abbe.service.scheduler.ready import AlwaysReady
 from abbe.service.scheduler.store import ServiceStore
-from abbe.service.scheduler.windows import Window
 from abbe.service.tables.in_force import LookAtTable
 
 

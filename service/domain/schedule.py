@@ -1,77 +1,145 @@
-"""The timetable: what runs when, under which conditions, and what comes next."""
+"""The timetable: what runs when, under which conditions, when nothing may start, and what comes next.
+
+The machine file, the scheduler, the channel and the interfaces use these records; limits and descriptions of their fields stand here alone.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from typing import Literal
+from datetime import UTC, datetime, time
+from typing import Annotated, Literal
+from zoneinfo import ZoneInfo
 
-from abbe.service.domain.bounds import Word
+from cronsim import CronSim, CronSimError
+from pydantic import AfterValidator, AwareDatetime, Field
+
+from abbe.service.domain.bounds import WORD
 
 FIRST_UTC = datetime(2026, 1, 1, tzinfo=UTC)
 """Intervals are counted from here unless the machine file names another instant."""
+SHORTEST_H = 1 / 60
+"""The shortest interval of a schedule."""
+
+Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
+
+
+def _cron(text: str) -> str:
+    try:
+        if text:
+            CronSim(text, datetime(2026, 1, 1, tzinfo=UTC))
+    except CronSimError as err:
+        raise ValueError(f"expected a cron expression (minute hour day month weekday), got {text!r}: {err}") from None
+    return text
+
+
+def _timezone(text: str) -> str:
+    try:
+        ZoneInfo(text)
+    except (KeyError, ValueError, OSError):
+        raise ValueError(f"expected an IANA time zone such as Europe/Berlin or UTC, got {text!r}") from None
+    return text
+
+
+def _interval(hours: float) -> float:
+    if hours and hours < SHORTEST_H:
+        raise ValueError(f"expected at least a minute (1/60 h), got {hours:g} h")
+    return hours
+
+
+Name = Annotated[str, Field(min_length=1, max_length=WORD)]
+Zone = Annotated[str, AfterValidator(_timezone), Field(description="IANA name, e.g. Europe/Berlin")]
+Cron = Annotated[str, AfterValidator(_cron)]
 
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What has to be so before a check starts.
+    """What has to be so before a check starts; it waits for it as long as the grace."""
 
-    Parameters
-    ----------
-    idle : bool
-        Controller ready, nothing moves, no NC program, spindle off.
-    warm_min : float
-        So many of the last 60 minutes the spindle turned or an axis moved, min.
-    air : bool
-        Air temperature (of the laser) inside the machine file's window.
-    operator : str
-        ``present`` or ``absent`` by the staffed hours, or ``any``.
-    """
-
-    idle: bool = False
-    warm_min: float = 0.0
-    air: bool = False
-    operator: Literal["any", "present", "absent"] = "any"
+    idle: Annotated[bool, Field(description="controller ready, nothing moves, no NC program, spindle off")] = False
+    warm_min: Annotated[
+        float,
+        Field(ge=0.0, le=50.0, description="so many of the last 60 minutes the spindle turned or an axis moved, as the service saw it"),
+    ] = 0.0
+    air: Annotated[bool, Field(description="air temperature (of the laser) inside [limits] temperature_c")] = False
+    operator: Annotated[Literal["any", "present", "absent"], Field(description="by [[staffed]]; absent: the door is shut, too")] = "any"
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """One line of the machine file's timetable.
+    """One line of the timetable: by cron expression or by interval. Its name is part of the key that makes a slot run once."""
 
-    Parameters
-    ----------
-    name : str
-        Unique within the machine; part of the key that makes a slot run once.
-    cron : str
-        Five fields (minute hour day month weekday, 1 = Monday), or six with seconds first. Empty where ``every_h`` is given.
-    timezone : str
-        IANA name, for example ``Europe/Berlin``.
-    recipe : str
-        What to run.
-    grace_s : float
-        A slot may start so late: found later, or kept from starting for longer, it is a missed one.
-    every_h : float
-        Interval, h; 0: by ``cron``.
-    first_utc : datetime
-        One slot of the interval; the others are whole intervals away from it.
-    catch_up : str
-        Missed slots: ``skip`` records each with its reason; ``once`` does so too, and runs once for all of them.
-    needs : Needs
-        Preconditions.
-    on_alarm : str
-        ``propose``: what an alarm of this schedule's recipe asks for is measured and proposed; ``none``.
+    name: Name
+    cron: Annotated[Cron, Field(description="minute hour day month weekday, e.g. 0 6 * * 1 (Monday); six fields: seconds first")] = ""
+    timezone: Zone = "UTC"
+    recipe: Annotated[Name, Field(description="what to measure")] = "quick-check"
+    grace_s: Annotated[
+        float,
+        Field(ge=1.0, le=86_400.0, description="a slot may start so late; found later, or kept from starting for longer, it is missed"),
+    ] = 300.0
+    every_h: Annotated[
+        float, AfterValidator(_interval), Field(le=8784.0, description="instead of cron: interval in hours (1/60 or more)")
+    ] = 0.0
+    first: Annotated[AwareDatetime, Field(description="a moment from which every_h is counted, e.g. 2026-11-02T06:00:00+01:00")] = FIRST_UTC
+    catch_up: Annotated[
+        Literal["skip", "once"],
+        Field(description="missed slots: skip: recorded, the machine is not moved; once: recorded, and one run for all of them"),
+    ] = "skip"
+    needs: Needs = Needs()
+    on_alarm: Annotated[
+        Literal["none", "propose"],
+        Field(
+            description="propose: when a check raises an alarm, [alarm] campaign is measured, solved and searched by itself, and tables "
+            "are proposed, which wait for approval"
+        ),
+    ] = "none"
+
+
+def one_way(schedule: Schedule) -> Schedule:
+    """Return a schedule of the machine file.
+
+    Raises
+    ------
+    ValueError
+        It has neither a cron expression nor an interval, or both, or an instant to count from without an interval.
+    """
+    if bool(schedule.cron) == bool(schedule.every_h):
+        raise ValueError(f"expected either cron = ... or every_h = ..., got {'both' if schedule.cron else 'neither'}")
+    if schedule.first != FIRST_UTC and not schedule.every_h:
+        raise ValueError("expected every_h = ... beside first = ...: a cron expression is not counted from anywhere")
+    return schedule
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A window in time: so many hours from each time of a cron expression, or from start to end on some days of the week.
+
+    Hours are real time, also where the clocks change in them; start and end are wall time.
     """
 
-    name: Word
-    cron: Word
-    timezone: Word
-    recipe: Word
-    grace_s: float = 300.0
-    every_h: float = 0.0
-    first_utc: datetime = FIRST_UTC
-    catch_up: Literal["skip", "once"] = "skip"
-    needs: Needs = Needs()
-    on_alarm: Literal["none", "propose"] = "none"
+    name: Name
+    timezone: Zone = "UTC"
+    cron: Annotated[Cron, Field(description="when it begins, e.g. 0 14 * * 5")] = ""
+    hours: Annotated[float, Field(ge=0.0, le=744.0, description="how long it lasts, with cron")] = 0.0
+    days: Annotated[frozenset[Day], Field(description='instead of cron: days on which it begins, e.g. ["sat", "sun"]')] = frozenset()
+    start: Annotated[time | None, Field(description="wall time, with days, e.g. 22:00:00")] = None
+    end: Annotated[time | None, Field(description="wall time; not later than start: on the day after")] = None
+
+
+def complete(window: Window) -> Window:
+    """Return a window of the machine file.
+
+    Raises
+    ------
+    ValueError
+        It is neither one of a cron expression nor a weekly one, or both; or its wall times carry an offset.
+    """
+    weekly = (bool(window.days), window.start is not None, window.end is not None)
+    by_cron = (bool(window.cron), bool(window.hours))
+    if not ((all(by_cron) and not any(weekly)) or (all(weekly) and not any(by_cron))):
+        raise ValueError("expected either cron and hours, or days, start and end")
+    if any(moment is not None and moment.tzinfo is not None for moment in (window.start, window.end)):
+        raise ValueError("expected start and end without an offset: timezone says it")
+    return window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

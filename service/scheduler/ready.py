@@ -11,9 +11,9 @@ from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
-from abbe.service.domain.schedule import Needs, Schedule
+from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.errors import AbbeError
-from abbe.service.scheduler.windows import Window, covering
+from abbe.service.scheduler.windows import covering
 from abbe.service.sequences.interlocks import somebody_at_work, tripped
 
 LOOK_S = 60.0

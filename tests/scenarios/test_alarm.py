@@ -22,7 +22,7 @@ from abbe.service.compensation.proposal_checks import approve
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.config import load_machine
-from abbe.service.config_timetable import AlarmSection
+from abbe.service.config_schema import AlarmSection
 from abbe.service.core.board import Board
 from abbe.service.devices.session import open_session
 from abbe.service.domain.progress import ProgressSink

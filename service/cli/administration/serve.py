@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from abbe.service.compensation.ordered_rollback import BackOrder
     from abbe.service.compensation.push_approved import PushOrder
     from abbe.service.config import LoadedMachine
-    from abbe.service.config_timetable import AlarmSection
+    from abbe.service.config_schema import AlarmSection
     from abbe.service.core.orders import CampaignOrder, MeasureCampaign, OrderActions
     from abbe.service.core.setup import ServiceSetup
     from abbe.service.domain.job_state import JobOutcome
@@ -81,7 +81,6 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     from abbe.service.mqtt.topics import Topics
     from abbe.service.report.report import rules_of
     from abbe.service.scheduler.ready import Ready, look_at
-    from abbe.service.scheduler.timetable import schedules_of, windows_of
     from abbe.service.sequences.check import dry_run_campaign, paced
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import site_of
@@ -105,15 +104,15 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         machine=config.name,
         doc=site.doc,
         devices={role: url for role, url in config.devices.model_dump().items() if url is not None},
-        schedules=schedules_of(config),
+        schedules=tuple(config.schedule),
         store_url=loaded.database_url,
         broker=_broker(loaded),
         topics=Topics(config.mqtt.topic_prefix, config.name),
         host=config.web.host,
         port=config.web.port if port is None else port,
         check=check_on,
-        maintenance=windows_of(config.maintenance),
-        ready=lambda clock: Ready(look_at(site.urls), schedules_of(config), site.temperature_c, windows_of(config.staffed), clock),
+        maintenance=tuple(config.maintenance),
+        ready=lambda clock: Ready(look_at(site.urls), config.schedule, site.temperature_c, config.staffed, clock),
         names=tuple(config.web.names),
         certificate=_beside(loaded.path, config.web.certificate),
         key=_beside(loaded.path, config.web.key),

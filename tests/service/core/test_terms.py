@@ -12,11 +12,11 @@ import pytest
 
 from abbe.drivers.api import Condition, ControllerStatus
 from abbe.drivers.errors import LinkDown
-from abbe.service.domain.schedule import Needs, Schedule
+from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ready import Ready, SeenDevices
 from abbe.service.scheduler.slots import cron_in_words, next_slot, previous_slot, slots_between
-from abbe.service.scheduler.windows import Window
+from abbe.service.scheduler.windows import covers
 from tests.pretended_status import READY, controller_status
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
@@ -129,7 +129,7 @@ async def test_what_a_lost_service_left_open_is_decided_by_the_next() -> None:
 
 
 def test_intervals_are_counted_from_a_fixed_instant() -> None:
-    every = Schedule("e", "", "UTC", "r", every_h=36.0, first_utc=utc(2026, 1, 2, 6))
+    every = Schedule("e", "", "UTC", "r", every_h=36.0, first=utc(2026, 1, 2, 6))
     assert list(slots_between(every, utc(2026, 1, 1), utc(2026, 1, 6))) == [utc(2026, 1, 2, 6), utc(2026, 1, 3, 18), utc(2026, 1, 5, 6)]
     assert next_slot(every, utc(2026, 1, 2, 6)) == utc(2026, 1, 3, 18)
     assert previous_slot(every, utc(2026, 1, 2, 6)) == utc(2026, 1, 2, 6)
@@ -151,7 +151,7 @@ def test_intervals_are_counted_from_a_fixed_instant() -> None:
 )
 def test_a_weekly_window_over_midnight(at: datetime, inside: bool) -> None:
     window = Window("late shift", "Europe/Berlin", days=frozenset({"fri"}), start=time(22), end=time(6))
-    assert window.covers(at) == inside
+    assert covers(window, at) == inside
 
 
 def status(conditions: Condition = READY, x: float = 0.0) -> ControllerStatus:
