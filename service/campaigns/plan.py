@@ -105,7 +105,7 @@ def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:
         )
     if isinstance(test, DiagonalTest):
         return Diagonal(step.label, step.setup_id, "identify", test.diagonal, test.steps, test.order, feed_mm_min=feed)
-    return Linear(step.label, step.setup_id, "identify", test.axis, n=test.n, at=test.at, feed_mm_min=feed)
+    return Linear(step.label, step.setup_id, "identify", test.axis, at_share=test.at, positions=test.n, feed_mm_min=feed)
 
 
 def words(test: Measurement) -> str:

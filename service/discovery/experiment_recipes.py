@@ -197,7 +197,7 @@ def _diagonals(like: Helix, name: str) -> list[Recipe]:
 
 
 def _lines(like: Helix, name: str) -> list[Recipe]:
-    return [Linear(f"{name}-line{AXES[a]}", f"{name}-line{AXES[a]}", "identify", a, n=25) for a in range(3)]
+    return [Linear(f"{name}-line{AXES[a]}", f"{name}-line{AXES[a]}", "identify", a, at_share=(0.15, 0.15)) for a in range(3)]
 
 
 MAKERS: dict[str, Maker] = {

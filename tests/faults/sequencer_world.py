@@ -43,7 +43,7 @@ SMALL: dict[str, Any] = {
     "turns": 3.0,
     "chord_mm": 3.0,
     "points": 5,
-    "n": 5,
+    "positions": 5,
     "steps": 2,
     "samples": 5,
     "axis": 2,
@@ -51,11 +51,15 @@ SMALL: dict[str, Any] = {
     "feed_in_deg": 20.0,
     "feed_out_deg": 20.0,
     "settle_s": 0.1,
-    "at": 0.5,
+    "order": "XYZ",
 }
 PATIENT = Watching(unknown_s=5.0)
 """For tests that are not about silence: simulators and service share one process here, on a computer that others use."""
-DIAGONALS = {"Diagonal": "ppp", "FaceDiagonal": "pp"}
+OWN: dict[str, dict[str, Any]] = {
+    "Diagonal": {"diagonal": "ppp"},
+    "FaceDiagonal": {"diagonal": "pp", "at_share": 0.5},
+    "Linear": {"at_share": (0.5, 0.5)},
+}
 
 
 def kinds() -> dict[str, type[Any]]:
@@ -67,7 +71,7 @@ def small(kind: str, **more: Any) -> TestPlan:
     """A short test of a kind."""
     made = kinds()[kind]
     names = {f.name for f in dataclasses.fields(made)}
-    words = {k: v for k, v in SMALL.items() if k in names} | ({"diagonal": DIAGONALS[kind]} if "diagonal" in names else {})
+    words = {k: v for k, v in SMALL.items() if k in names} | OWN.get(kind, {})
     plan: TestPlan = made(**(words | more)).plan(MACHINE)
     return plan
 

@@ -26,8 +26,8 @@ def campaign() -> CampaignPlan:
             ),
             "test",
         ),
-        *(Linear(f"line{axis}", f"L{axis}", "identify", axis, n=5) for axis in range(3)),
-        Diagonal("diag", "D1", "identify", "ppp", 3),
+        *(Linear(f"line{axis}", f"L{axis}", "identify", axis, positions=5, at_share=(0.15, 0.15)) for axis in range(3)),
+        Diagonal("diag", "D1", "identify", "ppp", 3, "XYZ"),
     )
     return CampaignPlan("small", tuple(r.plan(MACHINE) for r in recipes))
 

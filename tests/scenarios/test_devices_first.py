@@ -36,7 +36,13 @@ pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 ROLES = ("cnc", "ballbar", "laser", "fixture")
 RECIPES = ("quick-check", "verification", "identification", "own.toml")
-OWN = recipe_text("own", (Linear("line", "L1", "identify", 0, n=5), Helix("helix", "B1", "identify", (300.0, 250.0, 100.0), 100.0)))
+OWN = recipe_text(
+    "own",
+    (
+        Linear("line", "L1", "identify", 0, positions=5, at_share=(0.15, 0.15)),
+        Helix("helix", "B1", "identify", (300.0, 250.0, 100.0), 100.0),
+    ),
+)
 CASES = [(recipe, role) for k, recipe in enumerate(RECIPES) for n, role in enumerate(ROLES) if LONG or recipe == "quick-check" or k == n]
 """All pairs with ABBE_TEST_LONG=1; every day each device with the quick check, and each recipe with one device."""
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import KW_ONLY, dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field as Limits
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.circles import way_on_sphere
+from abbe.service.sequences.recipes.fields import AxisIndex, Coordinate, Feed, Rate, TestRecipe, inner
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Point, Step, TakeBarOut
 
 Array = NDArray[np.float64]
@@ -46,25 +48,28 @@ class Cup:
         return float(((np.array(list(points)) - self.centre) @ self.up).min()) / self.radius_mm
 
 
-class OnCup(Protocol):
-    """A ball-bar test: where its cup stands, what bar hangs in it, and what is mounted before and cleared away after it."""
+@dataclass(frozen=True, slots=True)
+class CupTest(TestRecipe):
+    """A ball-bar test: where its cup stands and what bar hangs in it.
 
-    @property
-    def centre_mm(self) -> Point: ...  # noqa: D102
-    @property
-    def radius_mm(self) -> float: ...  # noqa: D102
-    @property
-    def axis(self) -> int: ...  # noqa: D102
-    @property
-    def opens(self) -> int: ...  # noqa: D102
-    @property
-    def feed_mm_min(self) -> float: ...  # noqa: D102
-    @property
-    def mount(self) -> bool: ...  # noqa: D102
-    @property
-    def change_bar(self) -> bool: ...  # noqa: D102
-    @property
-    def link_mm(self) -> Point | None: ...  # noqa: D102
+    ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
+    ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: nobody measured it.
+    ``change_bar``: the test before had another radius; the cup stays, the bar is taken out before the machine moves and the other one is
+    hung in where its path starts. ``link_mm``: where the test before has left the machine, if this one begins elsewhere on the same sphere.
+    """
+
+    centre_mm: tuple[Coordinate, Coordinate, Coordinate]
+    radius_mm: Annotated[float, Limits(ge=0.1, le=2000.0)]
+    _: KW_ONLY
+    axis: AxisIndex = 2
+    opens: Literal[1, -1] = 1
+    direction: Literal[1, -1] = 1
+    feed_mm_min: Feed = 2000.0
+    rate_hz: Rate = 100
+    length_calibrated: bool = True
+    u_length_mm: Annotated[float, Limits(ge=0.0, le=1.0)] = 0.002
+    change_bar: bool = inner(False)
+    link_mm: Point | None = inner(None)  # noqa: RUF009 - a field, not a default
 
 
 def as_point(v: Array) -> Point:
@@ -81,7 +86,7 @@ def before(path: tuple[Point, ...], machine: Machine) -> Point:
     return as_point(np.clip(points[0] - BAR_APPROACH_MM * first, machine.stroke_mm[:, 0], machine.stroke_mm[:, 1]))
 
 
-def pole_of(recipe: OnCup) -> tuple[Point, Array]:
+def pole_of(recipe: CupTest) -> tuple[Point, Array]:
     """The pole of a test's hemisphere, where the spindle is, and the unit vector that points to it."""
     up = np.zeros(3)
     up[recipe.axis] = float(recipe.opens)
@@ -114,7 +119,7 @@ def cup_of(setup: dict[str, Any]) -> Cup:
     return Cup(np.array(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"]), up)
 
 
-def to_path(recipe: OnCup, path: tuple[Point, ...], machine: Machine) -> list[Step]:
+def to_path(recipe: CupTest, path: tuple[Point, ...], machine: Machine) -> list[Step]:
     """Steps up to the first point of a ball-bar path: mount, change the bar or come along the sphere, and approach.
 
     Nothing goes straight past the cup: from the centre, and with another bar, the machine goes by way of the pole and along the sphere.

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field as Limits
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.circles import Plane, arc_through, circle_points, way_on_sphere
 from abbe.models.paths.helix import Law, even_helix_points, helix_points
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.recipes.approach import BAR_APPROACH_MM, LINK_CHORD_MM, Array, as_point, pole_of, to_path
+from abbe.service.sequences.recipes.approach import BAR_APPROACH_MM, LINK_CHORD_MM, Array, CupTest, as_point, pole_of, to_path
+from abbe.service.sequences.recipes.fields import Feed, Rate, Settle, inner
 from abbe.service.sequences.steps import MAX_PATH_POINTS, FollowPath, MoveTo, Point, ReadBar, RecordPath, Step, TestPlan, Unmount
 
 MIN_TURNS = 3.0
 """Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition 28 at 3 turns, 58 at 2, 1900 at 1; math.md 4.5)."""
 PARTIAL_DEG, PARTIAL_LEAD_DEG = 220.0, 2.0
 """ISO 230-4's partial arc, and what comes before and after it."""
+Turns = Annotated[float, Limits(ge=3.0, le=50.0)]
+Lead = Annotated[float, Limits(ge=0.0, le=90.0)]
+Arc = Annotated[float, Limits(ge=0.0, le=360.0)]
 Path = tuple[tuple[Point, ...], tuple[int, int] | None]
 """Points of a path, and the first and last that count; None: all."""
 
@@ -40,7 +45,7 @@ def reversed_path(path: Path) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Helix:
+class Helix(CupTest):
     """Hemispherical helix of the ball-bar test (math.md 4.3): continuous, constant feed, pole to equator or (direction -1) back.
 
     ``chord_mm`` is the wanted mean distance of the path's points; a long path gets longer chords, so that the controller can hold it. The
@@ -49,35 +54,16 @@ class Helix:
     where a sample's place on the path is uncertain by a part of a chord. ``even``: points almost equally far apart along the same curve.
     ``feed_in_deg`` and ``feed_out_deg``: arcs of the great circles that touch the path's ends, driven before and after it in one go with
     it, so that what is recorded in between is at constant feed; ``feed_in_deg`` comes first in either direction.
-    ``mount`` and ``unmount`` are false where two tests in a row share one set-up: the second does not mount, the first leaves the bar.
-    ``change_bar``: the second has another radius; the cup stays, the bar is taken out before the machine moves and the other one is hung in
-    where its path starts. ``link_mm``: where the first has left the machine, if this one begins elsewhere on the same sphere.
-    ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
-    ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: nobody measured it.
     """
 
-    label: str
-    setup_id: str
-    role: str
-    centre_mm: Point
-    radius_mm: float
-    turns: float = 5.0
+    _: KW_ONLY
+    turns: Turns = 5.0
     law: Law = "area"
-    axis: int = 2
-    feed_mm_min: float = 2000.0
-    direction: Literal[1, -1] = 1
-    rate_hz: int = 100
-    chord_mm: float = 1.0
-    mount: bool = True
-    unmount: bool = True
-    change_bar: bool = False
-    opens: Literal[1, -1] = 1
-    length_calibrated: bool = True
-    u_length_mm: float = 0.002
-    even: bool = False
-    feed_in_deg: float = 0.0
-    feed_out_deg: float = 0.0
-    link_mm: Point | None = None
+    feed_in_deg: Lead = 0.0
+    feed_out_deg: Lead = 0.0
+    kind: Literal["helix"] = "helix"
+    chord_mm: float = inner(1.0)
+    even: bool = inner(False)
 
     def path(self) -> Path:
         """All points in the order of driving, feed-in and feed-out included."""
@@ -118,7 +104,7 @@ class Helix:
 
 
 @dataclass(frozen=True, slots=True)
-class HelixPoints:
+class HelixPoints(CupTest):
     """The same helix point by point: ``points`` places from pole to equator (direction -1: back), each read at standstill.
 
     Between two places the machine goes along the sphere, so that the bar stays within its stroke, stops half a millimetre before the next
@@ -126,27 +112,14 @@ class HelixPoints:
     the places follow each other. There the mean of ``samples`` readings is taken after ``settle_s``.
     """
 
-    label: str
-    setup_id: str
-    role: str
-    centre_mm: Point
-    radius_mm: float
-    turns: float = 5.0
+    _: KW_ONLY
+    turns: Turns = 5.0
     law: Law = "area"
-    axis: int = 2
-    points: int = 120
-    feed_mm_min: float = 2000.0
-    direction: Literal[1, -1] = 1
-    rate_hz: int = 1000
-    settle_s: float = 0.3
-    samples: int = 20
-    mount: bool = True
-    unmount: bool = True
-    change_bar: bool = False
-    opens: Literal[1, -1] = 1
-    length_calibrated: bool = True
-    u_length_mm: float = 0.002
-    link_mm: Point | None = None
+    points: Annotated[int, Limits(ge=20, le=2000)] = 120
+    rate_hz: Rate = 1000
+    settle_s: Settle = 0.3
+    samples: Annotated[int, Limits(ge=1, le=1000)] = 20
+    kind: Literal["helix_points"] = "helix_points"
 
     def path(self) -> Path:
         """The places in the order of reading."""
@@ -181,7 +154,7 @@ class HelixPoints:
 
 
 @dataclass(frozen=True, slots=True)
-class Circle:
+class Circle(CupTest):
     """Circular test (ISO 230-4) in the plane of two axes: ``span_deg`` from ``start_deg``, angles from the plane's first axis to its
     second.
 
@@ -189,33 +162,19 @@ class Circle:
     circle and do not count (ISO 230-4: 180 degrees for a full circle). Where nothing is said, the plane across ``axis`` has a full circle
     from 0 degrees, and the two planes that hold it the partial arc of 220 degrees about the pole with 2 degrees before and after it: what
     carries the cup stands below. ``under_the_cup``: points lower than that are wanted; somebody has made sure that there is room.
-    ``axis`` and ``opens``: where the spindle is, as of a helix; the machine takes the way over this pole between two arcs about one cup.
-    The others: as of `Helix`.
+    The machine takes the way over the pole between two arcs about one cup.
     """
 
-    label: str
-    setup_id: str
-    role: str
-    centre_mm: Point
-    radius_mm: float
-    plane: Plane = "XY"
-    start_deg: float | None = None
-    span_deg: float | None = None
-    feed_in_deg: float | None = None
-    feed_out_deg: float | None = None
-    feed_mm_min: float = 1000.0
-    direction: Literal[1, -1] = 1
-    rate_hz: int = 100
-    chord_mm: float = 0.5
-    axis: int = 2
-    opens: Literal[1, -1] = 1
-    mount: bool = True
-    unmount: bool = True
-    change_bar: bool = False
-    length_calibrated: bool = True
-    u_length_mm: float = 0.002
-    link_mm: Point | None = None
+    plane: Plane
+    start_deg: Annotated[float, Limits(ge=-360.0, le=360.0)] | None = None
+    span_deg: Annotated[float, Limits(ge=30.0, le=720.0)] | None = None
+    feed_in_deg: Arc | None = None
+    feed_out_deg: Arc | None = None
+    _: KW_ONLY
     under_the_cup: bool = False
+    feed_mm_min: Feed = 1000.0
+    kind: Literal["circle"] = "circle"
+    chord_mm: float = inner(0.5)
 
     def arc(self) -> dict[str, float]:
         """Where the arc begins, how long it is, feed-in and feed-out, degrees; what nobody said is chosen."""

@@ -33,7 +33,7 @@ def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identif
         recipes.append(Helix(f"helix{k + 1}", f"B{k + 1}", "identify", centre, radius, rate_hz=rate_hz))
     for a in range(3):
         for k, at in enumerate((0.15, 0.85)):
-            recipes.append(Linear(f"line{AXES[a]}{k + 1}", f"L{AXES[a]}{k + 1}", "identify", a, n=25, at=at))
+            recipes.append(Linear(f"line{AXES[a]}{k + 1}", f"L{AXES[a]}{k + 1}", "identify", a, at_share=(at, at)))
     for order in ("XYZ", "ZYX"):
         recipes += [Diagonal(f"step-{d}-{order}", f"D{d}{order}", "identify", d, 12, order) for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))

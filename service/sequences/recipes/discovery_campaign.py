@@ -58,7 +58,10 @@ def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew")
 
 def _lines(machine: Machine, when: str) -> list[Recipe]:
     """Every axis alone: what grows with the session shows in its length, whatever the squareness does."""
-    return [Linear(f"{when}-line{AXES[a]}", f"{when}{AXES[a]}", "identify", a, n=LINE_N, at=0.5) for a in range(len(machine.stroke_mm))]
+    return [
+        Linear(f"{when}-line{AXES[a]}", f"{when}{AXES[a]}", "identify", a, at_share=(0.5, 0.5), positions=LINE_N)
+        for a in range(len(machine.stroke_mm))
+    ]
 
 
 def _helix(machine: Machine, setup: str, rel: tuple[float, float, float], share: float, rate_hz: int) -> Helix:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import KW_ONLY, dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field as Limits
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import cycles_of, diagonal_ends, face_ends, step_diagonal, straight_line, target_shares
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import RAPID_MM_MIN, Array, as_point
+from abbe.service.sequences.recipes.fields import AxisIndex, Feed, Flat, Settle, Share, TestRecipe, one_of
 from abbe.service.sequences.steps import MountLaser, MoveTo, ReadLaser, Step, TestPlan, Unmount, ZeroLaser
 
 APPROACH_MM = 1.0
@@ -18,27 +20,35 @@ CLEARANCE_MM = 10.0
 """Laser lines keep this distance from the ends of the strokes, so that the approach and an overrun stay inside them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Diagonal:
-    """Body diagonal by laser: sequential single-axis ``steps`` (Wang), or plain positions when ``order`` is empty; out and back.
+Steps = Annotated[int, Limits(ge=1, le=500)]
 
-    ``cycles``: out and back so many times, in one run. ``overrun_mm`` (plain positions only): the machine turns so far beyond both ends, so
-    that every position is approached in the direction of its leg; the turning points are read as well.
-    ``mount`` and ``unmount`` are false where two orders in a row share one mirror: the second does not mount, the first leaves it.
+
+@dataclass(frozen=True, slots=True)
+class BeamTest(TestRecipe):
+    """A laser test along one line, out and back.
+
+    ``cycles``: so many times, in one run (ISO 230-2: five). ``overrun_mm``: the machine turns so far beyond both ends, so that every
+    position is approached in the direction of its leg; the turning points are read as well.
     """
 
-    label: str
-    setup_id: str
-    role: str
-    diagonal: str
-    steps: int = 12
-    order: str = "XYZ"
-    feed_mm_min: float = RAPID_MM_MIN
-    settle_s: float = 0.3
-    mount: bool = True
-    unmount: bool = True
-    cycles: int = 1
-    overrun_mm: float = 0.0
+    _: KW_ONLY
+    feed_mm_min: Feed = RAPID_MM_MIN
+    settle_s: Settle = 0.3
+    cycles: Annotated[int, Limits(ge=1, le=50)] = 1
+    overrun_mm: Annotated[float, Limits(ge=0.0, le=8.0)] = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Diagonal(BeamTest):
+    """Body diagonal by laser: sequential single-axis ``steps`` (Wang), or plain positions when ``order`` is empty; out and back.
+
+    Only plain positions may have an overrun.
+    """
+
+    diagonal: Annotated[str, one_of("ppp", "npp", "pnp", "ppn")]
+    steps: Steps = 12
+    order: Annotated[str, one_of("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")] = ""
+    kind: Literal["diagonal"] = "diagonal"
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: approach, mount, zero, one reading after every move, clear away.
@@ -63,31 +73,26 @@ class Diagonal:
 
 
 @dataclass(frozen=True, slots=True)
-class FaceDiagonal:
-    """Diagonal of a plane of two axes by laser (ISO 230-6 has six of them: two in each plane), the third axis at ``at`` of its stroke.
+class FaceDiagonal(BeamTest):
+    """Diagonal of a plane of two axes by laser (ISO 230-6 has six of them: two in each plane), the third axis standing.
+
+    ``at_share``: where that one stands in its stroke.
 
     ``diagonal``: ``pp`` both axes of the plane grow, ``np`` the first falls. As a run it is a ``laser_diagonal`` that does not move the
     third axis: its letter in ``diagonal`` is p, and ``face`` names the plane.
     """
 
-    label: str
-    setup_id: str
-    role: str
-    plane: str
-    diagonal: str
-    steps: int = 12
-    at: float = 0.5
-    feed_mm_min: float = RAPID_MM_MIN
-    settle_s: float = 0.3
-    mount: bool = True
-    unmount: bool = True
-    cycles: int = 1
-    overrun_mm: float = 0.0
+    plane: Flat
+    diagonal: Annotated[str, one_of("pp", "np")]
+    _: KW_ONLY
+    at_share: Share = 0.5
+    steps: Steps = 12
+    kind: Literal["face"] = "face"
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: approach, mount, zero, one reading after every move, clear away."""
         box = machine.stroke_mm + np.array([CLEARANCE_MM, -CLEARANCE_MM])
-        start, end = face_ends(box, self.plane, self.diagonal, self.at)
+        start, end = face_ends(box, self.plane, self.diagonal, self.at_share)
         letters = ["p", "p", "p"]
         letters["XYZ".index(self.plane[0])] = self.diagonal[0]
         setup = {"setup_id": self.setup_id, "diagonal": "".join(letters), "face": self.plane, "steps": self.steps}
@@ -95,40 +100,33 @@ class FaceDiagonal:
 
 
 @dataclass(frozen=True, slots=True)
-class Linear:
-    """Single-axis positioning by laser (ISO 230-2 line), ``n`` positions out and back, at relative place ``at`` of the other strokes.
+class Linear(BeamTest):
+    """Single-axis positioning by laser (ISO 230-2 line), so many ``positions`` out and back.
 
-    ``at``: one place for both other axes, or one for each in the order X, Y, Z. ``cycles``: out and back so many times (ISO 230-2: five).
-    ``overrun_mm``: the machine turns so far beyond both ends, so that every position is approached in the direction of its leg; the turning
-    points are read as well. ``offset_share``: each position is moved by a pseudo-random part of the interval, at most by this share of it,
-    so that errors with a period do not hide (ISO 230-2); ``seed`` says which.
+    ``at_share``: relative places in the strokes of the two other axes, in the order X, Y, Z.
+
+    ``offset_share``: each position is moved by a pseudo-random part of the interval, at most by this share of it, so that errors with a
+    period do not hide (ISO 230-2); ``seed`` says which.
     """
 
-    label: str
-    setup_id: str
-    role: str
-    axis: int
-    n: int = 21
-    at: float | tuple[float, float] = 0.15
-    feed_mm_min: float = RAPID_MM_MIN
-    settle_s: float = 0.3
-    mount: bool = True
-    unmount: bool = True
-    cycles: int = 1
-    overrun_mm: float = 0.0
-    offset_share: float = 0.0
-    seed: int = 1
+    axis: AxisIndex
+    _: KW_ONLY
+    at_share: tuple[Share, Share]
+    positions: Annotated[int, Limits(ge=5, le=1000)] = 25
+    offset_share: Annotated[float, Limits(ge=0.0, le=0.4)] = 0.0
+    seed: Annotated[int, Limits(ge=0, le=2**31)] = 1
+    kind: Literal["line"] = "line"
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: approach, mount, zero, one reading after every move, clear away."""
         others = [a for a in range(3) if a != self.axis]
         start = machine.stroke_mm[:, 0].copy()
-        start[others] += np.array(self.at) * machine.length_mm[others]
+        start[others] += np.array(self.at_share) * machine.length_mm[others]
         end = start.copy()
         start[self.axis], end[self.axis] = machine.stroke_mm[self.axis] + np.array([CLEARANCE_MM, -CLEARANCE_MM])
-        out = straight_line(start, end, self.n, back=False)
+        out = straight_line(start, end, self.positions, back=False)
         if self.offset_share:
-            out = start + target_shares(self.n, self.offset_share, self.seed)[:, None] * (end - start)
+            out = start + target_shares(self.positions, self.offset_share, self.seed)[:, None] * (end - start)
         return _laser_plan(self, "laser_linear", {"setup_id": self.setup_id, "axis": AXES[self.axis]}, out)
 
 

@@ -11,28 +11,36 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from abbe.service.errors import ConfigError
 from abbe.service.explain import expected, nearest, where
-from abbe.service.sequences.recipes import bar_tables, laser_tables
-from abbe.service.sequences.recipes.bar_tables import CircleTable, HelixPointsTable, HelixTable, bar_table
-from abbe.service.sequences.recipes.laser_tables import DiagonalTable, FaceTable, LineTable, laser_table
-from abbe.service.sequences.recipes.recipe import BarRecipe, Recipe
-from abbe.service.sequences.recipes.recipe_tables import RecipeTable, TestTable
+from abbe.service.sequences.recipes.fields import TestRecipe, file_fields, file_table
+from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear, Recipe
 from abbe.service.sequences.recipes.setups import shared_setups
 
 FORMAT = "abbe-recipe/1"
+KINDS: dict[str, type[TestRecipe]] = {
+    "helix": Helix, "helix_points": HelixPoints, "circle": Circle, "diagonal": Diagonal, "face": FaceDiagonal, "line": Linear,
+}  # fmt: skip
+
+
+def _consistent(recipe: Recipe) -> Recipe:
+    if isinstance(recipe, Diagonal) and recipe.order and recipe.overrun_mm:
+        raise ValueError("expected no overrun_mm beside order: a step diagonal turns where it stands")
+    return recipe
+
+
 AnyTest = Annotated[
-    HelixTable | HelixPointsTable | CircleTable | DiagonalTable | FaceTable | LineTable,
-    Field(discriminator="kind"),
+    Helix | HelixPoints | Circle | Diagonal | FaceDiagonal | Linear, Field(discriminator="kind"), AfterValidator(_consistent)
 ]
-KINDS: dict[str, type[TestTable]] = bar_tables.KINDS | laser_tables.KINDS
 
 
-class RecipeFile(RecipeTable):
+class RecipeFile(BaseModel):
     """A whole recipe file."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
     format: Literal["abbe-recipe/1"]
     name: Annotated[str, Field(min_length=1, max_length=120)]
@@ -75,12 +83,26 @@ def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
         content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise ConfigError(f"{source}: not valid TOML: {' '.join(str(error).split())[:200]}", "correct this line") from None
+    _check_keys(content, source)
     try:
         # By way of JSON: there strict means that text is no number, while a list still is a tuple.
         found = RecipeFile.model_validate_json(json.dumps(content, default=str), strict=True)
     except ValidationError as error:
         raise _config_error(source, error.errors()) from None
-    return found.name, shared_setups(tuple(t.recipe() for t in found.test), source)
+    return found.name, shared_setups(tuple(found.test), source)
+
+
+def _check_keys(content: dict[str, Any], source: str) -> None:
+    """Refuse a key that no test of its kind has: the recipes have fields which are none of a file's. A test without a role identifies."""
+    tests = content.get("test")
+    for k, table in enumerate(tests if isinstance(tests, list) else []):
+        kind = KINDS.get(str(table.get("kind"))) if isinstance(table, dict) else None
+        keys = [] if kind is None else list(file_fields(kind))
+        for key in table if keys else ():
+            if key not in keys:
+                raise ConfigError(f"{source}: unknown key {where(('test', k, key))!r}", nearest(key, keys))
+        if isinstance(table, dict):
+            table.setdefault("role", "identify")
 
 
 def _config_error(source: str, errors: list[ErrorDetails]) -> ConfigError:
@@ -88,8 +110,7 @@ def _config_error(source: str, errors: list[ErrorDetails]) -> ConfigError:
     tail = f" (and {more} more)" if more else ""
     place = tuple(p for p in first["loc"] if p not in KINDS)
     if first["type"] == "extra_forbidden":
-        valid = KINDS[str(first["loc"][2])] if len(first["loc"]) > 3 else RecipeFile
-        return ConfigError(f"{source}: unknown key {where(place)!r}{tail}", nearest(str(place[-1]), list(valid.model_fields)))
+        return ConfigError(f"{source}: unknown key {where(place)!r}{tail}", nearest(str(place[-1]), list(RecipeFile.model_fields)))
     if first["type"] == "union_tag_not_found":
         return ConfigError(f"{source}: key {where((*place, 'kind'))!r} is missing{tail}", f"add kind = {' or '.join(map(repr, KINDS))}")
     if first["type"] == "missing":
@@ -109,15 +130,10 @@ def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
     if note:
         lines.append(f"note = {_toml(note)}")
     for recipe in recipes:
-        lines += ["", "[[test]]", *(f"{key} = {_toml(value)}" for key, value in _table(recipe).items())]
+        lines += ["", "[[test]]", *(f"{key} = {_toml(value)}" for key, value in file_table(recipe).items())]
     text = "\n".join(lines) + "\n"
     parse_recipe(text, f"recipe {name!r}")
     return text
-
-
-def _table(recipe: Recipe) -> dict[str, Any]:
-    own = bar_table(recipe) if isinstance(recipe, BarRecipe) else laser_table(recipe)
-    return {"kind": own["kind"], "label": recipe.label, "setup": recipe.setup_id, "role": recipe.role} | own
 
 
 def _toml(value: Any) -> str:

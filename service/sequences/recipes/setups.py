@@ -48,10 +48,10 @@ def _check_shared(before: Recipe, after: Recipe, source: str) -> None:
     elif isinstance(before, Diagonal) and isinstance(after, Diagonal):
         trouble = "" if before.diagonal == after.diagonal else "another diagonal needs another alignment"
     elif isinstance(before, FaceDiagonal) and isinstance(after, FaceDiagonal):
-        same = (before.plane, before.diagonal, before.at) == (after.plane, after.diagonal, after.at)
+        same = (before.plane, before.diagonal, before.at_share) == (after.plane, after.diagonal, after.at_share)
         trouble = "" if same else "another diagonal needs another alignment"
     elif isinstance(before, Linear) and isinstance(after, Linear):
-        trouble = "" if (before.axis, before.at) == (after.axis, after.at) else "another line needs another alignment"
+        trouble = "" if (before.axis, before.at_share) == (after.axis, after.at_share) else "another line needs another alignment"
     else:
         trouble = "only ball-bar tests about one cup and laser tests on one line share a set-up"
     if trouble:

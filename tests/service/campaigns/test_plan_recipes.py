@@ -54,9 +54,19 @@ diagonals = st.builds(
 share = st.floats(0.0, 1.0)
 again = {"cycles": st.integers(1, 50), "overrun_mm": st.floats(0.0, 8.0)}
 lines = st.builds(
-    Linear, names, names, roles, st.integers(0, 2), n=st.integers(5, 1000), at=st.tuples(share, share), offset_share=st.just(0.3), **again
+    Linear,
+    names,
+    names,
+    roles,
+    st.integers(0, 2),
+    positions=st.integers(5, 1000),
+    at_share=st.tuples(share, share),
+    offset_share=st.just(0.3),
+    **again,
 )
-faces = st.builds(FaceDiagonal, names, names, roles, st.sampled_from(["XY", "YZ", "ZX"]), st.sampled_from(["pp", "np"]), at=share, **again)
+faces = st.builds(
+    FaceDiagonal, names, names, roles, st.sampled_from(["XY", "YZ", "ZX"]), st.sampled_from(["pp", "np"]), at_share=share, **again
+)
 cups = (names, names, roles, st.tuples(millimetres, millimetres, millimetres), st.floats(1.0, 2000.0))
 places = st.builds(HelixPoints, *cups, points=st.integers(20, 2000), samples=st.integers(1, 1000), settle_s=st.floats(0.0, 60.0))
 angle = st.floats(0.0, 360.0)
@@ -182,7 +192,7 @@ def test_instruments_that_the_machine_does_not_have_are_refused():
         plan_for(replace(site(), urls=DeviceUrls(laser="x")), minutes=9.0, tools=Instruments(laser=False))
 
 
-GOOD = recipe_text("n", (Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0), Linear("l", "S2", "identify", 1, at=(0.1, 0.9))))
+GOOD = recipe_text("n", (Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0), Linear("l", "S2", "identify", 1, at_share=(0.1, 0.9))))
 
 
 @pytest.mark.parametrize(
@@ -223,19 +233,19 @@ def test_set_ups_that_cannot_be_shared_are_named():
     for second, says in (
         (Helix("b", "S1", "identify", (301.0, 250.0, 50.0), 150.0), "another cup"),
         (Helix("b", "S1", "identify", cup, 150.0, opens=-1), "another cup"),
-        (Linear("b", "S1", "identify", 0), "share a set-up"),
+        (Linear("b", "S1", "identify", 0, at_share=(0.15, 0.15)), "share a set-up"),
     ):
         with pytest.raises(ConfigError, match=says):
             shared_setups((first, second), "f")
     with pytest.raises(ConfigError, match="another alignment"):
         shared_setups((Diagonal("a", "D", "identify", "ppp"), Diagonal("b", "D", "identify", "npp")), "f")
     with pytest.raises(ConfigError, match="another line"):
-        shared_setups((Linear("a", "L", "identify", 0), Linear("b", "L", "identify", 1)), "f")
+        shared_setups((Linear("a", "L", "identify", 0, at_share=(0.15, 0.15)), Linear("b", "L", "identify", 1, at_share=(0.15, 0.15))), "f")
     low = Circle("a", "S1", "identify", (300.0, 250.0, 225.0), 150.0, "YZ", -90.0, 360.0, feed_in_deg=0.0, feed_out_deg=0.0)
     with pytest.raises(ConfigError, match="below the cup"):
         shared_setups((low, replace(low, label="b", radius_mm=100.0)), "f")
     with pytest.raises(ConfigError, match="taken down before"):
-        shared_setups((first, Linear("b", "S2", "identify", 0), Helix("c", "S1", "identify", cup, 100.0)), "f")
+        shared_setups((first, Linear("b", "S2", "identify", 0, at_share=(0.15, 0.15)), Helix("c", "S1", "identify", cup, 100.0)), "f")
 
 
 MACHINE_TOML = 'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0.0, 600.0]\nY = [0.0, 500.0]\nZ = [0.0, 450.0]\n'

@@ -69,7 +69,7 @@ async def all_there(*_: object, **__: object) -> None:
 async def test_after_the_last_day_of_a_certificate_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(work, "_measured")
     bench = pretended(calibrated_until={"laser": date(2020, 5, 31), "ballbar": date(2020, 4, 30)})
-    line = Linear("l", "L1", "identify", 0, n=5).plan(MACHINE)
+    line = Linear("l", "L1", "identify", 0, positions=5, at_share=(0.15, 0.15)).plan(MACHINE)
     bench.plan = CampaignPlan("full 1", (line,))
     led = await work.run_guided_campaign(bench, {}, "bob")
     assert (led.word, "certificate of the laser has ended on 2020-05-31" in led.text, "ball-bar" in led.text) == ("ended", True, False)

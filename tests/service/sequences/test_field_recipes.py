@@ -125,7 +125,9 @@ def test_point_by_point_every_axis_arrives_the_way_its_places_follow_each_other(
 
 @pytest.mark.parametrize("cycles", [1, 5])
 def test_every_target_is_approached_from_the_side_that_its_direction_names(cycles):
-    plan = Linear("l", "S", "identify", 1, n=11, at=(0.5, 0.5), cycles=cycles, overrun_mm=2.0, offset_share=0.3, seed=4).plan(MACHINE)
+    plan = Linear("l", "S", "identify", 1, positions=11, at_share=(0.5, 0.5), cycles=cycles, overrun_mm=2.0, offset_share=0.3, seed=4).plan(
+        MACHINE
+    )
     assert all(np.sign(came) == direction for came, direction, _ in approaches(plan, 1))
     targets = [at for _, _, at in approaches(plan, 1)]
     assert len(targets) == cycles * 2 * (11 + 1) + 1
@@ -134,7 +136,9 @@ def test_every_target_is_approached_from_the_side_that_its_direction_names(cycle
     even = np.linspace(10.0, 490.0, 11)
     assert 1.0 < np.abs(np.subtract(inner, even)).max() < 0.3 * 48.0  # pseudo-random, less than its share of the interval
     assert inner == sorted(inner)
-    again = Linear("l", "S", "identify", 1, n=11, at=(0.5, 0.5), cycles=cycles, overrun_mm=2.0, offset_share=0.3, seed=4).plan(MACHINE)
+    again = Linear(
+        "l", "S", "identify", 1, positions=11, at_share=(0.5, 0.5), cycles=cycles, overrun_mm=2.0, offset_share=0.3, seed=4
+    ).plan(MACHINE)
     assert again == plan
     # the exchange file says the same: directions of travel follow from the positions, overruns included
     rows = np.zeros((len(targets), 3))
@@ -156,7 +160,7 @@ def approaches(plan, axis):
 
 @pytest.mark.parametrize(("plane", "diagonal"), [(p, d) for p, ds in FACES.items() for d in ds])
 def test_the_six_face_diagonals_move_two_axes(plane, diagonal):
-    plan = FaceDiagonal("f", "S", "identify", plane, diagonal, steps=8, at=0.25, cycles=2, overrun_mm=1.0).plan(MACHINE)
+    plan = FaceDiagonal("f", "S", "identify", plane, diagonal, steps=8, at_share=0.25, cycles=2, overrun_mm=1.0).plan(MACHINE)
     start, end = (np.array(plan.setup[k]) for k in ("start_mm", "end_mm"))
     a, b = ("XYZ".index(c) for c in plane)
     assert np.sign(end - start)[[a, b]].tolist() == [1.0 if diagonal[0] == "p" else -1.0, 1.0]

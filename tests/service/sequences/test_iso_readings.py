@@ -41,7 +41,7 @@ def lost(position, direction):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_turning_points_of_an_overrun_are_no_positions(axis):
-    run = line(Linear("l", "L", "identify", axis, n=5, cycles=3, overrun_mm=2.0), lost)
+    run = line(Linear("l", "L", "identify", axis, positions=5, cycles=3, overrun_mm=2.0, at_share=(0.15, 0.15)), lost)
     (test,) = linear_tests([run], [])
     assert test.name == "XYZ"[axis]
     assert test.readings.position_mm.size == 5
@@ -56,14 +56,14 @@ def test_turning_points_of_an_overrun_are_no_positions(axis):
 
 
 def test_without_overrun_the_end_is_said_to_be_read_twice():
-    (test,) = linear_tests([line(Linear("l", "L", "identify", 0, n=5), lost)], [])
+    (test,) = linear_tests([line(Linear("l", "L", "identify", 0, positions=5, at_share=(0.15, 0.15)), lost)], [])
     assert test.readings.position_mm.size == 5
     assert "no overrun on record" in test.notes[0]
 
 
 def test_runs_of_one_set_up_are_one_test_and_other_set_ups_are_others():
-    first, second = (line(Linear(n, "L", "identify", 0, n=5), lost) for n in "ab")
-    other = line(Linear("c", "M", "identify", 0, n=5), lost)
+    first, second = (line(Linear(n, "L", "identify", 0, positions=5, at_share=(0.15, 0.15)), lost) for n in "ab")
+    other = line(Linear("c", "M", "identify", 0, positions=5, at_share=(0.15, 0.15)), lost)
     found = linear_tests([first, other, second], [])
     assert [(t.setup, t.runs) for t in found] == [("L", ("a", "b")), ("M", ("c",))]
     assert found[0].readings.forward_mm.shape == (5, 2)
@@ -71,7 +71,7 @@ def test_runs_of_one_set_up_are_one_test_and_other_set_ups_are_others():
 
 def test_a_test_against_the_axis_reads_the_same(monkeypatch):
     """Start and end exchanged: displacement along the beam is the other way, and so are both directions."""
-    run = line(Linear("l", "L", "identify", 0, n=5, cycles=2, overrun_mm=2.0), lost)
+    run = line(Linear("l", "L", "identify", 0, positions=5, cycles=2, overrun_mm=2.0, at_share=(0.15, 0.15)), lost)
     there = linear_tests([run], [])[0].readings
     setup, columns = run["setup"], run["columns"]
     turned = run | {"setup": setup | {"start_mm": setup["end_mm"], "end_mm": setup["start_mm"]}}
@@ -82,7 +82,7 @@ def test_a_test_against_the_axis_reads_the_same(monkeypatch):
 
 
 def test_what_cannot_be_evaluated_is_told_and_stops_nothing():
-    good, bad = (line(Linear(n, n, "identify", 0, n=5), lost) for n in "ab")
+    good, bad = (line(Linear(n, n, "identify", 0, positions=5, at_share=(0.15, 0.15)), lost) for n in "ab")
     bad["columns"]["direction"] = [1] * len(bad["columns"]["direction"])
     columns = {k: v[:4] for k, v in good["columns"].items()}
     setup = {"setup_id": "B", "plane": "XY", "centre_mm": [300, 250, 100], "radius_mm": 100.0}
@@ -97,7 +97,10 @@ def test_what_cannot_be_evaluated_is_told_and_stops_nothing():
 
 def test_the_verifications_range_is_the_standards_m():
     """Two ways through the code, one figure: `abbe.models.verification` and ISO 230-6."""
-    run = line(Linear("l", "L", "identify", 0, n=9), lambda x, d: 1e-8 * (x - 200.0) ** 2 + 0.003 * (d < 0) + 1e-4 * np.sin(x * d))
+    run = line(
+        Linear("l", "L", "identify", 0, positions=9, at_share=(0.15, 0.15)),
+        lambda x, d: 1e-8 * (x - 200.0) ** 2 + 0.003 * (d < 0) + 1e-4 * np.sin(x * d),
+    )
     run |= {"test": "laser_diagonal", "setup": run["setup"] | {"diagonal": "ppp"}}
     (test,) = diagonal_tests([run], [])["body"]
     by = {f.symbol: f for f in evaluate([run]).figures}

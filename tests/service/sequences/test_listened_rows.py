@@ -17,8 +17,8 @@ from tests.pretended_status import controller_status
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 COMPENSATED = 1 << 3
 KINDS = {
-    "line": Linear("l", "L", "identify", 0, n=6, cycles=2, overrun_mm=2.0),
-    "line without overrun": Linear("l", "L", "identify", 1, n=7),
+    "line": Linear("l", "L", "identify", 0, positions=6, cycles=2, overrun_mm=2.0, at_share=(0.15, 0.15)),
+    "line without overrun": Linear("l", "L", "identify", 1, positions=7, at_share=(0.15, 0.15)),
     "straight diagonal": Diagonal("d", "D", "identify", "npp", 6, ""),
     "step diagonal": Diagonal("d", "D", "identify", "ppp", 4, "XYZ"),
     "face diagonal": FaceDiagonal("f", "F", "identify", "XY", "np", steps=6),

@@ -31,7 +31,7 @@ KINDS = {
     "step diagonal": Diagonal("d", "mirror", "identify", "npp", 5, "ZXY"),
     "straight diagonal": Diagonal("d", "mirror", "identify", "ppn", 6, "", cycles=2, overrun_mm=1.0),
     "face diagonal": FaceDiagonal("f", "face", "identify", "ZX", "np", steps=4, cycles=2, overrun_mm=0.05),
-    "line": Linear("l", "line", "identify", 2, n=5, at=(0.2, 0.4), offset_share=0.3, cycles=3, overrun_mm=2.0),
+    "line": Linear("l", "line", "identify", 2, positions=5, at_share=(0.2, 0.4), offset_share=0.3, cycles=3, overrun_mm=2.0),
 }
 
 

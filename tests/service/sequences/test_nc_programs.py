@@ -46,7 +46,7 @@ def plan():
             Circle("zx", "cup", "identify", CUP, 80.0, "ZX", -110.0, 220.0, 2.0, 2.0, direction=-1),
             Diagonal("d", "mirror (µm)", "identify", "npp", 3, "XYZ"),
             FaceDiagonal("f", "face", "identify", "XY", "np", steps=4, cycles=2, overrun_mm=1.0),
-            Linear("l", "line", "identify", 2, n=5, at=(0.2, 0.4), offset_share=0.3),
+            Linear("l", "line", "identify", 2, positions=5, at_share=(0.2, 0.4), offset_share=0.3),
         ),
         "f",
     )

@@ -50,7 +50,7 @@ def test_step_diagonals_move_one_axis_at_a_time_and_return_the_way_they_came(dia
 
 
 def test_laser_lines_approach_their_start_in_the_direction_of_the_first_motion():
-    for recipe in (Diagonal("d", "D", "identify", "npp"), Linear("l", "L", "identify", 0)):
+    for recipe in (Diagonal("d", "D", "identify", "npp"), Linear("l", "L", "identify", 0, at_share=(0.15, 0.15))):
         plan = recipe.plan(MACHINE)
         approach, start = (s.target_mm for s in plan.steps[:2] if isinstance(s, MoveTo))
         end = plan.setup["end_mm"]

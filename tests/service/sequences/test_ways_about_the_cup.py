@@ -12,9 +12,8 @@ from abbe.models.machine import Machine
 from abbe.models.paths.circles import way_on_sphere
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run
-from abbe.service.sequences.recipes.bar_tables import bar_table
 from abbe.service.sequences.recipes.recipe import Circle
-from abbe.service.sequences.recipes.recipe_file import parse_recipe
+from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_text
 from abbe.service.sequences.recipes.setups import shared_setups
 from abbe.service.sequences.resume_plan import end_of, remounted, rest_of
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, RecordPath, TakeBarOut
@@ -114,9 +113,7 @@ def test_a_path_under_the_cup_is_refused_unless_the_recipe_says_that_there_is_ro
         dry_run(MACHINE, whole.plan(MACHINE))
     allowed = replace(whole, under_the_cup=True)
     dry_run(MACHINE, allowed.plan(MACHINE))
-    keys = {k: f'"{v}"' if isinstance(v, str) else str(v).lower() for k, v in bar_table(allowed).items()}
-    text = 'format = "abbe-recipe/1"\nname = "n"\n[[test]]\nlabel = "c"\nsetup = "S"\n'
-    _, (again,) = parse_recipe(text + "".join(f"{k} = {v}\n" for k, v in keys.items()), "f")
+    _, (again,) = parse_recipe(recipe_text("n", (allowed,)), "f")
     assert again.path() == allowed.path()
     assert again.under_the_cup
 
