@@ -15,8 +15,7 @@ from abbe.models.geometry.bases import Term
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.uncertainty.combined import approach_variance_mm2, joint_factor
-from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.uncertainty.sources import ErrorSources, approach_variance_mm2, error_sources, joint_factor
 
 INNER_SHARE = 0.8
 """Share of each stroke, about its middle, over which distances are judged."""

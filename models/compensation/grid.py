@@ -20,10 +20,9 @@ from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.frame import RigidFree
 from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.models.uncertainty.mask import compensable_mask
+from abbe.models.uncertainty.mask import compensable_mask, unseen_mm
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
-from abbe.models.uncertainty.unseen import unseen_mm
 from abbe.models.volumetric import rigid_design
 
 # Where a deviation is known worse than it is large, nothing is compensated; what then happens at the border.
@@ -201,7 +200,7 @@ def compensable_nodes(
     """Nodes at which the deviation is larger than its expanded uncertainty (`abbe.models.uncertainty.mask`), shape ``counts``.
 
     All sources of uncertainty count; the deviation is that without rigid motion over the grid. ``k``: coverage factor, default 95 %.
-    Nor is a node compensated where what leaves no trace in any reading may be larger than the deviation (`abbe.models.uncertainty.unseen`).
+    Nor is a node compensated where what leaves no trace in any reading may be larger than the deviation (`abbe.models.uncertainty.mask`).
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)

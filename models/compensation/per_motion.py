@@ -27,8 +27,7 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.assessment import motions_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.parameters import observable_motions
-from abbe.models.uncertainty.combined import variances
-from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
 from abbe.models.volumetric import rigid_design, volume_grid
 
 NODES = 7

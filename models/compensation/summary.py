@@ -15,9 +15,8 @@ from abbe.models.compensation.additive import main_effect
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.priors import U_WAVELENGTH
-from abbe.models.uncertainty.combined import variances
 from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
 
 SCALE_NOTE = "at the machine's temperature while it was measured"
 """What every printed scale has to say: no material temperature correction is made."""

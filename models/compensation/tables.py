@@ -16,11 +16,9 @@ from abbe.models.geometry.bases import Term
 from abbe.models.geometry.chain import design
 from abbe.models.machine import AXES, Machine
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.uncertainty.budget import budget_over
-from abbe.models.uncertainty.combined import variances
 from abbe.models.uncertainty.frame import RigidFree
-from abbe.models.uncertainty.prediction import predict_deviation
-from abbe.models.uncertainty.sources import ErrorSources, error_sources
+from abbe.models.uncertainty.prediction import budget_over, predict_deviation
+from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
 from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 
 

@@ -12,8 +12,7 @@ from abbe.models.effects.path import Path
 from abbe.models.geometry.bases import Term, smooth_terms, term_values
 from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import SetupUnknowns, linearise, predict
-from abbe.models.solvers.observe_kinematics import LOST, AxisPlaces, with_tool
+from abbe.models.solvers.observe import LOST, AxisPlaces, SetupUnknowns, linearise, predict, with_tool
 from abbe.models.solvers.observe_setup import bar_length_name
 from abbe.models.solvers.priors import Priors, smooth_shapes, term_prior_sd
 

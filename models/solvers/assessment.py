@@ -17,13 +17,13 @@ from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from abbe.models.machine import Machine
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.cures import CampaignLayout
-from abbe.models.solvers.observability.free import hidden_free
 from abbe.models.solvers.observability.hidden import Advice, HiddenGroup, picture
 from abbe.models.solvers.observability.parameters import (
     Correlation,
     MotionStatus,
     ParameterStatus,
     correlations,
+    hidden_free,
     hidden_terms,
     motions,
     parameters,

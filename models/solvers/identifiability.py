@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.solvers.decomposition import svd
+from abbe.models.solvers.least_squares import svd
 
 RANK_TOLERANCE = 1e-9
 EFFECTIVE_TOLERANCE = 1e-3

@@ -22,8 +22,7 @@ from abbe.models.solvers.observe import predict
 from abbe.models.uncertainty.distributions import NORMAL, Distribution
 from abbe.models.uncertainty.frame import RigidFree, field
 from abbe.models.uncertainty.monte_carlo import Draw
-from abbe.models.uncertainty.response import Response, response
-from abbe.models.uncertainty.sources import ErrorSources
+from abbe.models.uncertainty.sources import ErrorSources, Response, response
 
 READINGS = ("bar_noise", "laser_noise")
 LIMITS: Mapping[str, Distribution] = MappingProxyType(

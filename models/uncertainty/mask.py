@@ -11,10 +11,41 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
-from abbe.models.arrays import F1
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.uncertainty.coverage import PROBABILITY, coverage_factor
+from abbe.models.uncertainty.frame import RigidFree, field
 from abbe.models.uncertainty.prediction import Prediction
+
+NO_TRACE_SIGMA = 0.3
+"""A direction of typical size that changes all readings together by less than this many standard deviations leaves no trace."""
+
+
+def unseen_directions(solution: JointSolution) -> F2:
+    """Changes of the smooth terms, each of typical size, that leave no trace in any reading, shape (terms, q), mm and rad.
+
+    Lost motion and set-up unknowns take their part first, within what is known of them.
+    """
+    n = len(solution.terms)
+    typical = term_prior_sd(solution.machine, solution.terms, Priors())
+    own, other = solution.information[:n, :n], solution.information[n:, n:]
+    across = solution.information[:n, n:]
+    taken = linalg.solve(other + np.diag(solution.prior_sd[n:] ** -2.0), across.T, assume_a="pos")
+    left = (own - across @ taken) * np.outer(typical, typical)
+    values, vectors = linalg.eigh(0.5 * (left + left.T))
+    return np.asarray(typical[:, None] * vectors[:, values < NO_TRACE_SIGMA**2])
+
+
+def unseen_mm(solution: JointSolution, points_mm: F2, frame: RigidFree, tool_mm: F1 | None = None) -> F1:
+    """Rms length of the deviation that no reading shows, if errors have their typical sizes, at points, shape (m,), mm."""
+    hidden = unseen_directions(solution)
+    if not hidden.shape[1]:
+        return np.zeros(len(points_mm))
+    moved = field(solution.machine, solution.terms, points_mm, tool_mm, frame) @ hidden
+    return np.asarray(np.sqrt(np.einsum("mcq,mcq->m", moved, moved)))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.uncertainty.coverage import PROBABILITY, Interval, shortest_interval, symmetric_interval
-from abbe.models.uncertainty.moments import Moments
+from abbe.models.uncertainty.distributions import Moments
 
 Draw = Callable[[np.random.Generator, int], F2]
 """Results of so many trials, shape (trials, m): inputs drawn from their distributions, sent through the whole measurement."""

@@ -12,10 +12,9 @@ from abbe.models.compensation.summary import SCALE_NOTE, MeanParameter, mean_lin
 from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.robust import Outlier
-from abbe.models.uncertainty.budget import Budget, BudgetLine, budget_over, worst_point
 from abbe.models.uncertainty.frame import volume_frame
 from abbe.models.uncertainty.mask import CompensableMask, compensable_mask
-from abbe.models.uncertainty.prediction import Prediction, predict_deviation
+from abbe.models.uncertainty.prediction import Budget, BudgetLine, Prediction, budget_over, predict_deviation, worst_point
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 from abbe.models.volumetric import volume_grid
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, versions

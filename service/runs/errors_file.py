@@ -19,7 +19,7 @@ from abbe.models.functions.legendre import Legendre
 from abbe.models.functions.motions import SQUARENESS, ErrorMotions
 from abbe.models.functions.polynomial import Polynomial
 from abbe.models.functions.table import Table
-from abbe.models.geometry.covariance import checked_covariance
+from abbe.models.geometry.propagation import checked_covariance
 from abbe.service.errors import FileFormatError
 from abbe.service.explain import nearest, shown
 from abbe.service.runs import formats

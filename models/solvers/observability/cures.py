@@ -1,5 +1,5 @@
 """What would make hidden combinations visible: every usual addition to a campaign is tried out
-(`abbe.models.solvers.observability.additions`).
+(`abbe.models.solvers.observability.cures`).
 
 Nothing is looked up: the rank with each addition is computed on the campaign at hand, so the advice fits this machine and these runs.
 """
@@ -7,17 +7,19 @@ Nothing is looked up: the rank with each addition is computed on the campaign at
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 
 import numpy as np
 from scipy import linalg
 
-from abbe.models.arrays import F2
+from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
-from abbe.models.machine import Machine
-from abbe.models.solvers.decomposition import singular_values
+from abbe.models.machine import AXES, Machine
+from abbe.models.paths.helix import helix_points
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.identifiability import project_out
-from abbe.models.solvers.observability.additions import Addition, additions
-from abbe.models.solvers.observability.free import Play, play
+from abbe.models.solvers.least_squares import singular_values
+from abbe.models.solvers.observability.parameters import Play, play
 from abbe.models.solvers.observability.rank import (
     CampaignColumns,
     Knowledge,
@@ -27,8 +29,291 @@ from abbe.models.solvers.observability.rank import (
     with_knowledge,
 )
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import SetupUnknowns, setup_unknowns
+from abbe.models.solvers.observe import SetupUnknowns, setup_unknowns, with_tool
+from abbe.models.solvers.observe_setup import SAME_PLACE_MM, straight_line_of
 from abbe.models.solvers.priors import Priors
+
+# What a campaign holds already, so that a cause is a fact about these runs and a cure is something that is not there yet.
+
+
+ALONG = 1e-3
+"""A line is along an axis, a diagonal across all of them, if no component (all components) of its direction is larger than this."""
+STEP_ORDERS = ("XYZ", "ZYX", *("".join(p) for p in permutations("XYZ") if p not in (("X", "Y", "Z"), ("Z", "Y", "X"))))
+
+
+@dataclass(frozen=True)
+class Present:
+    """Runs of a campaign by what they are.
+
+    Attributes
+    ----------
+    lines : per axis, the places (mm) of the laser lines along it.
+    stepped : step diagonals as (signs of the body diagonal, order of the steps).
+    plain : int
+        Diagonals that were run straight.
+    cups : int
+        Places where the ball-bar stood.
+    """
+
+    lines: tuple[tuple[F1, ...], tuple[F1, ...], tuple[F1, ...]]
+    stepped: tuple[tuple[str, str], ...]
+    plain: int
+    cups: int
+
+    @property
+    def orders(self) -> tuple[str, ...]:
+        """Orders in which diagonals were stepped."""
+        return tuple(dict.fromkeys(order for _, order in self.stepped))
+
+    @property
+    def next_order(self) -> str:
+        """The first usual order in which none was stepped yet (the last one if all were)."""
+        return next((o for o in STEP_ORDERS if o not in self.orders), STEP_ORDERS[-1])
+
+    @property
+    def diagonals(self) -> int:
+        """How many of the four body diagonals were stepped."""
+        return len({name for name, _ in self.stepped})
+
+
+def present(runs: tuple[RunData, ...]) -> Present:
+    """Sort the runs of a campaign."""
+    lines: tuple[list[F1], list[F1], list[F1]] = ([], [], [])
+    stepped, plain, cups = [], 0, set()
+    for run in runs:
+        if run.centre_mm is not None:
+            cups.add(tuple(np.round(run.centre_mm / SAME_PLACE_MM)))
+            continue
+        line = straight_line_of(run.axes_mm)
+        if line is None:
+            stepped += _stepped(run)
+        elif (np.abs(line[1]) > ALONG).sum() == 1:
+            lines[int(np.argmax(np.abs(line[1])))].append(line[0])
+        elif (np.abs(line[1]) > ALONG).all():
+            plain += 1
+    return Present((tuple(lines[0]), tuple(lines[1]), tuple(lines[2])), tuple(stepped), plain, len(cups))
+
+
+def _stepped(run: RunData) -> list[tuple[str, str]]:
+    """A run in steps of one axis each across the volume: its body diagonal (direction does not matter) and its order."""
+    steps = np.diff(run.axes_mm, axis=0)
+    big = np.abs(steps) > ALONG * np.abs(steps).max()
+    moves = [(int(np.argmax(b)), float(s[np.argmax(b)])) for b, s in zip(big, steps, strict=True) if b.sum() == 1]
+    first = list(dict.fromkeys(axis for axis, _ in moves))
+    if len(first) < len(AXES):
+        return []
+    signs = [np.sign(next(s for axis, s in moves if axis == a)) for a in range(3)]
+    return [("".join("p" if s == signs[0] else "n" for s in signs), "".join(AXES[a] for a in first))]
+
+
+def place_words(axis: int, place_mm: F1) -> str:
+    """Where a line along an axis stands: "Y = 40 mm, Z = 30 mm"."""
+    return ", ".join(f"{AXES[k]} = {place_mm[k]:.0f} mm" for k in range(3) if k != axis)
+
+
+def free_corner(machine: Machine, axis: int, inner: np.ndarray[tuple[int, ...], np.dtype[np.float64]], places: tuple[F1, ...]) -> F1:
+    """The corner of the inner volume (3, 2) across an axis that is farthest from the lines along it; without lines the lowest."""
+    others = [k for k in range(3) if k != axis]
+    corners = []
+    for sides in product((0, 1), repeat=2):
+        corner = inner[:, 0].copy()
+        corner[others] = inner[others, sides]
+        corners.append(corner)
+    if not places:
+        return corners[0]
+    size = machine.length_mm[others]
+    away = [min(float(np.linalg.norm((c - p)[others] / size)) for p in places) for c in corners]
+    return corners[int(np.argmax(away))]
+
+
+def on_opposite_edges(machine: Machine, axis: int, places: tuple[F1, ...]) -> bool:
+    """Whether two lines along an axis stand at least half the stroke apart in both other axes."""
+    others = [k for k in range(3) if k != axis]
+    return any((np.abs(a - b)[others] >= 0.5 * machine.length_mm[others]).all() for a in places for b in places)
+
+
+LONGER_MM = 100.0
+ASIDE_MM = (100.0, 50.0)
+"""Virtual tools: that much longer; that far off the spindle's axis (math.md 4.6)."""
+READINGS, RUNS = 130, 10
+"""Readings of a virtual run, and runs repeated with another tool, at most: they cost time, and a rank needs few."""
+SHORTEST_BAR_MM = 10.0
+"""No ball-bar is shorter."""
+MARGIN = 0.1
+"""Share of the stroke that virtual runs keep off its ends."""
+
+
+@dataclass(frozen=True)
+class Addition:
+    """One thing that could be done: why something is hidden without it, what to do, and what it would be in numbers.
+
+    ``ending``: how "cannot be told apart" goes on without it.
+    """
+
+    key: str
+    cause: str
+    cure: str
+    runs: tuple[RunData, ...] = ()
+    knows: tuple[str, ...] = ()
+    ending: str = ""
+
+
+def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, names: tuple[str, ...], order: int) -> tuple[Addition, ...]:
+    """What could be added to these runs, cheapest first; every cause is a fact about them (`abbe.models.solvers.observability.cures`).
+
+    Parameters
+    ----------
+    known, names : Knowledge, tuple of str
+        What is known of the set-up, and all its unknowns.
+    order : int
+        Highest order of the error motions: lines and diagonals get enough positions for it.
+    """
+    there = present(runs)
+    lasers = (*_lines(machine, there, order), _edges(machine, there, order), _diagonals(machine, there, order))
+    return (*_certificates(known, names), *lasers, *_bar_additions(machine, runs, there))
+
+
+def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
+    """What need not be measured on the machine."""
+    out = []
+    if lengths := tuple(n for n in names if n.startswith("bar_length_") and n not in known.held):
+        some = any(n.startswith("bar_length_") for n in known.held)
+        radii = " and ".join(n.removeprefix("bar_length_") for n in lengths)
+        cause = f"the length of the bar of {radii} mm is not calibrated" if some else "no bar length here is calibrated"
+        out.append(Addition("bar", cause, "a calibrated bar", knows=lengths))
+    if tilts := tuple(n for n in names if n.startswith("tilt_") and n not in known.held):
+        out.append(Addition("tilt", "the tilt of the mirror is unknown and reads like it", "a mirror of measured tilt", knows=tilts))
+    return out
+
+
+def _lines(machine: Machine, there: Present, order: int) -> list[Addition]:
+    """One laser line along each axis: where none is yet, or far from those that are."""
+    out = []
+    for k, a in enumerate(AXES):
+        places = there.lines[k]
+        corner = free_corner(machine, k, _inner(machine), places)
+        if not places:
+            cause, cure = f"nothing here measures {a} alone against a known length", f"a laser line along {a}"
+        else:
+            where = "; ".join(place_words(k, p) for p in places[:2]) + ("; ..." if len(places) > 2 else "")
+            count = "one line" if len(places) == 1 else f"{len(places)} lines"
+            cause = f"{a} alone was measured along {count} only ({where})"
+            cure = f"another laser line along {a} at {place_words(k, corner)}"
+        out.append(Addition(f"line {a}", cause, cure, (_line(machine, k, corner, order),)))
+    return out
+
+
+def _edges(machine: Machine, there: Present, order: int) -> Addition:
+    """Lines along all axes on two opposite edges; where these are there, on the two others."""
+    inner, cure = _inner(machine), "laser lines along X, Y and Z on two opposite edges"
+    sides = np.array([[0, 0, 0], [1, 1, 1]])
+    if not any(there.lines):
+        cause = "there are no laser lines here"
+    elif all(on_opposite_edges(machine, k, there.lines[k]) for k in range(3)):
+        cause, cure = "the laser lines here stand on too few edges", "laser lines along X, Y and Z on two more edges"
+        sides = np.array([[0, 0, 1], [0, 1, 0]])  # turned with the axis: low in one of the other two, high in the other
+    else:
+        cause = "the laser lines here do not stand on opposite edges in all three axes"
+    runs = tuple(_line(machine, k, inner[range(3), np.roll(side, k)], order, i) for k in range(3) for i, side in enumerate(sides))
+    return Addition("edges", cause, cure, runs)
+
+
+def _diagonals(machine: Machine, there: Present, order: int) -> Addition:
+    """Step diagonals, in an order of steps that was not used yet."""
+    sequence, done = there.next_order, " and ".join(there.orders)
+    if there.stepped and there.diagonals < len(DIAGONALS):
+        cause = f"only {there.diagonals} of the four body diagonals {'was' if there.diagonals == 1 else 'were'} stepped ({done})"
+        cure = f"step diagonals along all four body diagonals in another step order ({sequence})"
+    elif len(there.orders) == 1:
+        cause, cure = f"all step diagonals were stepped in one order ({done})", f"step diagonals in a second step order ({sequence})"
+    elif there.stepped:
+        cause, cure = f"the diagonals were stepped in {done} only", f"step diagonals in another step order ({sequence})"
+    else:
+        cause = "the diagonals here were run straight, without steps" if there.plain else "nothing here crosses the volume step by step"
+        cure = "four step diagonals"
+    return Addition("diagonals", cause, cure, tuple(_diagonal(machine, d, sequence, order) for d in DIAGONALS))
+
+
+def _bar_additions(machine: Machine, runs: tuple[RunData, ...], there: Present) -> list[Addition]:
+    longer, aside = _other_tools(machine, runs)
+    one = len({tuple(np.round(with_tool(machine, r.tool_mm).tool_mm, 6)) for r in runs}) == 1
+    length = "all runs used one tool length" if one else "the tools of these runs give it no lever of its own"
+    beside = "in all runs the tool's end stood on one line, so that turning about it is not seen" if one else length
+    short = " with one tool length" if one else " with these tools"
+    lined = " with tools that end on one line" if one else short
+    count = "at one place" if there.cups == 1 else f"at {there.cups} places"
+    cups = f"the ball-bar stood {count} only" if there.cups else "no ball-bar was used"
+    helices = _helices(machine, runs)
+    return [
+        *([Addition("centres", cups, "ball-bar helices about five centres", helices)] if helices else []),
+        Addition("tool", length, "a second tool length" if one else "another tool length", _with(runs, longer, "long"), (), short),
+        Addition("aside", beside, "a tool whose end stands off to the side", _with(runs, aside, "aside"), (), lined),
+    ]
+
+
+def _laser(label: str, path_mm: F2) -> RunData:
+    n, way = len(path_mm), path_mm[-1] - path_mm[0]
+    beam = way / np.linalg.norm(way)
+    return RunData(label, label, "laser", path_mm, np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.ones(n), beam=beam)
+
+
+def _line(machine: Machine, axis: int, through_mm: F1, order: int, number: int = 0) -> RunData:
+    """Along an axis through a place, MARGIN inside the stroke."""
+    start, end = through_mm.copy(), through_mm.copy()
+    start[axis], end[axis] = _inner(machine)[axis]
+    return _laser(f"virtual {AXES[axis]}{number}", straight_line(start, end, 2 * order + 3, back=False))
+
+
+def _diagonal(machine: Machine, name: str, sequence: str, order: int) -> RunData:
+    start, end = diagonal_ends(_inner(machine), name)
+    return _laser(f"virtual {name} {sequence}", step_diagonal(start, end, 2 * order + 4, sequence, back=False))
+
+
+def _inner(machine: Machine) -> F2:
+    return np.asarray(machine.stroke_mm + MARGIN * machine.length_mm[:, None] * np.array([1.0, -1.0]))
+
+
+def _helices(machine: Machine, runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
+    """About the middle and four places around it, with the campaign's own bar where it has one; none where no bar has room."""
+    own = next((r for r in runs if r.radius_mm is not None), None)
+    radius = 0.2 * float(machine.length_mm.min()) if own is None or own.radius_mm is None else own.radius_mm
+    if own is None and radius < SHORTEST_BAR_MM:
+        return ()
+    pole = int(np.argmax(np.abs(machine.tool_mm))) if machine.tool_mm.any() else 2
+    across = [a for a in range(3) if a != pole]
+    aside = np.clip(0.25 * machine.length_mm, 0.0, np.maximum(0.5 * machine.length_mm - radius, 0.0))  # beyond the stroke nothing is stated
+    out = []
+    for k, signs in enumerate(((0, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))):
+        centre = machine.centre_mm.copy()
+        centre[across] += aside[across] * signs
+        centre[pole] -= 0.5 * radius
+        path = helix_points(centre, radius, turns=5, n=READINGS, law="area", axis=pole)
+        n, name = len(path), f"virtual helix {k}"
+        bar = RunData(name, name, "bar", path, np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.ones(n), centre, radius)
+        out.append(bar if own is None else replace(bar, u_length_mm=own.u_length_mm, length_calibrated=own.length_calibrated))
+    return tuple(out)
+
+
+def _other_tools(machine: Machine, runs: tuple[RunData, ...]) -> tuple[F1, F1]:
+    """A tool longer than those of the runs, and one whose end stands aside."""
+    tools = [with_tool(machine, r.tool_mm).tool_mm for r in runs]
+    tool = max(tools, key=lambda t: float(np.linalg.norm(t)))
+    along = tool / np.linalg.norm(tool) if tool.any() else np.array([0.0, 0.0, -1.0])
+    helper = np.eye(3)[int(np.argmin(np.abs(along)))]
+    first = np.cross(along, helper) / np.linalg.norm(np.cross(along, helper))
+    return tool + LONGER_MM * along, tool + ASIDE_MM[0] * first + ASIDE_MM[1] * np.cross(along, first)
+
+
+def _with(runs: tuple[RunData, ...], tool_mm: F1, key: str) -> tuple[RunData, ...]:
+    """The ball-bar runs (without any, the laser runs) once more with another tool and newly mounted."""
+    out = []
+    for run in (tuple(r for r in runs if r.kind == "bar") or runs)[:RUNS]:
+        n = run.deviation_mm.size
+        at = np.unique(np.linspace(0, n - 1, min(n, READINGS)).round().astype(np.intp))
+        parts = {name: getattr(run, name)[at] for name in ("axes_mm", "deviation_mm", "sign", "t_s", "weight_n")}
+        out.append(replace(run, label=f"{key} {run.label}", setup=f"{key} {run.setup}", tool_mm=tool_mm, **parts))
+    return tuple(out)
+
 
 SHOWN = 1e-7
 """Trace (unit columns) from which a hidden combination counts as shown by an addition; hidden means below 1e-9."""

@@ -2,22 +2,214 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy import linalg
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
-from abbe.models.machine import Machine
-from abbe.models.solvers.decomposition import singular_values, svd
-from abbe.models.solvers.identifiability import RANK_TOLERANCE
-from abbe.models.solvers.observability.additions import Addition
-from abbe.models.solvers.observability.cures import CampaignLayout, CureTrial, best_sequence, trials
+from abbe.models.machine import AXES, Machine
+from abbe.models.solvers.identifiability import RANK_TOLERANCE, sparse_rows
+from abbe.models.solvers.least_squares import singular_values, svd
+from abbe.models.solvers.observability.cures import Addition, CampaignLayout, CureTrial, best_sequence, trials
 from abbe.models.solvers.observability.rank import SeenInformation
 from abbe.models.solvers.observability.volume import frame_free_design, inner_box
-from abbe.models.solvers.observability.words import Family, families, sentence
 from abbe.models.solvers.observe import with_tool
+
+LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
+"""Combinations of up to so many motions are looked for by trying all sets, first among orders up to LOW (a slope of an angle times the
+travel of its own axis is of order 2), then among all; what is left over are mixtures."""
+INSIDE = 1e-9
+"""A set of motions holds a hidden combination if its share of the null space misses 1 by less than this (squared leak)."""
+ENTRY = 1e-6
+"""Entries of a unit vector below this are rounding."""
+LISTED = 6
+_TURNS = {"AX": "roll", "BX": "pitch", "CX": "yaw", "AY": "pitch", "BY": "roll", "CY": "yaw", "CZ": "roll"}
+_PAIRS = {"C0Y": "X and Y", "B0Z": "X and Z", "A0Z": "Y and Z"}
+
+
+@dataclass(frozen=True)
+class Family:
+    """Hidden combinations of the same motions.
+
+    ``motions``: ISO names, in the order of the terms; ``vectors``: shape (p, count), one combination per column, coefficients in unit
+    columns; ``exact``: few motions, no mixture.
+    """
+
+    motions: tuple[str, ...]
+    vectors: F2
+    exact: bool
+
+
+def motion_words(motion: str) -> str:
+    """An error motion in words with its ISO name: ``EAX`` is "the roll of X (EAX)"."""
+    if motion in _PAIRS:
+        return f"the squareness of {_PAIRS[motion]} ({motion})"
+    what, axis = motion[1], motion[2]
+    if what == axis:
+        return f"the positioning of {axis} ({motion})"
+    if what in AXES:
+        return f"the straightness of {axis} in {what} ({motion})"
+    turn = _TURNS.get(what + axis)
+    return f"the {turn} of {axis} ({motion})" if turn else f"the tilt of {axis} about {AXES['ABC'.index(what)]} ({motion})"
+
+
+def part_words(motion: str, orders: Iterable[int]) -> str:
+    """Which part of a motion: its slope (order 1, for positioning the scale), its shape (order 2 and more), or all of it."""
+    found, whole = sorted(set(orders)), motion_words(motion)
+    if found == [0] or not found:
+        return whole
+    if found == [1]:
+        return whole.replace("the positioning", "the scale") if motion[1] == motion[2] else f"the slope of {whole}"
+    if found[0] == 1:
+        return whole
+    span = f"order {found[0]}" if found[0] == found[-1] else f"orders {found[0]} to {found[-1]}"
+    return f"the shape ({span}) of {whole}"
+
+
+def sentence(terms: tuple[Term, ...], family: Family, ending: str = "") -> str:
+    """What cannot be told apart, and how much of one looks like how much of the other where that is one number."""
+    parts = [part_words(m, _orders(terms, family, m)) for m in family.motions]
+    if len(parts) == 1:
+        return f"{_upper(parts[0])} leaves no trace{ending}"
+    if not family.exact and len(parts) > LISTED:
+        count = family.vectors.shape[1]
+        return f"{count} mixture{'s' if count > 1 else ''} of {len(parts)} motions ({', '.join(family.motions)}) leave no trace{ending}"
+    return f"{_upper(', '.join(parts[:-1]))} and {parts[-1]} cannot be told apart{ending}{_proportion(terms, family)}"
+
+
+def _orders(terms: tuple[Term, ...], family: Family, motion: str) -> list[int]:
+    return [t.order for t, row in zip(terms, family.vectors, strict=True) if t.motion == motion and row.any()]
+
+
+def _proportion(terms: tuple[Term, ...], family: Family) -> str:
+    """Of one combination of two terms: the size of the second that looks like one unit of the first, both over the whole stroke."""
+    used = np.flatnonzero(family.vectors[:, 0])
+    if family.vectors.shape[1] != 1 or len(used) != 2 or any(terms[i].order > 1 for i in used):
+        return ""
+    told = [(float(family.vectors[i, 0]), *_unit(terms[i])) for i in used]
+    a, b = (value * size for value, size, _, _ in told)
+    one, other = (f"{unit} of {terms[i].motion}{end}" for i, (_, _, unit, end) in zip(used, told, strict=True))
+    return f": 10 {one} look like {-b / a * 10.0:.3g} {other}"
+
+
+def _unit(term: Term) -> tuple[float, str, str]:
+    """How a coefficient is told to people: factor, unit, and over which way; order 1 of a Legendre series as its change over the stroke."""
+    size, unit = (1e3, "µm") if term.order > 0 and term.component < 3 else (1e6, "µrad")
+    return (2.0 * size, unit, " over the stroke") if term.order else (size, unit, "")
+
+
+def _upper(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None = None) -> list[Family]:
+    """Split a hidden space into combinations of as few motions as possible.
+
+    Parameters
+    ----------
+    terms : tuple of Term
+    null : array, shape (p, k)
+        Orthonormal basis of what is hidden, unit columns.
+    factor : array, shape (p,)
+        Coefficient = factor times unit-column value: the families' vectors are in the coefficients' own units.
+    found : array, shape (p, m), optional
+        Orthonormal combinations already told; only what is independent of them is told again.
+
+    Returns
+    -------
+    list of Family, exact ones first; all vectors together with ``found`` span ``null``.
+    """
+    told = np.zeros((len(terms), 0)) if found is None else found
+    shadow = null @ null.T
+    out: list[tuple[tuple[str, ...], F2]] = []
+    for highest, largest in ((LOW, LARGEST_SET_OF_LOW), (max(t.order for t in terms), LARGEST_SET)):
+        rows: dict[str, list[int]] = {}
+        for i, t in enumerate(terms):
+            if t.order <= highest:
+                rows.setdefault(t.motion, []).append(i)
+        new, told = _of_few(shadow, rows, largest, told, null.shape[1])
+        out += new
+    left, _ = _independent(_unit_length(sparse_rows(null.T).T), told)
+    return _merged(terms, out, factor) + ([_family(terms, left, factor, exact=False)] if left.shape[1] else [])
+
+
+def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, told: F2, count: int) -> tuple[list[tuple[tuple[str, ...], F2]], F2]:
+    """Hidden combinations of sets of up to ``largest`` motions, smallest sets first, that were not told yet, and all that is told then."""
+    active = {m: at for m, at in rows.items() if np.trace(shadow[np.ix_(at, at)]) > INSIDE}
+    out: list[tuple[tuple[str, ...], F2]] = []
+    for size in range(1, largest + 1):
+        for chosen, held in _holding(shadow, active, size):
+            known = sum(v.shape[1] for motions, v in out if set(motions) <= set(chosen))
+            if told.shape[1] == count or held <= known:
+                continue
+            new, told = _independent(_inside(shadow, [i for m in chosen for i in active[m]]), told)
+            if new.shape[1]:
+                out.append((chosen, new))
+    return out, told
+
+
+def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], factor: F1) -> list[Family]:
+    """One family per set of motions: what is hidden of their slopes and what is hidden of their shapes belongs together."""
+    by_motions: dict[tuple[str, ...], list[F2]] = {}
+    for motions, vectors in found:
+        by_motions.setdefault(motions, []).append(vectors)
+    ranked = sorted(by_motions.items(), key=lambda item: len(item[0]))
+    return [_family(terms, np.concatenate(v, axis=1), factor, exact=True) for _, v in ranked]
+
+
+def _holding(shadow: F2, rows: dict[str, list[int]], size: int) -> list[tuple[tuple[str, ...], int]]:
+    """Sets of motions that hold hidden combinations of their own, and how many: eigenvalues 1 of their block of the projector."""
+    sets = list(combinations(rows, size))
+    if not sets:
+        return []
+    indices = [[i for m in chosen for i in rows[m]] for chosen in sets]
+    width = max(len(i) for i in indices)
+    blocks = np.zeros((len(sets), width, width))
+    for block, at in zip(blocks, indices, strict=True):
+        block[: len(at), : len(at)] = shadow[np.ix_(at, at)]
+    count = (np.linalg.eigvalsh(blocks) > 1.0 - INSIDE).sum(axis=1)
+    return [(sets[i], int(count[i])) for i in np.flatnonzero(count)]
+
+
+def _inside(shadow: F2, at: list[int]) -> F2:
+    """Hidden combinations that only these terms make, as sparse as elimination gives, unit length, shape (p, count)."""
+    values, vectors = np.linalg.eigh(shadow[np.ix_(at, at)])
+    own = vectors[:, values > 1.0 - INSIDE]
+    out = np.zeros((shadow.shape[0], own.shape[1]))
+    out[at] = sparse_rows(own.T).T
+    return _unit_length(out)
+
+
+def _unit_length(vectors: F2) -> F2:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
+
+
+def _independent(vectors: F2, told: F2) -> tuple[F2, F2]:
+    """Those of the vectors that add something to what was told, and everything told so far, orthonormal."""
+    new = []
+    for v in vectors.T:
+        rest = _beside(v[:, None], told)
+        size = float(np.linalg.norm(rest))
+        if size > 1e-4:
+            new.append(v)
+            told = np.concatenate([told, rest / size], axis=1)
+    return (np.stack(new, axis=1) if new else vectors[:, :0]), told
+
+
+def _beside(vectors: F2, told: F2) -> F2:
+    once = vectors - told @ (told.T @ vectors)
+    return np.asarray(once - told @ (told.T @ once))
+
+
+def _family(terms: tuple[Term, ...], vectors: F2, factor: F1, *, exact: bool) -> Family:
+    used = np.abs(vectors).max(axis=1) > ENTRY
+    motions = tuple(dict.fromkeys(t.motion for t, u in zip(terms, used, strict=True) if u))
+    return Family(motions, np.where(np.abs(vectors) > ENTRY, vectors, 0.0) * factor[:, None], exact)
+
 
 HARMLESS = 1e-7
 """Deviation (unit columns, relative to the largest) below which a combination moves the tool nowhere."""

@@ -20,9 +20,9 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term
 from abbe.models.machine import Machine
-from abbe.models.solvers.decomposition import svd
 from abbe.models.solvers.designs import unit_columns
 from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
+from abbe.models.solvers.least_squares import svd
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns, run_design
 from abbe.models.solvers.observe_setup import NEAR_BEAM, STRAIGHT_MM, bar_length_name, straight_line_of

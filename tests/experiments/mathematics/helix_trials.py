@@ -16,8 +16,7 @@ from scipy import linalg
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.solvers.helix import LINEAR, SETUP, linear_field
-from abbe.models.uncertainty.distributions import NORMAL, Distribution
-from abbe.models.uncertainty.moments import Moments
+from abbe.models.uncertainty.distributions import NORMAL, Distribution, Moments
 
 CHUNK_VALUES = 500_000
 """Simulated readings held at once: 4 MB, so that they stay in the processor's cache between drawing and solving."""

@@ -16,8 +16,7 @@ from abbe.models.functions.table import Table
 from abbe.models.geometry import propagation
 from abbe.models.geometry.bases import Term, smooth_terms, term_values
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
-from abbe.models.geometry.covariance import checked_covariance
-from abbe.models.geometry.propagation import CHUNK, Points, deviation_covariance, sensitivity
+from abbe.models.geometry.propagation import CHUNK, Points, checked_covariance, deviation_covariance, sensitivity
 from abbe.models.machine import Machine
 
 STROKE = np.array([[-100.0, 500.0], [0.0, 400.0], [50.0, 450.0]])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from abbe.models.solvers import decomposition
-from abbe.models.solvers.decomposition import singular_values, svd
+from abbe.models.solvers import least_squares as decomposition
+from abbe.models.solvers.least_squares import singular_values, svd
 
 
 @pytest.fixture(params=[True, False], ids=["fast", "fast one fails"])

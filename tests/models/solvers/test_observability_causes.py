@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.paths.lines import diagonal_ends, step_diagonal
 from abbe.models.solvers.assessment import observability
-from abbe.models.solvers.observability.additions import STEP_ORDERS, additions, present
+from abbe.models.solvers.observability.cures import STEP_ORDERS, additions, present
 from abbe.models.solvers.observability.rank import Knowledge
 from tests.models.solvers.observability_cases import FXYZ, ONE, TEN, YANG, YANG_EXPERIMENTS, laser, wang_diagonals, wang_lines
 

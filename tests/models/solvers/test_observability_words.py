@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.functions.motions import motion_names
 from abbe.models.geometry.bases import smooth_terms
-from abbe.models.solvers.observability.words import families, motion_words, part_words, sentence
+from abbe.models.solvers.observability.hidden import families, motion_words, part_words, sentence
 
 TERMS = smooth_terms(4)
 NAMES = [t.name for t in TERMS]

@@ -10,13 +10,11 @@ from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.least_squares import solve_map
 from abbe.models.solvers.observe import run_design
 from abbe.models.uncertainty import prediction as module
-from abbe.models.uncertainty.budget import budget_over
 from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
 from abbe.models.uncertainty.inputs import STEEL_PER_K, StatedInputs
 from abbe.models.uncertainty.mask import compensable_mask
-from abbe.models.uncertainty.prediction import predict_deviation
-from abbe.models.uncertainty.response import response
-from abbe.models.uncertainty.sources import WORDS, error_sources, omitted_prior_sd
+from abbe.models.uncertainty.prediction import budget_over, predict_deviation
+from abbe.models.uncertainty.sources import WORDS, error_sources, omitted_prior_sd, response
 from abbe.models.volumetric import remove_rigid, volume_grid
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from abbe.models.uncertainty.coverage import coverage_factor, effective_dof, shortest_interval, symmetric_interval, vector_factor
-from abbe.models.uncertainty.distributions import Distribution
-from abbe.models.uncertainty.moments import Moments
+from abbe.models.uncertainty.distributions import Distribution, Moments
 from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, batch_size, numerical_tolerance, validate
 
 

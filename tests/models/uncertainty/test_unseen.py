@@ -10,9 +10,9 @@ from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observe import predict, run_jacobian
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.uncertainty.frame import RigidFree
+from abbe.models.uncertainty.mask import NO_TRACE_SIGMA, unseen_directions, unseen_mm
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
-from abbe.models.uncertainty.unseen import NO_TRACE_SIGMA, unseen_directions, unseen_mm
 from tests.experiments.campaigns.population import draw_case
 from tests.experiments.campaigns.scoring import INPUTS, judge
 
