@@ -36,22 +36,28 @@ class CampaignRecord:
     created_utc: str
 
 
-@dataclass(frozen=True, slots=True)
-class RunRecord:
-    """One measured sequence. ``status``: as written; ``visible_status``: as people see it."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunFacts:
+    """What every record of a run says: a field that stands here and as a column is in the lists of every surface."""
 
-    id: int
-    campaign_id: int
     campaign: str
-    label: str
     test: str
     role: str
     status: str
     reason: str
-    start_doc: Doc
-    end_doc: Doc | None
     started_utc: str
     ended_utc: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunRecord(RunFacts):
+    """One measured sequence. ``status``: as written; ``visible_status``: as people see it."""
+
+    id: int
+    campaign_id: int
+    label: str
+    start_doc: Doc
+    end_doc: Doc | None
     owner: Owner
 
     @property

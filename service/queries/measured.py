@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from abbe.service.domain.document import Doc
-from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, RunRecord
+from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, RunFacts, RunRecord
 from abbe.service.queries.reader import Reader, of_row, read_as
 from abbe.service.runs.machine_object import MachineObject
 from abbe.service.storage.repositories.pages import visible_status
@@ -38,19 +38,12 @@ class CampaignSummary:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunSummary:
-    """One measured sequence. ``status`` is as people are told: a run whose process died is incomplete."""
+class RunSummary(RunFacts):
+    """One measured sequence. ``status`` is as people see it: a run whose process died is incomplete."""
 
     number: int
-    campaign: str
     machine: str
     run_id: str
-    test: str
-    role: str
-    status: str
-    reason: str
-    started_utc: str
-    ended_utc: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,7 +139,7 @@ def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
 
 def run_summary(record: RunRecord, machine: str) -> RunSummary:
     """A run that was read whole."""
-    row = {name: getattr(record, name) for name in RunRecord.__dataclass_fields__}
+    row = {one.name: getattr(record, one.name) for one in fields(record)}
     state = record.visible_status
     return of_row(RunSummary, row, machine=machine, run_id=record.label, status=state, reason=_reason(state, record.reason, record.end_doc))
 

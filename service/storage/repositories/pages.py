@@ -49,7 +49,7 @@ def _of(table: Any, *names: str) -> dict[str, ColumnElement[Any]]:
 _MACHINE = {"machine": machines.c.name}
 _CAMPAIGN = {"campaign": campaigns.c.name}
 _CAMPAIGNS = campaigns.join(machines, machines.c.id == campaigns.c.machine_id)
-_RUN = ("id", "label", "test", "role", "status", "reason", "started_utc", "ended_utc", "owner_host", "owner_pid", "owner_start")
+_RUN = [column.name for column in runs.c if not column.name.endswith("_doc")]
 
 
 def _in_campaign(table: Any) -> FromClause:

@@ -18,7 +18,6 @@ from abbe.service.domain.verification import Verification
 from abbe.service.errors import StoreError
 from abbe.service.queries.reader import Reader, read_as
 from abbe.service.queries.status import StatusReader
-from abbe.service.queries.timetable import span
 from abbe.service.scheduler import record
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.web import words
@@ -230,7 +229,6 @@ def test_words() -> None:
     assert words.figure_name("helix_rms_um") == ("Helix RMS", "µm")
     assert words.figure_name("odd") == ("Odd", "")
     assert [words.number(v) for v in (123.4, 11.84, 0.123, None)] == ["123", "11.8", "0.12", "–"]
-    assert [span(s) for s in (5, 600, 7200, 200000)] == ["5 s", "10 min", "2 h", "2 days"]
 
 
 async def test_a_skipped_slot_changes_the_revision(site: Site) -> None:

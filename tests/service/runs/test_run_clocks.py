@@ -69,7 +69,9 @@ def measured(
         "ended_utc": "2025-06-01T10:00:00",
     }
     owner = Owner("", 0, "")
-    return run_document(RunRecord(1, 1, "c1", "r01", "ballbar_helix", "identify", "complete", "", doc, end, utc, utc, owner), chunks)
+    known = {"campaign": "c1", "label": "r01", "test": "ballbar_helix", "role": "identify", "status": "complete", "reason": ""}
+    known |= {"start_doc": doc, "end_doc": end, "started_utc": utc, "ended_utc": utc}
+    return run_document(RunRecord(id=1, campaign_id=1, owner=owner, **known), chunks)
 
 
 @pytest.mark.parametrize("drift_ppm", [0.0, 100.0, -100.0, 1000.0, -1000.0])

@@ -30,9 +30,9 @@ def cut(run: Doc, share: float) -> Doc:
 
 
 def record(run: Doc, status: str, start: Doc) -> RunRecord:
-    return RunRecord(
-        1, 1, "june", run["run_id"], run["test"], "identify", status, "", start, {}, "2026-11-23T00:00:00Z", None, this_process()
-    )
+    known = {"campaign": "june", "label": run["run_id"], "test": run["test"], "role": "identify", "status": status, "reason": ""}
+    times = {"started_utc": "2026-11-23T00:00:00Z", "ended_utc": None}
+    return RunRecord(id=1, campaign_id=1, start_doc=start, end_doc={}, owner=this_process(), **known, **times)
 
 
 def path_of(run: Doc) -> Doc:

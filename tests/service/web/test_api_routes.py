@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 
 from abbe.service.runs.columns import load_run
@@ -52,13 +51,11 @@ async def test_pages_have_every_run_once_newest_first(client, plant):
     assert seen == [run.id for run in reversed(plant.store.runs())]
 
 
-async def test_filters_are_exact_and_together(client):
-    found = (await got(client, "/runs", campaign="c2", role="identify"))["runs"]
-    assert [run["run_id"] for run in found] == ["r03", "r02", "r01"]
-    assert [run["status"] for run in found] == ["failed", "aborted", "complete"]
-    assert (await got(client, "/runs", campaign="c2", status="failed", test="laser_linear"))["runs"][0]["reason"] == "SEQ-003 beam"
-    for name in ("C2", "c2' OR '1'='1", "%", "c\0", ""):
-        assert (await got(client, "/runs", campaign=name))["runs"] == []
+async def test_filters_reach_the_read_model(client):
+    """What they do is held by tests/service/queries/test_measured.py."""
+    found = (await got(client, "/runs", campaign="c2", role="identify", machine="VMC-1"))["runs"]
+    assert [(run["run_id"], run["status"]) for run in found] == [("r03", "failed"), ("r02", "aborted"), ("r01", "complete")]
+    assert (await got(client, "/runs", status="failed", test="laser_linear"))["runs"] == found[:1]
 
 
 async def test_samples_are_those_that_were_stored(client, plant):
@@ -149,34 +146,27 @@ async def test_machines_campaigns_and_what_was_made_of_them(client, plant):
 
 
 async def test_checks_trends_and_timetable(client):
+    """What they say is held by tests/service/queries/test_status.py."""
     checks = (await got(client, "/checks", limit=5))["verifications"]
-    assert [one["id"] for one in checks] == list(range(CHECKS, CHECKS - 5, -1))
-    assert (await got(client, "/checks/1"))["values"] == {"body_diagonal_um": 10.0, "helix_rms_um": None}
+    assert await got(client, f"/checks/{checks[0]['id']}") == checks[0]
     trends = (await got(client, "/trends"))["figures"]
     assert [(one["figure"], one["checks"]) for one in trends] == [("body_diagonal_um", CHECKS)]
-    assert (trends[0]["latest"], trends[0]["state"], trends[0]["direction"]) == (13.3, "drifting", 1)
-    assert (trends[0]["days_until_limit"] is None) == bool(trends[0]["reason"])
     later = (await got(client, "/trends", after="2026-11-05T00:00:00Z"))["figures"]
     assert later[0]["checks"] == CHECKS - 4
-    assert (await got(client, "/trends", machine="other mill"))["figures"] == []
     daily, hours = (await got(client, "/schedules"))["schedules"]
-    assert daily["next_due_utc"] == "2026-11-23T05:00:00Z"  # 06:00 in Berlin
+    assert (daily["cron"], daily["next_due_utc"]) == ("0 6 * * *", "2026-11-23T05:00:00Z")
     assert hours["next_due_utc"] == "2026-11-22T16:00:00Z"
-    assert len(daily["latest"]) == 10
-    assert daily["latest"][0]["state"] == "done: pass"
     assert [device["role"] for device in (await got(client, "/devices"))["devices"]] == ["cnc"]
     assert [recipe["name"] for recipe in (await got(client, "/recipes"))["recipes"]] == ["quick-check", "verification"]
 
 
 async def test_proposals_and_journal(client, plant):
+    """Where they stand is held by tests/service/queries/test_proposals.py."""
     found = {one["number"]: one for one in (await got(client, "/proposals"))["proposals"]}
-    assert found[1]["state"] == "refused"
-    assert found[5]["state"] == "changed"
     detail = await got(client, "/proposals/4")
+    assert found[4].items() <= detail.items()
     assert (detail["two_people"], detail["by"], detail["reasons"]) == (True, "a-approver", [])
-    diff = await got(client, "/proposals/2/diff")
-    assert len(diff["tables"]) == 9
-    assert np.max(np.abs(diff["tables"][0]["u_um"])) > 0.0
+    assert len((await got(client, "/proposals/2/diff"))["tables"]) == 9
     same = await got(client, "/proposals/2/diff", **{"with": 3})
     assert {curve["largest_change_um"] for curve in same["tables"]} == {0.0}
     entries_ = (await got(client, "/pushes", push=1))["entries"]
