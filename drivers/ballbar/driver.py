@@ -8,11 +8,9 @@ from contextlib import asynccontextmanager
 
 from abbe.drivers.api import BarBatch, BarTap, DeviceInfo
 from abbe.drivers.ballbar import frames
-from abbe.drivers.ballbar.box import Box
-from abbe.drivers.ballbar.conversation import Conversation
-from abbe.drivers.ballbar.framing import BarCounters, Framing
-from abbe.drivers.ballbar.sequence import SegmentEnd
-from abbe.drivers.ballbar.stream import SLOW, Stream
+from abbe.drivers.ballbar.conversation import Box, Conversation
+from abbe.drivers.ballbar.frames import BarCounters, Framing
+from abbe.drivers.ballbar.stream import SLOW, SegmentEnd, Stream
 from abbe.drivers.errors import (
     Backpressure,
     DriverError,
@@ -24,8 +22,7 @@ from abbe.drivers.errors import (
     SettingsChanged,
     WrongDevice,
 )
-from abbe.drivers.links.backoff import Backoff
-from abbe.drivers.links.incidents import Incidents
+from abbe.drivers.links.incidents import Backoff, Incidents
 from abbe.drivers.links.reading import Ring
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.shielded import run_to_end

@@ -10,9 +10,9 @@ from abbe.drivers.api import Condition, ControllerStatus, Point
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
-from abbe.drivers.links.modbus_policy import ModbusOperation
-from abbe.drivers.links.numbered import next_number, run_numbered
+from abbe.drivers.links.modbus_line import ModbusOperation
 from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.links.words import next_number, run_numbered
 
 _POLL_S = 0.003
 _HOLD_S = 3.0

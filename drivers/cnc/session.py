@@ -7,8 +7,8 @@ import time
 from abbe.drivers.api import ControllerStatus, DeviceInfo, TableFormat
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.errors import Rebooted, WrongDevice
-from abbe.drivers.links.identity import check_clock, check_identity
 from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.words import check_clock, check_identity
 
 
 class ControllerSession:

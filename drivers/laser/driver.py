@@ -9,10 +9,9 @@ from abbe.drivers.api import DeviceInfo, LaserReading
 from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
 from abbe.drivers.flags import LaserFlag, beam_is_gone, is_zeroed
 from abbe.drivers.laser import registers as reg
-from abbe.drivers.links.identity import check_clock, check_identity
+from abbe.drivers.links.modbus_line import ModbusOperation
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import ModbusOperation
-from abbe.drivers.links.numbered import next_number, run_numbered
+from abbe.drivers.links.words import check_clock, check_identity, next_number, run_numbered
 
 _POLL_S = 0.005
 _READ_S = 5.0

@@ -7,11 +7,9 @@ import contextlib
 from collections.abc import Sequence
 
 from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
-from abbe.drivers.links.backoff import Backoff
-from abbe.drivers.links.incidents import Incidents
+from abbe.drivers.links.incidents import Backoff, Incidents
 from abbe.drivers.links.modbus import READ_HOLDING, WRITE, ModbusReply, ModbusWire, Request
-from abbe.drivers.links.modbus_line import Canary, ModbusLine
-from abbe.drivers.links.modbus_policy import BUSY_POLL_S, BUSY_S, POLICY, ModbusOperation, meaning, waits
+from abbe.drivers.links.modbus_line import BUSY_POLL_S, BUSY_S, POLICY, Canary, ModbusLine, ModbusOperation, meaning, waits
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 from abbe.drivers.links.words import RegisterBlock
 
@@ -127,7 +125,7 @@ class ModbusLink:
         return await self.read(block.base, block.count, lead=block.lead)
 
     async def write(self, address: int, values: Sequence[int], op: ModbusOperation = ModbusOperation.TRIGGER) -> None:
-        """Write 1..123 registers (FC16); whether it may be sent again is said by ``op`` (drivers/links/modbus_policy.py).
+        """Write 1..123 registers (FC16); whether it may be sent again is said by ``op`` (drivers/links/modbus_line.py).
 
         Raises
         ------

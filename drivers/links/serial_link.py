@@ -12,17 +12,111 @@ import os
 import socket
 import termios
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 import serial
 from serial.tools import list_ports
 
-from abbe.drivers.errors import LinkDown, ReplyTimeout
-from abbe.drivers.links.adapters import Adapter, adapter_at, path_to_open
-from abbe.drivers.links.raw_tcp import connected
+from abbe.drivers.errors import LinkDown, ReplyTimeout, WrongDevice
 from abbe.drivers.links.reading import ReadingThread, Ring
 from abbe.drivers.links.urls import SerialUrl, SocketUrl
+
+
+@dataclass(frozen=True, slots=True)
+class Adapter:
+    """A serial adapter as the system lists it. ``node`` is where it is now; kind and serial number are what it is."""
+
+    node: str
+    kind: str
+    serial_number: str
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.serial_number}"
+
+
+def adapter_at(path: str, listed: Sequence[Adapter]) -> Adapter | None:
+    """The adapter behind a path (links are followed); None when it has no serial number, so that nobody could know it again."""
+    real = os.path.realpath(path)
+    found = [adapter for adapter in listed if os.path.realpath(adapter.node) == real]
+    return found[0] if found and found[0].serial_number else None
+
+
+def path_to_open(device: str, path: str, known: Adapter | None, listed: Sequence[Adapter]) -> str:
+    """Say which path leads to the adapter that was there before.
+
+    Parameters
+    ----------
+    device : str
+        For the error text.
+    path : str
+        What the configuration says; a link by id stays right by itself.
+    known : Adapter or None
+        The adapter that was opened last; None when nothing was, or it cannot be known again.
+    listed : sequence of Adapter
+        What is plugged in now.
+
+    Raises
+    ------
+    LinkDown
+        The adapter is not plugged in.
+    WrongDevice
+        It is not, and another one is where it was.
+    """
+    if known is None:
+        return path
+    for adapter in listed:
+        if (adapter.kind, adapter.serial_number) == (known.kind, known.serial_number):
+            return adapter.node
+    other = adapter_at(path, listed)
+    if other is not None:
+        raise WrongDevice(device, "open", f"adapter {other} is there instead of {known}", "plug the right adapter in")
+    raise LinkDown(device, "open", f"adapter {known} is not plugged in", "plug it in, at any socket of this computer")
+
+
+_CONNECT_S = 5.0
+
+
+async def connected(url: SocketUrl) -> socket.socket:
+    """Connect.
+
+    Raises
+    ------
+    LinkDown
+        Refused, unreachable, or no answer within 5 s.
+    """
+    # pyserial's own socket:// connects blockingly, which would freeze every other device of the service for seconds
+    try:
+        async with asyncio.timeout(_CONNECT_S):
+            return await _connect_any(url)
+    except TimeoutError:
+        raise LinkDown(str(url), "open", f"no connection within {_CONNECT_S:g} s", "address right? device and network on?") from None
+    except OSError as error:
+        raise LinkDown(str(url), "open", str(error), "address and port right? device server running?") from error
+
+
+async def _connect_any(url: SocketUrl) -> socket.socket:
+    # a name may stand for several addresses (localhost: ::1 and 127.0.0.1) of which only one is served
+    loop = asyncio.get_running_loop()
+    refused = OSError(f"{url.host} has no address")
+    for family, kind, protocol, _, address in await loop.getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM):
+        sock = socket.socket(family, kind, protocol)
+        connected = False
+        try:
+            sock.setblocking(False)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            await loop.sock_connect(sock, address)
+            connected = True
+        except OSError as error:
+            refused = error
+        finally:
+            if not connected:
+                sock.close()
+        if connected:
+            return sock
+    raise refused
+
 
 _DRAIN_S = 0.5
 _POLL_S = 0.01

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError, TimeoutError
 
-from abbe.service.capture.records import CHUNK, GAP, Record, decode_at
+from abbe.service.capture.segment import CHUNK, GAP, Record, decode_at
 from abbe.service.domain.measured import ChunkRecord
 from abbe.service.errors import AbbeError, CaptureFault, StoreError
 from abbe.service.storage.store import Store

@@ -13,12 +13,8 @@ from functools import partial
 from typing import Any
 
 from abbe.drivers.api import BarBatch
-from abbe.service.capture.account import joined, streams_doc
-from abbe.service.capture.drafts import Drafter, Item
-from abbe.service.capture.ledger import SampleGap
-from abbe.service.capture.records import CHUNK, GAP, Record
-from abbe.service.capture.reserve import Reserve
-from abbe.service.capture.segment import Segment
+from abbe.service.capture.ledger import Drafter, Item, SampleGap, joined, streams_doc
+from abbe.service.capture.segment import CHUNK, GAP, Record, Reserve, Segment
 from abbe.service.errors import AbbeError, CaptureFault, DiskFull
 
 GROUP_S = 0.01

@@ -11,14 +11,12 @@ from typing import Any
 
 from abbe.drivers.api import BarBatch
 from abbe.drivers.links.shielded import run_to_end
-from abbe.service.capture.drafts import BAR, Drafter
 from abbe.service.capture.file_io import FileIO, RealFileIO
-from abbe.service.capture.folder import folder_of
 from abbe.service.capture.ingest import Ingest
+from abbe.service.capture.ledger import BAR, Drafter
 from abbe.service.capture.log import CaptureLog, Published
-from abbe.service.capture.reserve import Reserve
-from abbe.service.capture.segment import Segment, fault
-from abbe.service.capture.settings import ORPHAN, CaptureSettings, is_memory, segment_path, set_aside
+from abbe.service.capture.segment import Reserve, Segment, fault
+from abbe.service.capture.settings import ORPHAN, CaptureSettings, folder_of, is_memory, segment_path, set_aside
 from abbe.service.clock import Clock
 from abbe.service.errors import StoreError
 from abbe.service.storage.store import Store

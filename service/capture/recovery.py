@@ -16,14 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from abbe.service.capture.account import DAMAGED, ledger_of, settle, streams_doc
 from abbe.service.capture.file_io import RealFileIO
-from abbe.service.capture.folder import folder_of
 from abbe.service.capture.ingest import BATCH, chunk_of, may_pass
-from abbe.service.capture.ledger import Ledger
+from abbe.service.capture.ledger import DAMAGED, Ledger, ledger_of, settle, streams_doc
 from abbe.service.capture.recorder import is_active
-from abbe.service.capture.records import CHUNK, CLOSE, GAP, OPEN
-from abbe.service.capture.scan import Scan, scan
+from abbe.service.capture.segment import CHUNK, CLOSE, GAP, OPEN, Scan, scan
 from abbe.service.capture.settings import (
     CONFLICT,
     DAMAGED_SUFFIX,
@@ -31,6 +28,7 @@ from abbe.service.capture.settings import (
     SUFFIX,
     TAIL,
     CaptureSettings,
+    folder_of,
     free_name,
     other_folders,
     segment_path,

@@ -1,15 +1,21 @@
-"""The append-only file of one run: records chained by their hashes, on the disk when `append` returns."""
+"""The append-only file of one run: records chained by their hashes, on the disk when `append` returns.
+
+Its records and their bytes, the reserve of disk space that lets a run be closed on a full disk, and the scan that finds how far a file can
+be believed.
+"""
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import struct
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from abbe.service.capture.file_io import FileIO
-from abbe.service.capture.records import NO_HASH, Record, digest, encode
 from abbe.service.errors import CaptureFault, DiskFull
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
@@ -119,3 +125,247 @@ def fault(path: Path, what: str, error: OSError) -> CaptureFault | DiskFull:
     if error.errno in NO_SPACE:
         return DiskFull(f"{path}: {what}: no space left on the disk", "free disk space, then measure this test again")
     return CaptureFault(f"{path}: {what}: {error.strerror or error}", _DISK)
+
+
+MAGIC = b"AbbC"
+VERSION = 1
+OPEN, CHUNK, GAP, CLOSE = 1, 2, 3, 4
+MAX_PAYLOAD = 1 << 24
+NO_HASH = bytes(32)
+
+# magic, version, kind, stream, run, chunk_no, boot_id, channel, codec, first_seq, count, flags, first_us, last_us, first_host_s,
+# last_host_s, utc_offset_s, SHA-256 of the record before, payload length
+_HEAD = struct.Struct("<4sBBHIII12s8sQIIqqddd32sI")
+_CRC = struct.Struct("<I")
+HEAD_BYTES = _HEAD.size
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One record.
+
+    Parameters
+    ----------
+    kind : int
+        ``OPEN``, ``CHUNK``, ``GAP`` or ``CLOSE``.
+    run : int
+        Run in the database.
+    channel, codec : str
+        As in the database.
+    chunk_no : int
+        Number in its channel, from 0.
+    stream : int
+        Which stream of the run: sequence numbers begin anew in each.
+    boot_id : int
+        Of the device, 0 where it has none.
+    first_seq, count : int
+        First sequence number and how many samples.
+    flags : int
+        All status bits that any of the samples has.
+    first_us, last_us : int
+        Device clock of the first and the last sample.
+    first_host_s, last_host_s : float
+        Monotonic host time of the first and the last arrival.
+    utc_offset_s : float
+        What to add to the monotonic host time to get UTC, as this computer believed then; no sample time depends on it.
+    payload : bytes
+        Packed samples, or JSON.
+    previous : bytes
+        SHA-256 of the record before in the same file.
+    """
+
+    kind: int
+    run: int
+    channel: str
+    codec: str
+    chunk_no: int = 0
+    stream: int = 0
+    boot_id: int = 0
+    first_seq: int = 0
+    count: int = 0
+    flags: int = 0
+    first_us: int = 0
+    last_us: int = 0
+    first_host_s: float = 0.0
+    last_host_s: float = 0.0
+    utc_offset_s: float = 0.0
+    payload: bytes = field(default=b"", repr=False)
+    previous: bytes = field(default=NO_HASH, repr=False)
+
+
+def encode(record: Record) -> bytes:
+    """Bytes of a record."""
+    r = record
+    head = _HEAD.pack(
+        MAGIC, VERSION, r.kind, r.stream, r.run, r.chunk_no, r.boot_id, r.channel.encode(), r.codec.encode(), r.first_seq, r.count, r.flags,
+        r.first_us, r.last_us, r.first_host_s, r.last_host_s, r.utc_offset_s, r.previous, len(r.payload),
+    )  # fmt: skip
+    body = head + r.payload
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def digest(encoded: bytes | memoryview) -> bytes:
+    """What the next record holds of this one."""
+    return hashlib.sha256(encoded).digest()
+
+
+def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
+    """The record that begins at a place, and where it ends; None when there is no whole and undamaged one.
+
+    Raises
+    ------
+    CaptureFault
+        There is one, undamaged, of another version: nothing may be taken for a torn tail.
+    """
+    if at + HEAD_BYTES > len(data) or bytes(data[at : at + 4]) != MAGIC:
+        return None
+    fields = _HEAD.unpack_from(data, at)
+    length = fields[-1]
+    body_end = at + HEAD_BYTES + length
+    if length > MAX_PAYLOAD or body_end + _CRC.size > len(data) or zlib.crc32(data[at:body_end]) != _CRC.unpack_from(data, body_end)[0]:
+        return None
+    (_, version, kind, stream, run, chunk_no, boot_id, channel, codec, first_seq, count, flags,
+     first_us, last_us, first_host_s, last_host_s, utc_offset_s, previous, _) = fields  # fmt: skip
+    if version != VERSION:
+        raise CaptureFault(
+            f"a record of format {version}: this segment was made by a newer version of this program",
+            "start the newer version once, it takes the run over; nothing was changed",
+        )
+    payload = bytes(data[at + HEAD_BYTES : body_end])
+    names = (channel.rstrip(b"\0").decode(), codec.rstrip(b"\0").decode())
+    numbers = (chunk_no, stream, boot_id, first_seq, count, flags, first_us, last_us)
+    record = Record(kind, run, *names, *numbers, first_host_s, last_host_s, utc_offset_s, payload, previous)
+    return record, body_end + _CRC.size
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Bytes between good records that are no record: bits that flipped, or a sector that was lost."""
+
+    offset: int
+    length: int
+    before: int
+    """How many good records stand before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """What a segment holds.
+
+    Parameters
+    ----------
+    records : list of Record
+        Every undamaged one, in order.
+    damaged : list of Damage
+        Damage with good records behind it.
+    good_bytes : int
+        Where the last good record ends; what follows was never acknowledged and may be cut off.
+    tail_bytes : int
+        How much that is.
+    broken_links : list of int
+        Records that do not follow on the one before them: something was taken out, put in or changed on purpose.
+    head : bytes
+        SHA-256 of the last good record.
+    """
+
+    records: list[Record] = field(default_factory=list)
+    damaged: list[Damage] = field(default_factory=list)
+    good_bytes: int = 0
+    tail_bytes: int = 0
+    broken_links: list[int] = field(default_factory=list)
+    head: bytes = NO_HASH
+
+    @property
+    def closed(self) -> bool:
+        """True when the run was ended, not cut off."""
+        return bool(self.records) and self.records[-1].kind == CLOSE
+
+    @property
+    def whole(self) -> bool:
+        """True when every byte is part of one unbroken chain."""
+        return not (self.damaged or self.tail_bytes or self.broken_links)
+
+
+def scan(data: bytes | memoryview) -> Scan:
+    """Find every good record of a segment.
+
+    A bad record ends the search only if no good one follows: a torn tail is told from damage in the middle; neither costs a good record.
+    """
+    records: list[Record] = []
+    damaged: list[Damage] = []
+    broken: list[int] = []
+    at, expected = 0, NO_HASH
+    while True:
+        found = decode_at(data, at)
+        start = at
+        if found is None:
+            start = _next_good(data, at + 1)
+            if start < 0:
+                return Scan(records, damaged, at, len(data) - at, broken, expected)
+            damaged.append(Damage(at, start - at, len(records)))
+            found = decode_at(data, start)
+            assert found is not None
+        record, end = found
+        if start == at and record.previous != expected:
+            broken.append(len(records))
+        records.append(record)
+        expected, at = digest(data[start:end]), end
+
+
+def _next_good(data: bytes | memoryview, at: int) -> int:
+    """Where the next undamaged record begins, or -1."""
+    rest = bytes(data[at:])
+    found = rest.find(MAGIC)
+    while found >= 0:
+        if decode_at(rest, found) is not None:
+            return at + found
+        found = rest.find(MAGIC, found + 1)
+    return -1
+
+
+class Reserve:
+    """A file of a given size in the folder of the segments.
+
+    Parameters
+    ----------
+    io : FileIO
+        Where files are.
+    folder : Path
+        Of the segments.
+    size : int
+        Bytes.
+    """
+
+    def __init__(self, io: FileIO, folder: Path, size: int) -> None:
+        self._io, self._folder, self._size = io, folder, size
+        self._path = folder / "reserve"
+        self._held = False
+
+    def hold(self) -> None:
+        """Make sure that it is there; of size 0 there is none.
+
+        Raises
+        ------
+        DiskFull, CaptureFault
+            There is no room for it: nothing should be begun.
+        """
+        if not self._size:
+            return
+        try:
+            self._io.hold_space(self._path, self._size)
+            self._io.sync_folder(self._folder)
+        except OSError as error:
+            raise fault(self._path, "hold back disk space", error) from error
+        self._held = True
+
+    def release(self) -> bool:
+        """Give the space back; False when it was given back before or cannot be."""
+        if not self._held:
+            return False
+        self._held = False
+        try:
+            self._io.remove(self._path)
+            self._io.sync_folder(self._folder)
+        except OSError:
+            return False
+        return True

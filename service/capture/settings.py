@@ -12,6 +12,7 @@ from pathlib import Path
 
 from abbe.service.errors import ConfigError
 from abbe.service.storage.engine import parse_url
+from abbe.service.storage.store import Store
 
 MIB = 1 << 20
 SUFFIX = ".seg"
@@ -120,3 +121,15 @@ def set_aside(path: Path, suffix: str) -> Path:
     name = free_name(path, suffix)
     path.rename(name)
     return name
+
+
+def folder_of(store: Store, settings: CaptureSettings) -> Path:
+    """Folder of the segments of a store; the same whatever address it was opened by. Not created.
+
+    Raises
+    ------
+    ConfigError
+        A PostgreSQL database, and no folder is configured.
+    """
+    on_server = parse_url(store.url).drivername != "sqlite"
+    return segment_folder(store.url, settings, store.database_id() if on_server and settings.folder else "")

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abbe.drivers.api import BarSample
-from abbe.drivers.ballbar.sequence import OtherPace, OtherSettings, Reads, SequenceRestart, SequenceTracker
+from abbe.drivers.ballbar.stream import OtherPace, OtherSettings, Reads, SequenceRestart, SequenceTracker
 
 READS = Reads(number=3, range_nm=1_000_000)
 NUMBER = 3 << 8

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abbe.drivers.api import BarSample
-from abbe.drivers.ballbar.sequence import SequenceRestart, SequenceTracker
+from abbe.drivers.ballbar.stream import SequenceRestart, SequenceTracker
 
 
 def bar(seq: int, us: int | None = None) -> BarSample:

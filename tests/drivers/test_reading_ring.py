@@ -13,8 +13,7 @@ import pytest
 from abbe.drivers.api import BarBatch, BarSample
 from abbe.drivers.ballbar import driver as module
 from abbe.drivers.ballbar.driver import SerialBallBar
-from abbe.drivers.ballbar.sequence import Reads
-from abbe.drivers.ballbar.stream import Stream
+from abbe.drivers.ballbar.stream import Reads, Stream
 from abbe.drivers.errors import Backpressure, LossyLine
 from abbe.drivers.links.reading import ReadingThread, Ring
 from abbe.drivers.links.serial_link import ByteLink

@@ -13,9 +13,8 @@ import pytest
 
 from abbe.drivers.errors import LinkDown, WrongDevice
 from abbe.drivers.links import reading as module
-from abbe.drivers.links.adapters import Adapter, adapter_at, path_to_open
 from abbe.drivers.links.reading import ReadingThread, Ring
-from abbe.drivers.links.serial_link import ByteLink, plugged_in
+from abbe.drivers.links.serial_link import Adapter, ByteLink, adapter_at, path_to_open, plugged_in
 from abbe.drivers.links.urls import SerialUrl
 from tests.patience import within
 

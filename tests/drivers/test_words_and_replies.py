@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from abbe.drivers.cnc import registers as cnc
 from abbe.drivers.errors import WrongDevice
 from abbe.drivers.laser import registers as laser
-from abbe.drivers.links.identity import check_identity
-from abbe.drivers.links.modbus_reply import rtu_mismatch, tcp_mismatch
-from abbe.drivers.links.words import Register, RegisterBlock, bytes_of, words_of
+from abbe.drivers.links.modbus import rtu_mismatch, tcp_mismatch
+from abbe.drivers.links.words import Register, RegisterBlock, bytes_of, check_identity, words_of
 
 READ = bytes.fromhex("0007 0000 0006 01 03 0064 0002")
 WRITE = bytes.fromhex("0008 0000 000B 01 10 0064 0002 04 0001 0002")

@@ -9,7 +9,7 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU
 
-from abbe.drivers.links.modbus_reply import rtu_mismatch, tcp_mismatch
+from abbe.drivers.links.modbus import rtu_mismatch, tcp_mismatch
 
 logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL + 1)  # a line per refused reply would be most of the time
 UNIT, TID, ADDRESS, COUNT = 1, 0x1234, 10, 9

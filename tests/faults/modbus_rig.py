@@ -16,7 +16,7 @@ import numpy as np
 from abbe.drivers.cnc.driver import ModbusController
 from abbe.drivers.errors import DriverError
 from abbe.drivers.laser.driver import ModbusLaser
-from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.incidents import Backoff
 from abbe.drivers.links.modbus_line import Canary
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url

@@ -7,12 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from abbe.drivers.api import BarSample
-from abbe.drivers.ballbar.box import Box
-from abbe.drivers.ballbar.conversation import Conversation
-from abbe.drivers.ballbar.frames import Bad, FrameDecoder
-from abbe.drivers.ballbar.framing import BarCounters
-from abbe.drivers.ballbar.sequence import Reads, SegmentEnd
-from abbe.drivers.ballbar.stream import Stream
+from abbe.drivers.ballbar.conversation import Box, Conversation
+from abbe.drivers.ballbar.frames import Bad, BarCounters, FrameDecoder
+from abbe.drivers.ballbar.stream import Reads, SegmentEnd, Stream
 from abbe.drivers.errors import DriverError, on_behalf_of
 from abbe.simulators.faults.serial_bytes import Sample
 from tests.faults.contract import Observed, assert_fault_contract, told_of

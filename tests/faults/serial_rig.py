@@ -15,8 +15,7 @@ from abbe.drivers.api import BarBatch, BarSample
 from abbe.drivers.ballbar import driver as module
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.errors import DriverError, on_behalf_of
-from abbe.drivers.links.adapters import Adapter
-from abbe.drivers.links.serial_link import ByteLink
+from abbe.drivers.links.serial_link import Adapter, ByteLink
 from abbe.drivers.links.urls import parse_url
 from abbe.simulators.faults.serial_box import FaultyBox
 from abbe.simulators.faults.serial_bytes import Sample

@@ -8,10 +8,9 @@ from contextlib import asynccontextmanager
 import pytest
 
 from abbe.drivers.errors import BadFrame, LinkDown
-from abbe.drivers.links.backoff import Backoff
-from abbe.drivers.links.modbus_line import Canary
+from abbe.drivers.links.incidents import Backoff
+from abbe.drivers.links.modbus_line import Canary, ModbusOperation
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.modbus_policy import ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, parse_url
 from abbe.simulators.faults.modbus_frames import RTU, Frame, parts
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine

@@ -8,7 +8,7 @@ import random
 import pytest
 
 from abbe.drivers.errors import DriverError, LinkDown, on_behalf_of
-from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.incidents import Backoff
 from abbe.drivers.links.modbus_line import Canary
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.urls import ModbusTcpUrl

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.errors import LinkDown, WrongDevice
-from abbe.drivers.links.adapters import Adapter
+from abbe.drivers.links.serial_link import Adapter
 from abbe.simulators.ballbar.wire import IDENTIFY, START, STOP
 from abbe.simulators.faults.serial_box import FaultyBox
 from tests.faults.rows_serial import S1_MOMENTS, S1_REPLUG

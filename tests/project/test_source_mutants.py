@@ -35,7 +35,7 @@ def test_the_fast_ones_are_noticed() -> None:
 
 
 def test_a_mistake_that_nobody_notices_is_said_and_the_copy_is_put_right() -> None:
-    harmless = Mutant("harmless", "drivers/ballbar/sequence.py", "_LATE_WINDOW = 128", "_LATE_WINDOW = 129", ())
+    harmless = Mutant("harmless", "drivers/ballbar/stream.py", "_LATE_WINDOW = 128", "_LATE_WINDOW = 129", ())
     with copied() as copy:
         path = copy / harmless.path
         before = path.read_text(encoding="utf-8")
@@ -43,4 +43,4 @@ def test_a_mistake_that_nobody_notices_is_said_and_the_copy_is_put_right() -> No
             assert "_LATE_WINDOW = 129" in path.read_text(encoding="utf-8")
             assert stale(harmless, copy)
         assert path.read_text(encoding="utf-8") == before
-    assert "| harmless | `drivers/ballbar/sequence.py` | SURVIVED | `` |" in page([(harmless, "SURVIVED", "")])
+    assert "| harmless | `drivers/ballbar/stream.py` | SURVIVED | `` |" in page([(harmless, "SURVIVED", "")])

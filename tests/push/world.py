@@ -232,7 +232,7 @@ class World:
         return self.p.operations.Done() if result == c.OK else self.p.operations.Refused("the bank is active")
 
     def _command(self, command: int, op: Any) -> Any:
-        """As drivers/links/numbered.py does: ask the number, send once, let the acknowledge decide."""
+        """As drivers/links/words.py does: ask the number, send once, let the acknowledge decide."""
         o, ctl = self.p.operations, self.ctl
         boot, ack = self.request("look", lambda: (ctl.boot, ctl.ack))
         if boot != self.boot:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.capture.account import ledger_of, streams_told
+from abbe.service.capture.ledger import ledger_of, streams_told
 from abbe.service.scheduler.store import ServiceStore
 from tests.system.serve_bench import Machine, abbe, free_port
 from tests.system.test_serve_processes import running, tokens, url_of

@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.capture.account import ledger_of, streams_told
+from abbe.service.capture.ledger import ledger_of, streams_told
 from abbe.service.clock import SystemClock
 from abbe.service.scheduler.store import ServiceStore
 from abbe.service.users.people import People

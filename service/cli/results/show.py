@@ -79,7 +79,7 @@ def show(
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
     """Where every ball-bar sample ended: stored, flagged, or in which gap."""
     from abbe.drivers.flags import BAR_REASONS
-    from abbe.service.capture.account import ledger_of, streams_told
+    from abbe.service.capture.ledger import ledger_of, streams_told
 
     streams = streams_told(run.end_doc)
     ledger = ledger_of(chunks, streams)

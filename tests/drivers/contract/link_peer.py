@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from abbe.drivers.links.backoff import Backoff
+from abbe.drivers.links.incidents import Backoff
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 

@@ -13,8 +13,7 @@ import pytest
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.capture.ingest import chunk_of
-from abbe.service.capture.records import CHUNK
-from abbe.service.capture.scan import scan
+from abbe.service.capture.segment import CHUNK, scan
 from abbe.service.capture.settings import segment_path
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.schedule import Schedule

@@ -17,9 +17,9 @@ from sqlalchemy.exc import OperationalError
 from abbe.service.capture import ingest as ingest_module
 from abbe.service.capture import log as log_module
 from abbe.service.capture import recorder as recorder_module
-from abbe.service.capture.drafts import Drafter
 from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.ingest import is_full
+from abbe.service.capture.ledger import Drafter
 from abbe.service.capture.recorder import CaptureRecorder, close_run, is_active, recording
 from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path

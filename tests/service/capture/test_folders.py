@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.capture.folder import folder_of
 from abbe.service.capture.recorder import recording
 from abbe.service.capture.recovery import recover_segments
-from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder, segment_path
+from abbe.service.capture.settings import CaptureSettings, folder_of, other_folders, segment_folder, segment_path
 from abbe.service.clock import SystemClock
 from abbe.service.storage.store import Store
 from tests.service.capture.capture_bench import abandon, batch, new_run

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.capture.drafts import Drafter
 from abbe.service.capture.ingest import chunk_of
+from abbe.service.capture.ledger import Drafter
 from abbe.service.capture.log import GROUP_S
-from abbe.service.capture.records import CHUNK
 from abbe.service.capture.recovery import ledger_of, recover_segments
-from abbe.service.capture.scan import scan
-from abbe.service.capture.segment import Segment
+from abbe.service.capture.segment import CHUNK, Segment, scan
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
 from abbe.service.runs.codec import decode_bar
 from abbe.service.storage.store import Store

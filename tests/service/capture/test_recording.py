@@ -14,8 +14,8 @@ import pytest
 from abbe.drivers.api import BarBatch, BarSample
 from abbe.service.capture import ingest as ingest_module
 from abbe.service.capture.recorder import CaptureRecorder, recording
-from abbe.service.capture.records import CHUNK, CLOSE, OPEN
 from abbe.service.capture.recovery import ledger_of, read_segment
+from abbe.service.capture.segment import CHUNK, CLOSE, OPEN
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
 from abbe.service.clock import SystemClock
 from abbe.service.domain.measured import ChunkRecord

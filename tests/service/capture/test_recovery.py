@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from abbe.service.capture.ingest import chunk_of
-from abbe.service.capture.records import CHUNK, encode
 from abbe.service.capture.recovery import DAMAGED, ledger_of, read_segment, recover_segments
-from abbe.service.capture.scan import scan
+from abbe.service.capture.segment import CHUNK, encode, scan
 from abbe.service.capture.settings import CaptureSettings, segment_path
 from abbe.service.domain.measured import RunRecord
 from abbe.service.runs.codec import decode_bar

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.capture.drafts import Drafter
 from abbe.service.capture.ingest import chunk_of
-from abbe.service.capture.records import CHUNK, Record
+from abbe.service.capture.ledger import Drafter
 from abbe.service.capture.recovery import recover_segments
-from abbe.service.capture.segment import Segment
+from abbe.service.capture.segment import CHUNK, Record, Segment
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
 from abbe.service.runs.codec import encode_bar
 from abbe.service.storage.store import Store

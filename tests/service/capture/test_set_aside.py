@@ -15,13 +15,10 @@ from pathlib import Path
 import pytest
 
 from abbe.service.capture import recovery
-from abbe.service.capture.account import DAMAGED, TORN
-from abbe.service.capture.drafts import Drafter
 from abbe.service.capture.ingest import chunk_of
-from abbe.service.capture.records import CHUNK, CLOSE, Record, encode
+from abbe.service.capture.ledger import DAMAGED, TORN, Drafter
 from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
-from abbe.service.capture.scan import scan
-from abbe.service.capture.segment import Segment
+from abbe.service.capture.segment import CHUNK, CLOSE, Record, Segment, encode, scan
 from abbe.service.capture.settings import CaptureSettings, segment_path
 from abbe.service.errors import CaptureFault
 from abbe.service.storage.store import Store
