@@ -8,10 +8,10 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from abbe.service.config_schema import MachineFile
-from abbe.service.runs.discovery_file import DiscoveryFile
-from abbe.service.runs.formats import CampaignFile, ErrorsFile, RunFile
-from abbe.service.runs.machine_object import MachineObject
-from abbe.service.runs.solution_file import SolutionFile
+from abbe.service.domain.discovery_file import DiscoveryFile
+from abbe.service.domain.machine_object import MachineObject
+from abbe.service.domain.run_file import CampaignFile, ErrorsFile, RunFile
+from abbe.service.domain.solution_file import SolutionFile
 
 MODELS: dict[str, type[BaseModel]] = {
     "machine-file": MachineFile,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, prepare
 from abbe.service.discovery.discover import discover as run_discovery
 from abbe.service.discovery.discovery_engine import search
-from abbe.service.discovery.discovery_words import UNITS
+from abbe.service.discovery.discovery_words import unit
+from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue, checked
 from abbe.service.rendering.discovery_page import render_discovery
@@ -36,7 +37,7 @@ class DiscoveryAnswer:
         Role of runs (``"identify"``, ``"holdout"``): rms of measured minus simulated ``before_um`` and ``after_um`` the effects, and
         ``floor_um``, the noise that no model takes out.
     next_measurement : dict or None
-        The measurement that would tell more.
+        The measurement that would tell more: what it ``adds``, which suspects it ``separates``, ``minutes``, and ``why``.
     """
 
     verdict: str
@@ -45,7 +46,7 @@ class DiscoveryAnswer:
     next_measurement: dict[str, Any] | None
     _job: DiscoveryJob
     _journal: DiscoveryJournal
-    _finding: dict[str, Any]
+    _finding: Finding
 
     def report(self, target: str | Path) -> None:
         """Write the page that ``abbe discover --report`` writes.
@@ -83,8 +84,10 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     job = prepare(campaign, (*known, *checked(effects, {e.name for e in known})))
     journal = DiscoveryJournal()
     finding = run_discovery(job, journal, search, progress or _silent)
-    found = {e["label"]: Estimate(e["strength"], e["u_strength"], UNITS.get(e["unit"], e["unit"]), "observed") for e in finding["effects"]}
-    return DiscoveryAnswer(finding["verdict"], found, finding["gaps"], finding["next_test"], job, journal, finding)
+    found = {e.label: Estimate(e.strength, e.u_strength, unit(e.unit), "observed") for e in finding.effects}
+    gap = {role: asdict(one) for role, one in finding.gaps.items()}
+    following = None if finding.next_test is None else asdict(finding.next_test)
+    return DiscoveryAnswer(finding.verdict, found, gap, following, job, journal, finding)
 
 
 def _silent(_: Progress) -> None:

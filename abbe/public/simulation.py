@@ -18,10 +18,10 @@ from abbe.models.geometry.chain import deviation_mm
 from abbe.models.machine import AXES, Machine
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, RUN_FORMAT
 from abbe.service.effects.effect_catalogue import catalogue, checked
 from abbe.service.errors import EffectUnknown, Unusable
 from abbe.service.runs.cases import path_of
-from abbe.service.runs.formats import ASSUMED_MODEL, CAMPAIGN_FORMAT, RUN_FORMAT
 from abbe.service.sequences.recipes.recipe import Recipe
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
 from abbe.service.site import Site, machine_doc

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.plausibility import SuspectRun, suspects
-from abbe.service.campaign_data.campaign_issue import Finding
+from abbe.service.campaign_data.campaign_issue import CampaignIssue
 from abbe.service.campaign_data.copied_runs import copies
 from abbe.service.campaign_data.run_geometry import geometry
 from abbe.service.campaign_data.run_times import times
@@ -47,7 +47,7 @@ _READINGS = {
 }
 
 
-def refuse(findings: Sequence[Finding]) -> None:
+def refuse(findings: Sequence[CampaignIssue]) -> None:
     """Stop at the first finding that refuses the campaign.
 
     Raises
@@ -61,7 +61,7 @@ def refuse(findings: Sequence[Finding]) -> None:
         raise CampaignRefused(f"run {bad[0].run}: {bad[0].what}{more}", f"{bad[0].remedy}; nothing was stored")
 
 
-def check_files(machine: Doc, runs: Sequence[Doc]) -> list[Finding]:
+def check_files(machine: Doc, runs: Sequence[Doc]) -> list[CampaignIssue]:
     """What single runs and their comparison show without any model: machine, geometry, units, time, copies, too few readings.
 
     Parameters
@@ -78,15 +78,15 @@ def check_files(machine: Doc, runs: Sequence[Doc]) -> list[Finding]:
     return _nothing_measured(runs) + out + times(runs) + copies(runs)
 
 
-def _nothing_measured(runs: Sequence[Doc]) -> list[Finding]:
+def _nothing_measured(runs: Sequence[Doc]) -> list[CampaignIssue]:
     """Runs whose readings are all the same: refused if they all are, else flagged."""
     still = [r["run_id"] for r in runs if _constant(r)]
     if not still:
         return []
     if len(still) == len(runs):
         what = "in this run and all others every reading is the same: nothing was measured"
-        return [Finding(still[0], what, "export the runs again, with their readings", True)]
-    return [Finding(n, "all its readings are the same: nothing was measured", "leave it out (--without)", False) for n in still]
+        return [CampaignIssue(still[0], what, "export the runs again, with their readings", True)]
+    return [CampaignIssue(n, "all its readings are the same: nothing was measured", "leave it out (--without)", False) for n in still]
 
 
 def _constant(run: Doc) -> bool:
@@ -94,24 +94,24 @@ def _constant(run: Doc) -> bool:
     return bool(y.size and (y == y[0]).all())
 
 
-def geometry_findings(machine: Doc, run: Doc) -> list[Finding]:
+def geometry_findings(machine: Doc, run: Doc) -> list[CampaignIssue]:
     """Whether the points of a run lie where its set-up says, inside the strokes."""
     what = geometry(machine, run)
-    return [Finding(run["run_id"], what.text, what.remedy, what.refuse)] if what else []
+    return [CampaignIssue(run["run_id"], what.text, what.remedy, what.refuse)] if what else []
 
 
-def _twice(names: list[str]) -> list[Finding]:
+def _twice(names: list[str]) -> list[CampaignIssue]:
     twice = sorted({n for n in names if names.count(n) > 1})
-    return [Finding(n, "two runs have this run_id", "give each run its own", True) for n in twice]
+    return [CampaignIssue(n, "two runs have this run_id", "give each run its own", True) for n in twice]
 
 
-def _other_machine(machine: Doc, run: Doc) -> list[Finding]:
+def _other_machine(machine: Doc, run: Doc) -> list[CampaignIssue]:
     theirs = run.get("machine") or {}
     for key, word in (("name", "name"), ("chain", "chain"), ("stroke_mm", "strokes"), ("pivots_mm", "pivots"), ("tool_mm", "tool")):
         ours, other = machine.get(key), theirs.get(key)
         if ours is not None and other is not None and not _same(ours, other):
             what = f"measured on another machine: {word} {_short(other)}, the campaign's is {_short(ours)}"
-            return [Finding(run["run_id"], what, "leave it out (--without), or correct its machine object", True)]
+            return [CampaignIssue(run["run_id"], what, "leave it out (--without), or correct its machine object", True)]
     return []
 
 
@@ -133,37 +133,43 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, int | float) else repr(value)
 
 
-def _readings(run: Doc) -> list[Finding]:
+def _readings(run: Doc) -> list[CampaignIssue]:
     """Time, size and number of the readings of one run."""
     label, columns = run["run_id"], run["columns"]
     y, t = (np.asarray(columns[k], dtype=np.float64) for k in ("deviation_mm", "t_s"))
     valid = np.asarray(columns.get("valid", np.ones(y.size))).astype(bool)
     if not (np.isfinite(y[valid]).all() and np.isfinite(t).all()):
-        return [Finding(label, "a reading or a time is not a finite number", "mark it with valid 0 or leave the run out (--without)", True)]
+        return [
+            CampaignIssue(
+                label, "a reading or a time is not a finite number", "mark it with valid 0 or leave the run out (--without)", True
+            )
+        ]
     if (np.diff(t) < 0).any():
         row = int(np.argmax(np.diff(t) < 0)) + 2
-        return [Finding(label, f"t_s runs back at row {row}", "put the rows in the order in which they were measured", True)]
+        return [CampaignIssue(label, f"t_s runs back at row {row}", "put the rows in the order in which they were measured", True)]
     return _too_large(label, y, valid) + _too_few(run, int(valid.sum()))
 
 
-def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[Finding]:
+def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[CampaignIssue]:
     """Deviations that no machine has: most of them, another unit; some, a lost beam or bar; single ones are left to the robust weights."""
     size = np.where(valid, np.abs(y), 0.0)
     count, of, largest = int((size > LARGEST_MM).sum()), int(valid.sum()), float(size.max(initial=0.0))
     if largest > NO_READING_MM:
         row = int(np.argmax(size)) + 1
         return [
-            Finding(label, f"{y[row - 1]:.3g} mm in row {row} is no reading", "mark it with valid 0, or write deviation_mm in mm", True)
+            CampaignIssue(
+                label, f"{y[row - 1]:.3g} mm in row {row} is no reading", "mark it with valid 0, or write deviation_mm in mm", True
+            )
         ]
     if count > HALF * of:
-        return [Finding(label, f"deviations up to {largest:.3g} mm: they look like µm", "write deviation_mm in mm", True)]
+        return [CampaignIssue(label, f"deviations up to {largest:.3g} mm: they look like µm", "write deviation_mm in mm", True)]
     if count > max(SPIKES * of, 1):
         what = f"{count} of {of} readings are beyond {LARGEST_MM:g} mm, up to {largest:.3g} mm: µm, or the bar or the beam was lost"
-        return [Finding(label, what, "write deviation_mm in mm, or mark what was lost with valid 0", True)]
+        return [CampaignIssue(label, what, "write deviation_mm in mm, or mark what was lost with valid 0", True)]
     return []
 
 
-def _too_few(run: Doc, count: int) -> list[Finding]:
+def _too_few(run: Doc, count: int) -> list[CampaignIssue]:
     """Few readings are a flag: fewer than 10 are refused where runs become arrays (`abbe.service.runs.observations`)."""
     turns = float(run["setup"].get("turns") or 1.0)
     wanted = max(FEWEST_BAR, int(np.ceil(PER_TURN * turns)))
@@ -172,28 +178,28 @@ def _too_few(run: Doc, count: int) -> list[Finding]:
     what = (
         f"only {count} valid readings on {turns:g} turns: cup, bar length and lost motion take most of what they tell ({wanted} are needed)"
     )
-    return [Finding(run["run_id"], what, "measure it again with a higher rate", False)]
+    return [CampaignIssue(run["run_id"], what, "measure it again with a higher rate", False)]
 
 
-def check_readings(machine: Machine, data: Sequence[RunData]) -> list[Finding]:
+def check_readings(machine: Machine, data: Sequence[RunData]) -> list[CampaignIssue]:
     """Runs whose readings contradict those of the others (`abbe.models.solvers.plausibility.suspects`)."""
     found = suspects(machine, data)
     return [_suspect(s, alone=len(found) == 1) for s in found]
 
 
-def _suspect(s: SuspectRun, *, alone: bool) -> Finding:
+def _suspect(s: SuspectRun, *, alone: bool) -> CampaignIssue:
     gross = s.misfit_mm > OTHER_RATIO * s.expected_mm and s.misfit_mm > OTHER_MM
     if s.tied:
         who = " or ".join(("it", *(f"run {name}" for name in s.tied)))
         what = f"contradicts the others ({_misfit(s)}); whether {who} is wrong, these runs cannot tell"
-        return Finding(s.run, what, "measure them again", gross or s.cause != "other")
+        return CampaignIssue(s.run, what, "measure them again", gross or s.cause != "other")
     if s.cause != "other":
-        return Finding(s.run, f"{_READINGS[s.cause]} ({_misfit(s)})", "correct the file, or leave it out (--without)", True)
+        return CampaignIssue(s.run, f"{_READINGS[s.cause]} ({_misfit(s)})", "correct the file, or leave it out (--without)", True)
     if alone and gross:
         what = f"fits none of the other runs ({_misfit(s)}), which fit each other: another machine, tool or table"
-        return Finding(s.run, what, "leave it out (--without), or measure it again", True)
+        return CampaignIssue(s.run, what, "leave it out (--without), or measure it again", True)
     what = f"does not fit the other runs ({_misfit(s)}): the machine changed, or its set-up or tool is not what it says"
-    return Finding(s.run, what, "look at its residuals; measure it again, or leave it out (--without)", False)
+    return CampaignIssue(s.run, what, "look at its residuals; measure it again, or leave it out (--without)", False)
 
 
 def _misfit(s: SuspectRun) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CampaignIssue:
     """One thing that is wrong with one run (or with two that contradict each other).
 
     ``refuse``: nothing may be solved from such a campaign; otherwise it is a flag beside the result.

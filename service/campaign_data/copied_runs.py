@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.service.campaign_data.campaign_issue import Finding
+from abbe.service.campaign_data.campaign_issue import CampaignIssue
 
 Doc = dict[str, Any]
 COPIED_SHARE = 0.98
@@ -20,7 +20,7 @@ NOTHING_MM = 1e-9
 STATE = ("x_mm", "y_mm", "z_mm", "direction")
 
 
-def copies(runs: Sequence[Doc]) -> list[Finding]:
+def copies(runs: Sequence[Doc]) -> list[CampaignIssue]:
     """Runs whose readings stand in another run already, whatever they are called.
 
     Where the readings show noise, alike readings are a copy whenever they are said to be measured. A coarse sensor shows none, and repeats
@@ -32,7 +32,7 @@ def copies(runs: Sequence[Doc]) -> list[Finding]:
         for j in range(k):
             if _copied(rows[j], rows[k]) and (_shows_noise(run) or _copied(_timed(runs[j], rows[j]), _timed(run, rows[k]))):
                 what = f"its readings are those of run {runs[j]['run_id']}: one measurement would count twice"
-                out.append(Finding(run["run_id"], what, "leave it out (--without), or export it again", True))
+                out.append(CampaignIssue(run["run_id"], what, "leave it out (--without), or export it again", True))
                 break
     return out
 

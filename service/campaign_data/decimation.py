@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from abbe.service.domain.discovery_file import FoundThinning
 
 MOST_READINGS = 20000
 """Ball-bar readings of a campaign that are searched one by one; more become means of so many neighbours that about as many are left."""
@@ -17,63 +18,37 @@ STILL_MM = 1e-6
 """An axis that moves less than this from reading to reading stands."""
 
 
-@dataclass(frozen=True)
-class Thinning:
-    """What became of long ball-bar runs, and what the shorter ones cannot show.
+def lines_of(made: FoundThinning) -> tuple[str, ...]:
+    """For people: what was done to long runs, what therefore could not be seen, what to do about it."""
+    each, means = made.readings_per_value, made.how == "means"
+    became = f"every {each} of them became one mean" if means else f"of every {each} one was looked at, as it was read"
+    done = f"{made.readings} ball-bar readings are more than are searched one by one: {became}, {made.kept} values in all"
+    hidden = f"what that hides could not be seen, which does not say that it is absent: {'; '.join(made.not_seen)}"
+    return (done, hidden, REMEDY) if means else (done, hidden)
 
-    ``readings``: ball-bar readings before; ``kept``: values after; ``each``: readings that one value stands for; ``means``: whether it is
-    their mean (else one of them, the rest are not looked at); ``interval_s``: usual time from value to value, and ``hertz``: the highest
-    frequency that such values can tell; ``turning``: values in whose readings an axis turns round.
+
+def _not_seen(*, each: int, means: bool, interval_s: float, turning: int) -> list[str]:
+    """What the shorter runs cannot show, one sentence each.
+
+    ``each``: readings that one value stands for; ``interval_s``: from value to value; ``turning``: values in whose readings an axis turns.
     """
-
-    readings: int
-    kept: int
-    each: int
-    means: bool
-    interval_s: float
-    turning: int
-
-    @property
-    def hertz(self) -> float:
-        """Half the rate of the values (Nyquist)."""
-        return 0.5 / self.interval_s
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """For people: what was done, what therefore could not be seen, what to do about it."""
-        became = f"every {self.each} of them became one mean" if self.means else f"of every {self.each} one was looked at, as it was read"
-        done = f"{self.readings} ball-bar readings are more than are searched one by one: {became}, {self.kept} values in all"
-        hidden = f"what that hides could not be seen, which does not say that it is absent: {'; '.join(self.not_seen)}"
-        return (done, hidden, REMEDY) if self.means else (done, hidden)
-
-    @property
-    def not_seen(self) -> tuple[str, ...]:
-        """What the shorter runs cannot show, one sentence each."""
-        if self.means:
-            # A spike of one interval lies across two values as a rule; one of two fills a value wherever it begins.
-            spikes = (
-                f"a spike at a reversal keeps its height from {2.0 * self.interval_s:.2g} s on, "
-                f"one of a single reading is 1/{self.each} as high"
-            )
-            sides = f"in {self.turning} means an axis turns round, and both sides of its lost motion are mixed there"
-            fast = f"vibration above {self.hertz:.2g} Hz is averaged down, or looks like a slower one"
-        else:
-            spikes = f"a spike at a reversal that lasts less than {self.interval_s:.2g} s may lie between two values"
-            sides = f"{self.turning} values stand for readings in which an axis turns round; how it loses motion there is not seen"
-            fast = f"vibration above {self.hertz:.2g} Hz looks like a slower one, or like noise"
-        return spikes, sides, fast
-
-    def doc(self) -> dict[str, Any]:
-        """As JSON."""
-        figures: dict[str, Any] = {"readings": self.readings, "kept": self.kept, "readings_per_value": self.each}
-        how = {"how": "means" if self.means else "picked", "interval_s": self.interval_s, "highest_hz": self.hertz}
-        return figures | how | {"values_with_reversal": self.turning, "not_seen": list(self.not_seen)}
+    highest_hz = 0.5 / interval_s  # Nyquist
+    if means:
+        # A spike of one interval lies across two values as a rule; one of two fills a value wherever it begins.
+        spikes = f"a spike at a reversal keeps its height from {2.0 * interval_s:.2g} s on, one of a single reading is 1/{each} as high"
+        sides = f"in {turning} means an axis turns round, and both sides of its lost motion are mixed there"
+        fast = f"vibration above {highest_hz:.2g} Hz is averaged down, or looks like a slower one"
+    else:
+        spikes = f"a spike at a reversal that lasts less than {interval_s:.2g} s may lie between two values"
+        sides = f"{turning} values stand for readings in which an axis turns round; how it loses motion there is not seen"
+        fast = f"vibration above {highest_hz:.2g} Hz looks like a slower one, or like noise"
+    return [spikes, sides, fast]
 
 
 REMEDY = f"to see it, search fewer runs (--without RUN): up to {MOST_READINGS} ball-bar readings are searched as they were read"
 
 
-def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Thinning | None:
+def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> FoundThinning | None:
     """What `thinned` or `picked` did to runs; None if nothing.
 
     Parameters
@@ -89,7 +64,17 @@ def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Thinn
     interval = float(np.median(np.concatenate([np.diff(a["columns"]["t_s"]) for _, a in changed])))
     means = any(not np.isin(_finite(a), _finite(b)).all() for b, a in changed)
     each = -(-readings // MOST_READINGS) if means else _step(*changed[0])
-    return Thinning(readings, kept, each, means, interval, sum(_turning(b, each) for b, _ in changed))
+    turning = sum(_turning(b, each) for b, _ in changed)
+    return FoundThinning(
+        readings=readings,
+        kept=kept,
+        readings_per_value=each,
+        how="means" if means else "picked",
+        interval_s=interval,
+        highest_hz=0.5 / interval,
+        values_with_reversal=turning,
+        not_seen=_not_seen(each=each, means=means, interval_s=interval, turning=turning),
+    )
 
 
 def _step(before: dict[str, Any], after: dict[str, Any]) -> int:

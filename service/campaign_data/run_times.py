@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.service.campaign_data.campaign_issue import Finding
+from abbe.service.campaign_data.campaign_issue import CampaignIssue
 
 Doc = dict[str, Any]
 FASTEST = 0.2
@@ -19,20 +19,24 @@ OVERLAP = 0.1
 UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
 
 
-def times(runs: Sequence[Doc]) -> list[Finding]:
+def times(runs: Sequence[Doc]) -> list[CampaignIssue]:
     """Flags of runs whose t_s does not fit their feed, and of runs that were measured while others were."""
     out = [f for run in runs for f in (*_clocks(run), *_against_feed(run))]
     known = {f.run for f in out}
     return out + _overlaps([r for r in runs if r["run_id"] not in known])
 
 
-def _clocks(run: Doc) -> list[Finding]:
+def _clocks(run: Doc) -> list[CampaignIssue]:
     """What the clocks of a run that was measured here contradict each other in (abbe.service.runs.clocks)."""
     trouble = (run.get("timing") or {}).get("trouble")
-    return [Finding(run["run_id"], str(trouble), "look at the sync cable and the links, then measure it again", False)] if trouble else []
+    return (
+        [CampaignIssue(run["run_id"], str(trouble), "look at the sync cable and the links, then measure it again", False)]
+        if trouble
+        else []
+    )
 
 
-def _against_feed(run: Doc) -> list[Finding]:
+def _against_feed(run: Doc) -> list[CampaignIssue]:
     columns = run["columns"]
     if columns.get("feed_mm_min") is None:
         return []
@@ -50,11 +54,13 @@ def _against_feed(run: Doc) -> list[Finding]:
     unit = next((word for factor, word in UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is not what it says")
     what = f"it took {ratio:.2g} times as long as its path at its feed_mm_min: {unit}"
     return [
-        Finding(run["run_id"], what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: drift is judged by them", False)
+        CampaignIssue(
+            run["run_id"], what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: drift is judged by them", False
+        )
     ]
 
 
-def _overlaps(runs: Sequence[Doc]) -> list[Finding]:
+def _overlaps(runs: Sequence[Doc]) -> list[CampaignIssue]:
     """Runs that lie in time where others lie; the one with the most others is named first and set aside."""
     spans = {r["run_id"]: (float(r["columns"]["t_s"][0]), float(r["columns"]["t_s"][-1])) for r in runs if len(r["columns"]["t_s"])}
     spans = {k: v for k, v in spans.items() if np.isfinite(v).all()}
@@ -65,10 +71,10 @@ def _overlaps(runs: Sequence[Doc]) -> list[Finding]:
         others = meets.pop(worst)
         meets = {k: [m for m in v if m != worst] for k, v in meets.items()}
         what = f"its t_s lies within that of {_named(others)}: one machine cannot measure two runs at a time"
-        out.append(Finding(worst, what, "write t_s in s of one clock for the whole campaign: drift is judged by it", False))
+        out.append(CampaignIssue(worst, what, "write t_s in s of one clock for the whole campaign: drift is judged by it", False))
     if len(out) > 1 and 2 * len(out) >= len(spans):
         what = f"its t_s and those of {len(out)} other runs overlap: every run seems to have a clock of its own"
-        return [Finding(next(iter(spans)), what, out[0].remedy, False)]
+        return [CampaignIssue(next(iter(spans)), what, out[0].remedy, False)]
     return out
 
 

@@ -26,6 +26,7 @@ from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, disc
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.new_measurement import NewMeasurement, judged_anew
+from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current
@@ -50,7 +51,7 @@ class HiddenDemo:
     site: Site
     folder: Path
     started_utc: str
-    finding: dict[str, Any] = field(default_factory=dict)
+    finding: Finding = field(default_factory=lambda: Finding(verdict="unknown"))
     job: DiscoveryJob | None = None
     journal: DiscoveryJournal | None = None
     anew: NewMeasurement | None = None
@@ -125,7 +126,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
         result.refused = str(error)
 
 
-async def _searched(job: DiscoveryJob, journal: DiscoveryJournal, progress: ProgressSink) -> dict[str, Any]:
+async def _searched(job: DiscoveryJob, journal: DiscoveryJournal, progress: ProgressSink) -> Finding:
     """The search, off the event loop; stopped, it ends with its next word about how far it is."""
     stopped = threading.Event()
 

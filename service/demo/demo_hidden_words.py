@@ -6,8 +6,9 @@ from dataclasses import asdict
 from typing import Any
 
 from abbe.service.demo.demo_hidden import HiddenDemo
+from abbe.service.discovery.discovery_answer import where_doc
 from abbe.service.discovery.discovery_words import book_lines, effect_lines, next_of, verdict_of
-from abbe.service.discovery.new_measurement import NewGap
+from abbe.service.domain.finding import GapUm
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.rendering.numbers import plain
 
@@ -18,17 +19,17 @@ def story(result: HiddenDemo) -> list[str]:
     """What happened, one line a thing to know, in the order in which it happened."""
     finding = result.finding
     _, word, text = verdict_of(finding)
-    lines = [f"measured: {len(finding['runs'])} runs, {sum(r['readings'] for r in finding['runs'].values())} readings"]
+    lines = [f"measured: {len(finding.runs)} runs, {sum(r.readings for r in finding.runs.values())} readings"]
     lines += [f"{word}. {text}"]
-    lines += [f"{role} runs: {_gap_words(g['before_um'], g['after_um'], g['floor_um'])}" for role, g in finding["gaps"].items()]
-    for effect in finding["effects"]:
+    lines += [f"{role} runs: {_gap_words(g)}" for role, g in finding.gaps.items()]
+    for effect in finding.effects:
         lines += effect_lines(effect)
     lines += next_of(finding) + _model(result) + _anew(result) + _tables(result)
     return [*lines, *truth_lines(result)]
 
 
-def _gap_words(before: float, after: float, floor: float) -> str:
-    return f"gap {plain(before)} -> {plain(after)} µm rms, {plain(floor)} µm is noise"
+def _gap_words(gap: GapUm) -> str:
+    return f"gap {plain(gap.before_um)} -> {plain(gap.after_um)} µm rms, {plain(gap.floor_um)} µm is noise"
 
 
 def _model(result: HiddenDemo) -> list[str]:
@@ -41,13 +42,8 @@ def _model(result: HiddenDemo) -> list[str]:
 def _anew(result: HiddenDemo) -> list[str]:
     if result.anew is None:
         return []
-    g = result.anew.gap
-    runs = [f"  {label}: {_gap_words(*_numbers(r))}" for label, r in result.anew.runs.items()]
-    return [f"measured anew at places that no fit has used, later: {_gap_words(*_numbers(g))}", *runs]
-
-
-def _numbers(gap: NewGap) -> tuple[float, float, float]:
-    return gap.before_um, gap.after_um, gap.floor_um
+    runs = [f"  {label}: {_gap_words(r)}" for label, r in result.anew.runs.items()]
+    return [f"measured anew at places that no fit has used, later: {_gap_words(result.anew.gap)}", *runs]
 
 
 def _tables(result: HiddenDemo) -> list[str]:
@@ -73,18 +69,18 @@ def judged(result: HiddenDemo) -> tuple[bool, str]:
     Right is: the hidden name and key and no other; ``none`` where nothing is hidden; ``unknown`` where the catalogue has no such name.
     """
     label, finding = hidden_label(result.truth), result.finding
-    named = [e["label"] for e in finding["effects"]]
+    named = [e.label for e in finding.effects]
     if label is None:
-        right = finding["verdict"] == "none"
-        return right, "nothing was hidden" + ("" if right else f", and yet it was said: {', '.join(named) or finding['verdict']}")
+        right = finding.verdict == "none"
+        return right, "nothing was hidden" + ("" if right else f", and yet it was said: {', '.join(named) or finding.verdict}")
     if result.truth["hidden"]["name"] not in {e.name for e in catalogue()}:
-        right = finding["verdict"] == "unknown" and not named
-        return right, f"hidden was {label}, which no catalogue names; the answer was {', '.join([finding['verdict'], *named])}"
-    right = finding["verdict"] == "named" and named == [label]
+        right = finding.verdict == "unknown" and not named
+        return right, f"hidden was {label}, which no catalogue names; the answer was {', '.join([finding.verdict, *named])}"
+    right = finding.verdict == "named" and named == [label]
     also = [n for n in named if n != label]
     if label in named and also:
         return False, f"hidden was {label}, and it was named; but beside it {', '.join(also)}, which is not there"
-    return right, f"hidden was {label}; the answer was {', '.join(named) or finding['verdict']}"
+    return right, f"hidden was {label}; the answer was {', '.join(named) or finding.verdict}"
 
 
 def truth_lines(result: HiddenDemo) -> list[str]:
@@ -106,10 +102,10 @@ def hidden_json(result: HiddenDemo) -> dict[str, Any]:
     right, text = judged(result)
     doc: dict[str, Any] = {
         "format": FORMAT,
-        "verdict": finding["verdict"],
-        "effects": [{k: e[k] for k in told} for e in finding["effects"]],
-        "where": {k: v for k, v in finding["where"].items() if k != "table"},
-        "gaps": finding["gaps"],
+        "verdict": finding.verdict,
+        "effects": [{k: getattr(e, k) for k in told} for e in finding.effects],
+        "where": where_doc(finding.where),
+        "gaps": {role: asdict(gap) for role, gap in finding.gaps.items()},
         "model_version": None if result.journal is None else result.journal.version,
         "anew": None if result.anew is None else asdict(result.anew),
         "tables": None if c is None else {"kept": c.decision.keep, "verdict": c.decision.text, "stays": list(c.not_for_tables)},

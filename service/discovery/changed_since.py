@@ -7,7 +7,7 @@ table did is put in its place, so that both are of the same machine.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,9 +17,11 @@ from abbe.models.solvers.in_force import AppliedTables
 from abbe.models.uncertainty.known_field import KnownField
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import machine_digest
+from abbe.service.discovery.changed_words import proved
+from abbe.service.domain.finding import ChangedSince, ChangeRival, EffectFound, GapUm, MotionChange
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.effects.known_effects import LASTING, applies
-from abbe.service.effects.model_book import name_of, version
+from abbe.service.effects.model_book import version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
 from abbe.service.identification.effect_removal import less_effects
 from abbe.service.identification.solution_field import stored_field
@@ -37,12 +39,12 @@ LOST_MOTION = "backlash"
 class Since:
     """The solution that a campaign is compared with, and how; comparing takes a second or two.
 
-    ``compare``: of the campaign, or of one that it was joined with, and what a search has just found in it (entries of a finding); what
-    cannot be told is its ``trouble``.
+    ``compare``: of the campaign, or of one that it was joined with, and what a search has just found in it; a comparison that fails says
+    why in its ``trouble``.
     """
 
     number: int
-    compare: Callable[[Campaign, Sequence[Doc]], Doc]
+    compare: Callable[[Campaign, Sequence[EffectFound]], ChangedSince]
 
 
 @dataclass(frozen=True)
@@ -142,51 +144,57 @@ def _force(store: Store, crc: int | None) -> AppliedTables:
     return NOTHING if table is None else AppliedTables(smooth_of(table) or table.correction_at)
 
 
-def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[Doc]) -> Doc:
+def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[EffectFound]) -> ChangedSince:
     try:
-        return {"since": before.number} | _compared(store, before, campaign, found)
+        return _compared(store, before, campaign, found)
     except StoreError:
         raise
     except (AbbeError, ValueError, ArithmeticError, LookupError) as trouble:  # what is missing is worth telling all the same
-        return {"since": before.number, "changes": [], "gap": None, "judged": None, "hidden_um_m": {}, "trouble": str(trouble)}
+        return ChangedSince(since=before.number, trouble=str(trouble))
 
 
-def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence[Doc]) -> Doc:
+def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence[EffectFound]) -> ChangedSince:
     """The campaign less what the solution's readings were without, too, and less what heat and instruments did in it alone."""
     left = as_left(campaign, table_then(store, campaign).table)
     if before.version is not None:
-        book = version(store, campaign.site.name, before.version).doc["effects"]
-        same = [e for e in book if e["label"] in before.taken and applies(e, campaign.name)]
+        book = version(store, campaign.site.name, before.version).book.effects
+        same = [e for e in book if e.label in before.taken and applies(e, campaign.name)]
         left = less_effects(left, same, f"model version {before.version}")
-    left = less_effects(left, [e for e in found if e["family"] not in LASTING], "found in these runs")
+    left = less_effects(left, [e for e in found if e.family not in LASTING], "found in these runs")
     used, out = [r for r in left.runs if r["role"] == "identify"], _tables_between(store, campaign, before)
-    doc = changed_doc(changed_since(before.known, tuple(run_data(r) for r in (used if out is None else less(used, out)))))
+    changed = changed_since(before.known, tuple(run_data(r) for r in (used if out is None else less(used, out))))
     # A drive's lost motion is free in the comparison; what else lasts may have been there before, swallowed by the motions.
-    beside = [name_of(e) for e in found if e["family"] in LASTING and e["name"] != LOST_MOTION]
-    return doc | {"beside": beside}
+    beside = [e.words for e in found if e.family in LASTING and e.name != LOST_MOTION]
+    return _record(before.number, changed, tuple(beside))
 
 
-def changed_doc(found: Changed) -> Doc:
-    """The changes as they are stored with a finding: µm/m and µrad of what is linear, µm or µrad of shapes; ``gap`` as of a finding."""
+def _record(since: int, changed: Changed, beside: tuple[str, ...]) -> ChangedSince:
+    """The changes as they are kept with a finding: µm/m and µrad of what is linear, µm or µrad of shapes."""
     gap = None
-    if found.before_mm is not None and found.after_mm is not None:
-        gap = {"before_um": found.before_mm * 1e3, "after_um": found.after_mm * 1e3, "floor_um": found.floor_mm * 1e3}
-    hidden = {k: v * 1e6 for k, v in found.hidden.items()}
-    return {"changes": [_change(c) for c in found.changes], "gap": gap, "judged": found.judged, "hidden_um_m": hidden}
+    if changed.before_mm is not None and changed.after_mm is not None:
+        gap = GapUm(before_um=changed.before_mm * 1e3, after_um=changed.after_mm * 1e3, floor_um=changed.floor_mm * 1e3)
+    found = ChangedSince(
+        since=since,
+        changes=tuple(_change(c) for c in changed.changes),
+        gap=gap,
+        judged=changed.judged,
+        hidden_um_m={k: v * 1e6 for k, v in changed.hidden.items()},
+        beside=beside,
+    )
+    return replace(found, proved=proved(found))
 
 
-def _change(change: Change) -> Doc:
+def _change(change: Change) -> MotionChange:
     motion, _, shape = change.name.partition(" ")
     angle = motion[1] in "ABC"
     size = 1e6 if angle or not shape else 1e3
-    unit = "um/m" if not shape and motion[0] == "E" else "urad" if angle or not shape else "um"
-    return {
-        "motion": motion,
-        "part": shape or "linear",
-        "value": change.value * size,
-        "u": change.u * size,
-        "unit": unit,
-        "evidence": change.evidence,
-        "rivals": [{"name": name, "less_evidence": by} for name, by in change.rivals],
-        "halves": change.halves,
-    }
+    return MotionChange(
+        motion=motion,
+        part="shape" if shape else "linear",
+        value=change.value * size,
+        u=change.u * size,
+        unit="um/m" if not shape and motion[0] == "E" else "urad" if angle or not shape else "um",
+        evidence=change.evidence,
+        rivals=tuple(ChangeRival(name=name, less_evidence=by) for name, by in change.rivals),
+        halves=change.halves,
+    )

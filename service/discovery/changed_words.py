@@ -2,107 +2,103 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from abbe.service.discovery.discovery_states import CLOSED, NEAR, VISIBLE, closed
+from abbe.service.discovery.discovery_states import CLOSED, NEAR, VISIBLE
 from abbe.service.discovery.linear_change import NAMES
+from abbe.service.domain.finding import ChangedSince, GapUm, MotionChange
 from abbe.service.rendering.numbers import COVERAGE, plain, with_uncertainty
 
 LEFT = 1.5
-"""What is left after the changes is told as more than noise from this factor on: the solution is known to a part of the noise only."""
+"""What is left after the changes counts as more than noise from this factor on: the solution is known to a part of the noise only."""
 HALVES = 2
 UNITS = {"um/m": "µm/m", "urad": "µrad", "um": "µm"}
-Doc = dict[str, Any]
 
 
-def changed_words(finding: Doc) -> str:
+def changed_words(changed: ChangedSince | None) -> str:
     """In one sentence, empty where nothing could be compared: what has changed, with U (k = 2), and whether that is proved."""
-    told = finding.get("changed")
-    if told is None:
+    if changed is None:
         return ""
-    since = f"since solution {told['since']}"
-    if told.get("trouble"):
-        return f"what has changed {since} could not be told: {told['trouble']}"
-    if not told["changes"]:
+    since = f"since solution {changed.since}"
+    if changed.trouble:
+        return f"what has changed {since} could not be told: {changed.trouble}"
+    if not changed.changes:
         return f"nothing has changed {since} that these runs can tell"
-    names = ", ".join(_size(c) for c in told["changes"])
-    return f"changed {since}: {names}{'' if proved(told) else ' (not proved)'}"
+    names = ", ".join(_size(c) for c in changed.changes)
+    return f"changed {since}: {names}{'' if changed.proved else ' (not proved)'}"
 
 
-def changed_lines(finding: Doc) -> list[str]:
+def changed_lines(changed: ChangedSince | None) -> list[str]:
     """The same with what proves it, what else it could be, and what would not have been seen; empty where nothing could be compared."""
-    told = finding.get("changed")
-    if told is None:
+    if changed is None:
         return []
-    out = [changed_words(finding)]
-    if told.get("trouble"):
+    out = [changed_words(changed)]
+    if changed.trouble:
         return out
-    for c in told["changes"]:
-        name = _name(c["motion"], c["part"])
-        if c["rivals"]:
-            out.append(f"  {name}: these runs cannot tell it from {', '.join(_rival(r['name']) for r in c['rivals'])}")
+    for c in changed.changes:
+        name = _name(c.motion, c.part)
+        if c.rivals:
+            out.append(f"  {name}: these runs cannot tell it from {', '.join(_rival(r.name) for r in c.rivals)}")
         if not _sure(c):
             out.append(f"  {name}: zero is within its uncertainty, so it may be another scale or squareness that has changed")
-    if told["changes"] and told.get("beside"):
-        out.append(f"  {', '.join(told['beside'])} was found in the same runs: a change may be the same thing, seen by other motions")
-    return out + (_proof(told) if told["changes"] else []) + _hidden(told)
+    if changed.changes and changed.beside:
+        out.append(f"  {', '.join(changed.beside)} was found in the same runs: a change may be the same thing, seen by other motions")
+    return out + (_proof(changed) if changed.changes else []) + _hidden(changed)
 
 
-def proved(told: Doc) -> bool:
+def proved(changed: ChangedSince) -> bool:
     """Whether runs that did not choose the changes bear them out.
 
     Each half of the set-ups is more likely with what the other has chosen; the gap, where it shows, closes; every change was chosen by both
     halves, has no near rival, and is larger than its own U; and nothing was found in the same runs that could be the same thing.
     """
-    sure = all(c["halves"] == HALVES and not c["rivals"] and _sure(c) for c in told["changes"])
-    if not told["changes"] or not sure or told.get("beside") or told["judged"] is None or told["judged"] < NEAR:
+    sure = all(c.halves == HALVES and not c.rivals and _sure(c) for c in changed.changes)
+    if not changed.changes or not sure or changed.beside or changed.judged is None or changed.judged < NEAR:
         return False
-    return not _shows(told["gap"]) or (closed(told["gap"]) or 0.0) >= CLOSED
+    return changed.gap is not None and (not _shows(changed.gap) or (changed.gap.closed or 0.0) >= CLOSED)
 
 
-def _shows(gap: Doc) -> bool:
-    return bool(gap["before_um"] > VISIBLE * gap["floor_um"])
+def _shows(gap: GapUm) -> bool:
+    return gap.before_um > VISIBLE * gap.floor_um
 
 
-def _sure(change: Doc) -> bool:
-    return abs(float(change["value"])) > COVERAGE * float(change["u"])
+def _sure(change: MotionChange) -> bool:
+    return abs(change.value) > COVERAGE * change.u
 
 
-def _proof(told: Doc) -> list[str]:
-    gap, judged = told["gap"], told["judged"]
-    if gap is None:
+def _proof(changed: ChangedSince) -> list[str]:
+    gap, judged = changed.gap, changed.judged
+    if gap is None or judged is None:
         return ["  there are too few set-ups for one half of them to judge what the other chooses: judged by evidence alone"]
-    before, after, floor = (plain(gap[k]) for k in ("before_um", "after_um", "floor_um"))
+    before, after, floor = plain(gap.before_um), plain(gap.after_um), plain(gap.floor_um)
     if _shows(gap):
-        share = closed(gap) or 0.0
+        share = gap.closed or 0.0
         goes, part = ("shrinks", f" ({share:.0%} closed)") if share > 0.0 else ("goes", "")
         out = [f"  on runs that did not choose it the gap {goes} from {before} to {after} µm rms where {floor} µm is noise{part}"]
     else:
         out = [f"  set-ups take up nearly all of it: the gap is {before} µm rms without and {after} with it where {floor} µm is noise"]
     if judged < NEAR:
         out.append("  runs that did not choose it are not more likely with it")
-    alone = [_name(c["motion"], c["part"]) for c in told["changes"] if c["halves"] < HALVES]
+    alone = [_name(c.motion, c.part) for c in changed.changes if c.halves < HALVES]
     if alone:
         out.append(f"  not chosen by each half of the runs alone: {', '.join(alone)}")
-    if gap["after_um"] > LEFT * gap["floor_um"]:
+    if gap.after_um > LEFT * gap.floor_um:
         out.append("  what is left is more than noise: what the solution did not know, or a change that has no name here")
     return out
 
 
-def _hidden(told: Doc) -> list[str]:
+def _hidden(changed: ChangedSince) -> list[str]:
     """What may have changed beside what was named, where nothing was: all of it."""
-    hidden: Doc = told["hidden_um_m"]
-    named = {c["motion"] for c in told["changes"] if c["part"] == "linear"}
+    hidden = changed.hidden_um_m
+    named = {c.motion for c in changed.changes if c.part == "linear"}
     each = [f"{NAMES[n]} {plain(v, 2)} {'µm/m' if n[0] == 'E' else 'µrad'}" for n, v in hidden.items()]
     unseen = [words for n, words in NAMES.items() if n not in hidden and n not in named]
     out = [f"  what may have changed all the same, at most (k = 2): {', '.join(each)}"] if each else []
     return out + ([f"  not seen by these runs: {', '.join(unseen)}"] if unseen else [])
 
 
-def _size(change: Doc) -> str:
-    value, expanded = with_uncertainty(change["value"], change["u"])
-    sign = "+" if change["part"] == "linear" and change["value"] > 0.0 else ""
-    return f"{_name(change['motion'], change['part'])} {sign}{value} ± {expanded} {UNITS[change['unit']]}"
+def _size(change: MotionChange) -> str:
+    value, expanded = with_uncertainty(change.value, change.u)
+    sign = "+" if change.part == "linear" and change.value > 0.0 else ""
+    return f"{_name(change.motion, change.part)} {sign}{value} ± {expanded} {UNITS[change.unit]}"
 
 
 def _rival(name: str) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,13 +21,16 @@ from abbe.models.effects.effect import Effect
 from abbe.service.campaign_data.campaign_checks import check_files, check_readings, refuse
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.copied_runs import copies
-from abbe.service.campaign_data.decimation import Thinning, thinned, thinning
+from abbe.service.campaign_data.decimation import lines_of, thinned, thinning
 from abbe.service.campaign_data.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
 from abbe.service.discovery.changed_since import Since
-from abbe.service.discovery.discovery_doc import finding_doc
-from abbe.service.discovery.discovery_states import ENDS, FOLLOWS, PROGRAM, after_fit, entering, taken_back
+from abbe.service.discovery.discovery_states import ENDS, FOLLOWS, after_fit, entering
+from abbe.service.discovery.finding import finding_of
+from abbe.service.domain.discovery import DiscoveryStep, FindingSource, SearchStart
+from abbe.service.domain.discovery_file import FoundThinning
+from abbe.service.domain.finding import Finding
+from abbe.service.domain.model_book import ModelBook, ModelVersion
 from abbe.service.domain.progress import ProgressSink
-from abbe.service.domain.results import ModelRecord
 from abbe.service.effects.axis_test import SLOW_DRIFT
 from abbe.service.effects.known_effects import applies, readings_of, without
 from abbe.service.effects.model_book import grown
@@ -60,20 +63,21 @@ class DiscoveryJob:
     runs: list[dict[str, Any]]
     case: Case
     effects: tuple[Effect, ...]
-    base: ModelRecord | None
+    base: ModelVersion | None
     known_mm: dict[str, F1]
     known: tuple[str, ...]
     flags: tuple[str, ...]
-    thinning: Thinning | None = None
+    thinning: FoundThinning | None = None
     seen: int | None = None
     table_mm: dict[str, F1] = field(default_factory=dict)
     since: Since | None = None
 
     @property
-    def source(self) -> dict[str, Any]:
+    def source(self) -> FindingSource:
         """Where a finding comes from: campaign, runs by their digests, machine, program."""
         runs = {r["run_id"]: run_digest(r) for r in self.campaign.runs}
-        return {"campaign": self.campaign.name, "machine_digest": machine_digest(self.case.machine), "runs": runs, "versions": versions()}
+        digest = machine_digest(self.case.machine)
+        return FindingSource(campaign=self.campaign.name, machine_digest=digest, runs=runs, versions=versions())
 
     @property
     def digest(self) -> str:
@@ -81,14 +85,14 @@ class DiscoveryJob:
         head = {k: self.campaign.doc.get(k) for k in ("machine", "current_model", "instruments", "temperature_sensors")}
         runs = sorted(whole_run_digest(r) for r in self.runs)
         files = {e.name: code_digest(e.signal) for e in self.effects}
-        words = [self.source, head, runs, sorted(self.case.includes), files]
+        words = [asdict(self.source), head, runs, sorted(self.case.includes), files]
         return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
 
 
 def prepare(
     campaign: Campaign,
     effects: tuple[Effect, ...],
-    base: ModelRecord | None = None,
+    base: ModelVersion | None = None,
     *,
     table: TableThen = NO_TABLE,
     since: Since | None = None,
@@ -98,7 +102,7 @@ def prepare(
 
     Parameters
     ----------
-    base : ModelRecord, optional
+    base : ModelVersion, optional
         Current version of the machine's model. A version of another geometry is not used, and that is flagged.
     table : TableThen
         In force while it was measured: what it did beyond smooth corrections is taken out of the readings, and flagged.
@@ -122,15 +126,15 @@ def prepare(
     runs = thin(left.runs)
     hidden = thinning(left.runs, runs)
     table_mm = {} if left is campaign else _between(thin(campaign.runs), runs)
-    flags += hidden.lines if hidden is not None else ()
+    flags += lines_of(hidden) if hidden is not None else ()
     case = case_of(campaign.doc, campaign.site.machine, runs)
     seen = None if base is None else base.version
-    if base is not None and base.doc["machine_digest"] != machine_digest(case.machine):
+    if base is not None and base.book.machine_digest != machine_digest(case.machine):
         flags.append(f"model version {base.version} of {base.machine} is of another geometry and was not used")
         base = None
-    known = [] if base is None else [e for e in base.doc["effects"] if applies(e, campaign.name)]
+    known = [] if base is None else [e for e in base.book.effects if applies(e, campaign.name)]
     known_mm = readings_of(known, effects, case)
-    labels = tuple(e["label"] for e in known)
+    labels = tuple(e.label for e in known)
     return DiscoveryJob(
         campaign, runs, without(case, known_mm), effects, base, known_mm, labels, tuple(flags), hidden, seen, table_mm, since
     )
@@ -158,10 +162,10 @@ class DiscoveryJournal:
     """States of one discovery, in order; this one forgets them with the process. `StoredJournal` keeps them."""
 
     def __init__(self) -> None:
-        self.states: list[tuple[str, dict[str, Any]]] = []
+        self.steps: list[DiscoveryStep] = []
         self.version: int | None = None
 
-    def write(self, state: str, doc: dict[str, Any], model: dict[str, Any] | None = None) -> None:
+    def write(self, step: DiscoveryStep, model: ModelBook | None = None) -> None:
         """Append a state.
 
         Raises
@@ -169,13 +173,13 @@ class DiscoveryJournal:
         ValueError
             It cannot follow the last one.
         """
-        last = self.states[-1][0] if self.states else None
-        if state not in FOLLOWS[last]:
-            raise ValueError(f"{state} cannot follow {last}")
-        self._keep(len(self.states), state, doc, model)
-        self.states.append((state, doc))
+        last = self.steps[-1].state if self.steps else None
+        if step.state not in FOLLOWS[last]:
+            raise ValueError(f"{step.state} cannot follow {last}")
+        self._keep(len(self.steps), step, model)
+        self.steps.append(step)
 
-    def _keep(self, seq: int, state: str, doc: dict[str, Any], model: dict[str, Any] | None) -> None:
+    def _keep(self, seq: int, step: DiscoveryStep, model: ModelBook | None) -> None:
         """Nothing is kept."""
 
     @property
@@ -184,23 +188,18 @@ class DiscoveryJournal:
         return None
 
     @property
-    def finding(self) -> dict[str, Any] | None:
+    def finding(self) -> Finding | None:
         """What the search found, as soon as it has."""
-        return next((taken_back(doc["finding"]) for _, doc in self.states if "finding" in doc), None)
+        return next((step.finding for step in self.steps if step.finding is not None), None)
 
     @property
     def ended(self) -> bool:
         """Whether it came to an end."""
-        return bool(self.states) and self.states[-1][0] in ENDS
+        return bool(self.steps) and self.steps[-1].state in ENDS
 
 
-def discover(job: DiscoveryJob, journal: DiscoveryJournal, search: Search, progress: ProgressSink) -> dict[str, Any]:
-    """Take a discovery from wherever its journal stands to its end.
-
-    Returns
-    -------
-    dict
-        The finding (`abbe.service.discovery.discovery_doc`).
+def discover(job: DiscoveryJob, journal: DiscoveryJournal, search: Search, progress: ProgressSink) -> Finding:
+    """Take a discovery from wherever its journal stands to its end, and give what was found.
 
     Raises
     ------
@@ -209,32 +208,31 @@ def discover(job: DiscoveryJob, journal: DiscoveryJournal, search: Search, progr
     ModelMovedOn
         The model has a version that this search has not known. Nothing was added; the finding is kept in the journal.
     """
-    if not journal.states:
-        base = None if job.base is None else job.base.version
-        fitted = {
-            "present_model": sorted(job.case.includes),
-            "model_version": base,
-            "known_effects": list(job.known),
-            "flags": list(job.flags),
-        }
-        journal.write("FITTED", {"decided_by": PROGRAM, "why": "runs checked, present model stated"} | fitted | job.source)
+    if not journal.steps:
+        start = SearchStart(
+            source=job.source,
+            present_model=tuple(sorted(job.case.includes)),
+            model_version=None if job.base is None else job.base.version,
+            known_effects=job.known,
+            flags=job.flags,
+        )
+        journal.write(DiscoveryStep(state="FITTED", why="runs checked, present model stated", start=start))
     finding = journal.finding
     if finding is None:
         found = search(job.case, job.effects, progress)
-        finding = finding_doc(found, job.case, (*job.effects, SLOW_DRIFT), job.known_mm, job.thinning)
-        finding |= {} if job.since is None else {"changed": job.since.compare(job.campaign, entering(finding))}
-    for seq, (state, doc) in enumerate(after_fit(finding), start=1):
-        if seq < len(journal.states):
-            continue
-        kept = doc | ({"finding": finding} if seq == 1 else {})
-        journal.write(state, kept, _version(job, journal, finding) if state == "EXPLAINED" and _enters(doc, finding) else None)
+        finding = finding_of(found, job.case, (*job.effects, SLOW_DRIFT), job.known_mm, job.thinning)
+        if job.since is not None:
+            finding = replace(finding, changed=job.since.compare(job.campaign, entering(finding)))
+    for step in list(after_fit(finding))[len(journal.steps) - 1 :]:
+        journal.write(step, _version(job, journal, finding) if _enters(step, finding) else None)
     return finding
 
 
-def _enters(ending: dict[str, Any], finding: dict[str, Any]) -> bool:
-    return bool(finding["effects"]) and ending["not_added"] is None
+def _enters(step: DiscoveryStep, finding: Finding) -> bool:
+    """Whether a finding enters the model book with this step."""
+    return step.state == "EXPLAINED" and bool(finding.effects) and step.not_added is None
 
 
-def _version(job: DiscoveryJob, journal: DiscoveryJournal, finding: dict[str, Any]) -> dict[str, Any]:
+def _version(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> ModelBook:
     """The model's version that a proved finding brings: with what moves readings, and nothing that was only seen beside it."""
-    return grown(job.base, finding | {"effects": entering(finding)}, job.source | {"discovery": journal.id}, job.effects)
+    return grown(job.base, replace(finding, effects=entering(finding)), job.source, journal.id, job.effects)

@@ -1,66 +1,64 @@
-"""What a discovery found as the answer of run-format.md 5 (``abbe-discovery/1``)."""
+"""A finding as the answer of run-format.md 5 (``abbe-discovery/1``)."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import Any
 
-from abbe.models.discovery.answer import Discovery, NamedEffect, Where
-from abbe.models.discovery.case import Case
-from abbe.service.campaign_data.decimation import Thinning
+from abbe.models.discovery.answer import NextTest, Where
+from abbe.service.domain.finding import EffectFound, Finding
 
 FORMAT = "abbe-discovery/1"
 
 
-def answer_doc(found: Discovery, case: Case, thinning: Thinning | None = None) -> dict[str, Any]:
-    """Plain JSON, lengths of gaps in um, predictions of every sealed run in mm; ``thinning``: what became of long runs before."""
-    held, fitted = found.gaps.get("holdout"), found.gaps.get("identify")
+def answer_doc(finding: Finding) -> dict[str, Any]:
+    """Plain JSON, lengths of gaps in µm, predictions of every sealed run in mm."""
+    held, fitted, test = finding.gaps.get("holdout"), finding.gaps.get("identify"), finding.next_test
     doc: dict[str, Any] = {
         "format": FORMAT,
-        "case": case.name,
-        "verdict": found.verdict,
-        "effects": [_effect(e) for e in found.effects],
-        "confounded_with": list(found.confounded_with),
-        "where": where_doc(found.where),
-        "p_value": found.p_value,
-        "predictions": {r.path.label: found.predicted_mm[r.path.label].tolist() for r in case.of("sealed")},
+        "case": finding.case,
+        "verdict": finding.verdict,
+        "effects": [_effect(e) for e in finding.effects],
+        "confounded_with": list(finding.confounded_with),
+        "where": where_doc(finding.where),
+        "p_value": finding.p_value,
+        "predictions": {label: list(values) for label, values in finding.predictions.items()},
+        "proved": finding.proved,
+        "proof": finding.proof,
     }
-    if found.beside:
-        doc["beside"] = [{"label": label, "evidence": evidence} for label, evidence in found.beside]
-    if found.agreement:
-        doc["agreement"] = [asdict(a) for a in found.agreement]
-    if found.fitted:
-        doc["fitted"] = [asdict(f) for f in found.fitted]
-    if found.unseen:
-        doc["unseen"] = [asdict(u) for u in found.unseen]
-    if thinning is not None:
-        doc["thinning"] = thinning.doc()
-    if found.next_test is not None:
-        t = found.next_test
-        doc["next_test"] = {
-            "adds": list(t.adds),
-            "minutes": t.minutes,
-            "expected_separation_sigma": t.expected_separation_sigma,
-            "why": t.why,
-        } | ({"like": t.like} if t.like else {})
+    for name in ("beside", "agreement", "fitted", "unseen"):
+        if found := getattr(finding, name):
+            doc[name] = [asdict(one) for one in found]
+    doc |= {"suspects": [_effect(e) for e in finding.suspects]} if finding.suspects else {}
+    doc |= {"thinning": finding.thinning.model_dump()} if finding.thinning is not None else {}
+    doc |= {"next_test": _next_test(test)} if test is not None else {}
     if fitted is not None:
-        doc |= {"rms_before_um": 1e3 * fitted.before_mm, "rms_after_um": 1e3 * fitted.after_mm, "noise_floor_um": 1e3 * fitted.floor_mm}
-    if held is not None:
-        doc["holdout_rms_um"] = 1e3 * held.after_mm
-    return doc
+        doc |= {"rms_before_um": fitted.before_um, "rms_after_um": fitted.after_um, "noise_floor_um": fitted.floor_um}
+    return doc if held is None else doc | {"holdout_rms_um": held.after_um}
 
 
-def _effect(e: NamedEffect) -> dict[str, Any]:
-    shape = {name: value for name, (value, _) in e.parameters.items()} | {f"u_{name}": u for name, (_, u) in e.parameters.items()}
-    return {
+def _effect(e: EffectFound) -> dict[str, Any]:
+    values = {name: p.value for name, p in e.parameters.items()}
+    unsure = {f"u_{name}": p.u for name, p in e.parameters.items() if p.u is not None}
+    doc = {
         "name": e.name,
         "key": e.key,
-        "parameters": {name: v for name, v in ({"strength": e.strength, "u_strength": e.u_strength} | shape).items() if math.isfinite(v)},
+        "parameters": {"strength": e.strength, "u_strength": e.u_strength} | values | unsure,
         "evidence": e.evidence,
-        "alternatives": [label for label, _ in e.alternatives],
+        "alternatives": [rival.label for rival in e.alternatives],
         "forms": list(e.forms),
     }
+    return doc if e.proved is None else doc | {"proved": e.proved}
+
+
+def _next_test(test: NextTest) -> dict[str, Any]:
+    doc = {
+        "adds": list(test.adds),
+        "minutes": test.minutes,
+        "expected_separation_sigma": test.expected_separation_sigma,
+        "why": test.why,
+    }
+    return doc | ({"like": test.like} if test.like else {})
 
 
 def where_doc(where: Where) -> dict[str, Any]:

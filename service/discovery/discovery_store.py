@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from abbe.service.campaign_data.campaign_folder import ensure_stored
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
+from abbe.service.domain.discovery import DiscoveryStep, SearchBase
+from abbe.service.domain.document import document, record
+from abbe.service.domain.model_book import ModelBook
 from abbe.service.domain.results import DiscoveryRecord, NewVersion
 from abbe.service.errors import ModelMovedOn
 from abbe.service.storage.store import Store
@@ -20,10 +21,10 @@ class StoredJournal(DiscoveryJournal):
     def __init__(self, store: Store, discovery_id: int, machine: str) -> None:
         super().__init__()
         self._store, self._id, self._machine = store, discovery_id, machine
-        record = store.discovery(discovery_id)
-        self.base: int | None = record.doc["model_version"]
-        self._after = _after(record)
-        self.states = [(s.state, s.doc) for s in store.discovery_steps(discovery_id)]
+        base = base_of(store.discovery(discovery_id))
+        self.base = base.model_version
+        self._after = base.after
+        self.steps = stored_steps(store, discovery_id)
         self.version = next((m.version for m in store.models(machine) if m.discovery_id == discovery_id), None)
 
     @property
@@ -33,13 +34,13 @@ class StoredJournal(DiscoveryJournal):
 
     @property
     def leaves(self) -> int | None:
-        """Version of the model that is the current one after this discovery, if nobody else adds one: its own, or the one it saw."""
+        """Version of the model that is the current one after this discovery, if no other is added: its own, or the one it saw."""
         return self._after if self.version is None else self.version
 
-    def _keep(self, seq: int, state: str, doc: dict[str, Any], model: dict[str, Any] | None) -> None:
-        new = None if model is None else NewVersion(self._machine, self._after, model)
+    def _keep(self, seq: int, step: DiscoveryStep, model: ModelBook | None) -> None:
+        new = None if model is None else NewVersion(self._machine, self._after, document(model))
         try:
-            self.version = self._store.add_discovery_step(self._id, seq, state, doc, new)
+            self.version = self._store.add_discovery_step(self._id, seq, step.state, document(step), new)
         except ModelMovedOn as moved:
             # Adding it to effects that its search has not seen could count one thing twice, or keep what was mended.
             again = "run the same command again: it searches anew with what the model knows now"
@@ -62,27 +63,35 @@ def journal_of(store: Store, job: DiscoveryJob, before: StoredJournal | None = N
         Another campaign of this name is in the store.
     """
     ensure_stored(store, job.campaign)
-    record = store.campaign(job.campaign.name)
+    campaign = store.campaign(job.campaign.name)
     machine, digest = job.campaign.site.name, job.digest
-    for old in reversed(store.discoveries(record.id)):
+    for old in reversed(store.discoveries(campaign.id)):
         if old.digest == digest and (_goes_on(old, before) if before is not None else _holds(store, old, machine, job.seen)):
             return StoredJournal(store, old.id, machine)
-    doc = {
-        "model_version": None if job.base is None else job.base.version,
-        "after": job.seen,
-        "continues": None if before is None else before.id,
-    }
-    return StoredJournal(store, store.add_discovery(record.id, digest, doc), machine)
+    base = SearchBase(
+        model_version=None if job.base is None else job.base.version, after=job.seen, continues=None if before is None else before.id
+    )
+    return StoredJournal(store, store.add_discovery(campaign.id, digest, document(base)), machine)
 
 
-def _after(record: DiscoveryRecord) -> int | None:
-    """Version of the model that was the current one when a discovery was opened."""
-    number: int | None = record.doc.get("after", record.doc["model_version"])
-    return number
+def base_of(one: DiscoveryRecord) -> SearchBase:
+    """What a stored search goes out from."""
+    return record(SearchBase, one.doc, f"discovery {one.id}")
+
+
+def stored_steps(store: Store, discovery_id: int) -> list[DiscoveryStep]:
+    """The states that a stored search has reached, first to last.
+
+    Raises
+    ------
+    Unusable
+        One of them was stored by a version that kept another form.
+    """
+    return [record(DiscoveryStep, s.doc, f"state {s.state} of discovery {discovery_id}") for s in store.discovery_steps(discovery_id)]
 
 
 def _goes_on(old: DiscoveryRecord, before: StoredJournal) -> bool:
-    return bool(old.doc.get("continues") == before.id)
+    return base_of(old).continues == before.id
 
 
 def _holds(store: Store, old: DiscoveryRecord, machine: str, now: int | None) -> bool:
@@ -90,7 +99,7 @@ def _holds(store: Store, old: DiscoveryRecord, machine: str, now: int | None) ->
     brought = {m.version: m.discovery_id for m in store.models(machine)}
     if old.id in _line(store, None if now is None else brought.get(now)):
         return True
-    return old.id not in brought.values() and _after(old) == now
+    return old.id not in brought.values() and base_of(old).after == now
 
 
 def _line(store: Store, discovery_id: int | None) -> list[int]:
@@ -98,5 +107,5 @@ def _line(store: Store, discovery_id: int | None) -> list[int]:
     out: list[int] = []
     while discovery_id is not None:
         out.append(discovery_id)
-        discovery_id = store.discovery(discovery_id).doc.get("continues")
+        discovery_id = base_of(store.discovery(discovery_id)).continues
     return out

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
+from abbe.models.discovery.answer import Where
 from abbe.models.discovery.unseen import LATE_S
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import DIAGONALS
@@ -50,13 +51,13 @@ class NextPlan:
 
 
 def next_plan(
-    adds: list[str],
+    adds: Sequence[str],
     machine: Machine,
     runs: list[dict[str, Any]],
     *,
     name: tuple[str, str],
     max_feed_mm_min: float,
-    about: dict[str, Any] | None = None,
+    about: Where | None = None,
 ) -> NextPlan:
     """Recipes for what a discovery wants to have added (``next_test.adds``).
 
@@ -66,7 +67,7 @@ def next_plan(
         What was measured so far: second feeds and late repeats are of the first helix of it, exactly as it was.
     name : tuple of str
         Of the new campaign, and what its labels and set-ups begin with, so that they can stand beside the old ones.
-    about : dict, optional
+    about : Where, optional
         Where something without a name lives (``where`` of a finding, ``runs`` the one that is to be measured again): a helix is repeated
         several times in one set-up, any other run by hand; another radius passes through its place.
     """
@@ -83,13 +84,13 @@ def next_plan(
 
 
 def _tests(
-    add: str, machine: Machine, runs: list[dict[str, Any]], name: str, max_feed_mm_min: float, about: dict[str, Any] | None
+    add: str, machine: Machine, runs: list[dict[str, Any]], name: str, max_feed_mm_min: float, about: Where | None
 ) -> tuple[TestPlan, ...] | str:
     """The tests of one addition, or what a person reads who has to see to it."""
     make = MAKERS.get(add)
     if make is None:
         return add
-    place = None if about is None else about.get("position_mm")
+    place = None if about is None else about.position_mm
     like = _first_helix(machine, [] if add in LASER else runs if about is None else _showing(runs, about))
     if about is not None:
         if add == "ballbar":
@@ -104,7 +105,7 @@ def _tests(
 
 
 def _within(
-    add: str, machine: Machine, recipes: list[Recipe], max_feed_mm_min: float, place: list[float] | None
+    add: str, machine: Machine, recipes: list[Recipe], max_feed_mm_min: float, place: tuple[float, float, float] | None
 ) -> tuple[TestPlan, ...] | str:
     """The tests of recipes inside the strokes; a sphere of another radius that has no room may be smaller still."""
     tries = [recipes]
@@ -122,17 +123,17 @@ def _within(
     return f"{add} ({why})"
 
 
-def _is_helix(runs: list[dict[str, Any]], about: dict[str, Any]) -> bool:
+def _is_helix(runs: list[dict[str, Any]], about: Where) -> bool:
     """Whether the run that is to be measured again is a helix."""
-    return "ballbar_helix" in [r["test"] for r in runs if r.get("run_id") in about.get("runs", [])]
+    return "ballbar_helix" in [r["test"] for r in runs if r.get("run_id") in about.runs]
 
 
-def _showing(runs: list[dict[str, Any]], about: dict[str, Any]) -> list[dict[str, Any]]:
+def _showing(runs: list[dict[str, Any]], about: Where) -> list[dict[str, Any]]:
     """Runs, first those that are to be measured again."""
-    return sorted(runs, key=lambda run: run.get("run_id") not in about.get("runs", []))
+    return sorted(runs, key=lambda run: run.get("run_id") not in about.runs)
 
 
-def _shrunk(helix: Helix, scale: float, place: list[float] | None) -> Helix:
+def _shrunk(helix: Helix, scale: float, place: tuple[float, float, float] | None) -> Helix:
     """A helix with a shorter bar about the same centre; about one nearer to a place, so that its sphere still passes there."""
     if place is None:
         return replace(helix, radius_mm=scale * helix.radius_mm)
@@ -143,7 +144,7 @@ def _shrunk(helix: Helix, scale: float, place: list[float] | None) -> Helix:
     return replace(helix, radius_mm=radius, centre_mm=as_point(at + radius * towards))
 
 
-def _through(place: list[float] | None, like: Helix, name: str) -> list[Recipe]:
+def _through(place: tuple[float, float, float] | None, like: Helix, name: str) -> list[Recipe]:
     """Twice the turns on another sphere through a place; without one, another radius as usual."""
     if place is None:
         return _named(like, name, "radius", radius_mm=SHORTER * like.radius_mm)

@@ -11,30 +11,22 @@ from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.decimation import thinned
 from abbe.service.discovery.discover import Thin, prepare
 from abbe.service.discovery.discover_live import joined
-from abbe.service.discovery.discovery_doc import noise_mm_of
+from abbe.service.discovery.finding import noise_mm_of
 from abbe.service.discovery.simulate import Simulation, simulate
-from abbe.service.domain.results import ModelRecord
-
-
-@dataclass(frozen=True, slots=True)
-class NewGap:
-    """Rms of measured minus predicted over new runs, µm: by the model as it was, by the model with what was found, and the noise."""
-
-    before_um: float
-    after_um: float
-    floor_um: float
+from abbe.service.domain.finding import GapUm
+from abbe.service.domain.model_book import ModelVersion
 
 
 @dataclass(frozen=True)
 class NewMeasurement:
-    """The gap on all new runs together, and run by run."""
+    """The gap on all new runs together, and run by run: by the model as it was before, by the model with what was found."""
 
-    gap: NewGap
-    runs: dict[str, NewGap]
+    gap: GapUm
+    runs: dict[str, GapUm]
 
 
 def judged_anew(
-    old: Campaign, new: Campaign, effects: tuple[Effect, ...], model: ModelRecord | None, *, thin: Thin = thinned
+    old: Campaign, new: Campaign, effects: tuple[Effect, ...], model: ModelVersion | None, *, thin: Thin = thinned
 ) -> NewMeasurement:
     """Predict a new campaign from an old one and the model book, and compare.
 
@@ -45,7 +37,7 @@ def judged_anew(
     new : Campaign
         Measured later with the controller's clock running on. Nothing of it is fitted but what only it can tell: the zero of every laser
         run, and where the cup of a new set-up stands.
-    model : ModelRecord, optional
+    model : ModelVersion, optional
         The book's version with what was found. None: nothing was found, and before and after are the same.
 
     Raises
@@ -63,9 +55,10 @@ def judged_anew(
     return NewMeasurement(_gap(labels, plain, known, kinds), runs)
 
 
-def _gap(labels: list[str], plain: Simulation, known: Simulation, kinds: dict[str, str]) -> NewGap:
+def _gap(labels: list[str], plain: Simulation, known: Simulation, kinds: dict[str, str]) -> GapUm:
     floor = np.concatenate([np.full(known.left_mm[k].size, noise_mm_of(known.noise_mm, kinds[k])) for k in labels])
-    return NewGap(_rms_um([plain.left_mm[k] for k in labels]), _rms_um([known.left_mm[k] for k in labels]), _rms_um([floor]))
+    before, after = ([simulation.left_mm[k] for k in labels] for simulation in (plain, known))
+    return GapUm(before_um=_rms_um(before), after_um=_rms_um(after), floor_um=_rms_um([floor]))
 
 
 def _rms_um(parts: list[np.ndarray]) -> float:

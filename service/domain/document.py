@@ -1,8 +1,43 @@
-"""A document: what is stored or sent as JSON."""
+"""A document: what is stored or sent as JSON. It is parsed into a record once, where it is read."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from abbe.service.errors import Unusable
 
 Doc = dict[str, Any]
 """A JSON object."""
+T = TypeVar("T")
+_adapters: dict[type[Any], TypeAdapter[Any]] = {}
+
+
+def _adapter(kind: type[Any]) -> TypeAdapter[Any]:
+    if kind not in _adapters:
+        _adapters[kind] = TypeAdapter(kind)
+    return _adapters[kind]
+
+
+def document(record: Any) -> Doc:
+    """A record (a dataclass) as a JSON object."""
+    doc: Doc = _adapter(type(record)).dump_python(record, mode="json", by_alias=True)
+    return doc
+
+
+def record(kind: type[T], doc: object, what: str) -> T:
+    """A stored JSON object as a record; ``what`` it is, for the message.
+
+    Raises
+    ------
+    Unusable
+        The document has another form.
+    """
+    try:
+        found: T = _adapter(kind).validate_python(doc)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise Unusable(f"{what} has another form than expected: {where}: {first['msg']}", "make it again with this version") from None
+    return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,8 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.case import Case
 from abbe.models.effects.effect import Effect
 from abbe.models.effects.path import Path
+from abbe.service.domain.finding import EffectSize
+from abbe.service.domain.model_book import BookEffect
 from abbe.service.errors import ModelUnknown
 
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
@@ -19,13 +20,13 @@ LASTING = ("drive", "structure", "geometry")
 """Families that stay with the machine. Heat has its own clock in every campaign, an instrument its own set-up: they are found anew."""
 
 
-def applies(entry: dict[str, Any], campaign: str) -> bool:
+def applies(entry: BookEffect, campaign: str) -> bool:
     """Whether an effect of the model book is expected in a campaign's readings: it moves them, and it lasts or was found in just these."""
-    moves = entry["kind"] == "mean" and len(entry["coefficients"]) > 0
-    return moves and (entry["family"] in LASTING or entry["from"]["campaign"] == campaign)
+    moves = entry.kind == "mean" and len(entry.coefficients) > 0
+    return moves and (entry.family in LASTING or entry.origin.campaign == campaign)
 
 
-def readings_of(entries: Sequence[dict[str, Any]], effects: tuple[Effect, ...], case: Case) -> dict[str, F1]:
+def readings_of(entries: Sequence[EffectSize], effects: tuple[Effect, ...], case: Case) -> dict[str, F1]:
     """Reading that known effects cause in every run, mm, by the run's label; runs of the case in their order.
 
     Raises
@@ -37,20 +38,20 @@ def readings_of(entries: Sequence[dict[str, Any]], effects: tuple[Effect, ...], 
     paths = tuple(r.path for r in case.runs)
     by_name = {e.name: e for e in effects}
     for entry in entries:
-        effect = by_name.get(entry["name"])
+        effect = by_name.get(entry.name)
         if effect is None:
             raise ModelUnknown(
-                f"the model knows {entry['label']}, the catalogue does not",
+                f"the model knows {entry.label}, the catalogue does not",
                 "install the plug-in it came from, or go back: abbe model revert",
             )
-        coefficients = np.asarray(entry["coefficients"], dtype=np.float64)
+        coefficients = np.asarray(entry.coefficients, dtype=np.float64)
         found = _columns(effect, entry, paths)
         shown = _shown(found, coefficients.size, [r.role == "identify" for r in case.runs])
         usual = _usual(entry, coefficients)
         for path, columns in zip(paths, found, strict=True):
             if np.count_nonzero(shown) != coefficients.size:
                 raise ModelUnknown(
-                    f"{entry['label']} has {coefficients.size} coefficients in the model and {columns.shape[1]} in this catalogue",
+                    f"{entry.label} has {coefficients.size} coefficients in the model and {columns.shape[1]} in this catalogue",
                     "run abbe discover again with this version, or go back: abbe model revert",
                 )
             total[path.label] += columns[:, shown] @ coefficients + usual * columns[:, ~shown].sum(axis=1)
@@ -66,17 +67,17 @@ def _shown(columns: list[F2], count: int, fitted: Sequence[bool]) -> Mask:
     return np.asarray(shown) if np.count_nonzero(shown) == count else everything
 
 
-def _usual(entry: dict[str, Any], coefficients: F1) -> float:
+def _usual(entry: EffectSize, coefficients: F1) -> float:
     """What an instrument's new set-up is expected to have: the mean of the known ones where all agree in sign, else nothing."""
     alike = len(coefficients) > 1 and bool(np.all(coefficients > 0.0) or np.all(coefficients < 0.0))
-    return float(np.mean(coefficients)) if entry["family"] == "instrument" and alike and not entry["forms"] else 0.0
+    return float(np.mean(coefficients)) if entry.family == "instrument" and alike and not entry.forms else 0.0
 
 
-def _columns(effect: Effect, entry: dict[str, Any], paths: tuple[Path, ...]) -> list[F2]:
-    values = {name: float(p["value"]) for name, p in entry["parameters"].items()}
+def _columns(effect: Effect, entry: EffectSize, paths: tuple[Path, ...]) -> list[F2]:
+    values = {name: p.value for name, p in entry.parameters.items()}
     forms = {f.name: f.signal for f in effect.forms}
-    parts = [effect.signal(paths, entry["key"], values)]
-    parts += [forms[name](paths, entry["key"], values) for name in entry["forms"] if name in forms]
+    parts = [effect.signal(paths, entry.key, values)]
+    parts += [forms[name](paths, entry.key, values) for name in entry.forms if name in forms]
     return [np.concatenate(of_run, axis=1) for of_run in zip(*parts, strict=True)]
 
 

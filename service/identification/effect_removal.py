@@ -11,6 +11,7 @@ import numpy as np
 from abbe.models.effects.effect import Effect
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import changed, machine_digest
+from abbe.service.domain.finding import EffectSize
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.known_effects import applies, readings_of
 from abbe.service.effects.model_book import current, no_table_lines
@@ -67,18 +68,18 @@ def _less_known(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | 
     record = current(store, campaign.site.name)
     if record is None:
         return TakenOut(campaign, (), (), None)
-    if record.doc["machine_digest"] != machine_digest(campaign.site.machine):
+    if record.book.machine_digest != machine_digest(campaign.site.machine):
         line = f"model version {record.version} of {campaign.site.name} is of another geometry and was not used"
         return TakenOut(campaign, (), (line,), record.version)
-    chosen = [e for e in record.doc["effects"] if e["remedy"] != "table" and applies(e, campaign.name)]
+    chosen = [e for e in record.book.effects if e.remedy != "table" and applies(e, campaign.name)]
     lines = tuple(no_table_lines(record))
     if not chosen:
         return TakenOut(campaign, (), lines, record.version)
     left = less_effects(campaign, chosen, f"model version {record.version}", effects)
-    return TakenOut(left, tuple(e["label"] for e in chosen), lines, record.version)
+    return TakenOut(left, tuple(e.label for e in chosen), lines, record.version)
 
 
-def less_effects(campaign: Campaign, entries: Sequence[dict[str, Any]], whose: str, effects: tuple[Effect, ...] | None = None) -> Campaign:
+def less_effects(campaign: Campaign, entries: Sequence[EffectSize], whose: str, effects: tuple[Effect, ...] | None = None) -> Campaign:
     """A campaign without what named effects do to its readings; ``whose``: in words, where they are from.
 
     Raises
@@ -90,7 +91,7 @@ def less_effects(campaign: Campaign, entries: Sequence[dict[str, Any]], whose: s
         return campaign
     case = case_of(campaign.doc, campaign.site.machine, campaign.runs)
     known_mm = readings_of(entries, effects or catalogue(), case)
-    words = f"{whose}: {', '.join(e['label'] for e in entries)}"
+    words = f"{whose}: {', '.join(e.label for e in entries)}"
     return replace(campaign, runs=[_less(run, known_mm[run["run_id"]], words) for run in campaign.runs])
 
 

@@ -18,7 +18,7 @@ from abbe.models.solvers.observe import bar_normals, setup_unknowns
 from abbe.models.solvers.priors import U_WAVELENGTH, Priors
 from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
 from abbe.service.campaign_data.campaign_checks import check_files, check_readings, refuse
-from abbe.service.campaign_data.campaign_issue import Finding
+from abbe.service.campaign_data.campaign_issue import CampaignIssue
 from abbe.service.campaign_data.copied_runs import copies
 from abbe.service.campaign_data.provenance import measured_digest, taken_from
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
@@ -66,7 +66,7 @@ class Solved:
     helices: dict[str, HelixSolution]
     step_totals: dict[str, dict[str, float]]
     noise_bar_mm: float
-    flags: tuple[Finding, ...] = ()
+    flags: tuple[CampaignIssue, ...] = ()
     digests: dict[str, str] = field(default_factory=dict)
     rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -132,7 +132,7 @@ def _silent(_: str) -> None:
     return None
 
 
-def check_campaign(site: Site, used: list[dict[str, Any]], others: list[dict[str, Any]], model: Model) -> list[Finding]:
+def check_campaign(site: Site, used: list[dict[str, Any]], others: list[dict[str, Any]], model: Model) -> list[CampaignIssue]:
     """Flags of the runs that are to be solved; ``others`` are only looked at for copies.
 
     Raises
@@ -173,16 +173,16 @@ def _unknowns(data: list[RunData], model: Model) -> int:
     return (TWENTY_ONE if model == "rigid21" else SIX) + sum(4 if r.kind == "bar" else 2 for r in data)
 
 
-def _affordable(data: list[RunData]) -> tuple[Model, list[Finding]]:
+def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
     """The largest model that there are enough readings for, and the flag that tells where it is not the usual one."""
     count, wanted = sum(r.deviation_mm.size for r in data), PER_UNKNOWN * _unknowns(data, "rigid21")
     if count >= wanted:
         return "rigid21", []
     what = f"{count} readings in all are too few for rigid21 ({wanted} are needed): solved for rigid6, scales and squareness only"
-    return "rigid6", [Finding(min(data, key=lambda r: r.deviation_mm.size).label, what, "measure more positions", False)]
+    return "rigid6", [CampaignIssue(min(data, key=lambda r: r.deviation_mm.size).label, what, "measure more positions", False)]
 
 
-def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[Finding]:
+def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[CampaignIssue]:
     """Refuse a solution in which a bar, cup, mirror or the laser's scale would have to be impossibly wrong; other set-up errors are flags.
 
     Raises
@@ -202,7 +202,7 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[F
     return [_unusual(name, times, data) for name, times in found]
 
 
-def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> Finding:
+def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> CampaignIssue:
     """A set-up error that is larger than a careful hand leaves, without being impossible."""
     words, remedy = next(
         (told for prefix, told in UNUSUAL.items() if name.startswith(prefix)), (name.replace("_", " "), "look at that set-up")
@@ -210,9 +210,9 @@ def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> Finding:
     run = _whole([r.label for r in data], name)
     setup = None if run else _whole([r.setup for r in data], name)
     if run:
-        return Finding(run, f"{words} is {times:.0f} times what is usual", remedy, False)
+        return CampaignIssue(run, f"{words} is {times:.0f} times what is usual", remedy, False)
     first = next((r.label for r in data if r.setup == setup), name)
-    return Finding(first, f"{words} of set-up {setup} is {times:.0f} times what is usual", remedy, False)
+    return CampaignIssue(first, f"{words} of set-up {setup} is {times:.0f} times what is usual", remedy, False)
 
 
 def _whole(names: list[str], unknown: str) -> str | None:

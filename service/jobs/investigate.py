@@ -11,7 +11,6 @@ import math
 import threading
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from abbe.models.compensation.tables import Predicted
 from abbe.service.campaign_data.campaign_folder import from_store
@@ -32,9 +31,10 @@ from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_words import size_text, verdict_of
 from abbe.service.discovery.linear_change import linear_words
+from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.effects.model_book import REMEDIES, current, name_of
+from abbe.service.effects.model_book import REMEDIES, current
 from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
 from abbe.service.identification.table_removal import table_then
 from abbe.service.sequences.check import paced
@@ -117,14 +117,14 @@ async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -
     except asyncio.CancelledError:
         stopped.set()  # the thread ends at its next word: a service that stops does not wait for the rest of the search
         raise
-    _, word, told = verdict_of(finding)
-    names = ", ".join(f"{name_of(e)} {size_text(e)}" for e in finding["effects"])
-    changes = changed_words(finding)
-    doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {told}", changes) if t), "discovery": number}
+    _, word, text = verdict_of(finding)
+    names = ", ".join(f"{e.words} {size_text(e)}" for e in finding.effects)
+    changes = changed_words(finding.changed)
+    doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {text}", changes) if t), "discovery": number}
     return await note(AlarmKind.DISCOVERED, doc | _against(finding, context.store, context.site.name))
 
 
-def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, dict[str, Any]]:
+def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, Finding]:
     store = context.store
     measured = from_store(store, campaign)
     book, since = current(store, context.site.name), since_of(store, measured)
@@ -133,20 +133,20 @@ def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, d
     return journal.id, discover(job, journal, search, context.progress)
 
 
-def _against(finding: dict[str, Any], store: Store, machine: str) -> Doc:
+def _against(finding: Finding, store: Store, machine: str) -> Doc:
     """Why a table could be the wrong answer to a finding (``against``, empty: it is not), and how much that is (``rms_um``, of readings).
 
     What entered the machine's model is taken out of the readings before tables are made; what is named without that proof is in them.
     """
-    gap = finding["gaps"].get("identify")
-    rms_um = 0.0 if gap is None else math.sqrt(max(gap["before_um"] ** 2 - gap["floor_um"] ** 2, 0.0))
-    record = current(store, machine)
-    known = {e["label"] for e in record.doc["effects"]} if record is not None else set()
-    wrong = [e for e in entering(finding) if e["remedy"] != "table" and e["label"] not in known]
-    why = [f"{name_of(e)} is a matter for {REMEDIES[e['remedy']]}: {e['remedy_text']}" for e in wrong]
-    if finding["verdict"] == "unknown":
+    gap = finding.gaps.get("identify")
+    rms_um = 0.0 if gap is None else math.sqrt(max(gap.before_um**2 - gap.floor_um**2, 0.0))
+    model = current(store, machine)
+    known = {e.label for e in model.book.effects} if model is not None else set()
+    wrong = [e for e in entering(finding) if e.remedy != "table" and e.label not in known]
+    why = [f"{e.words} is a matter for {REMEDIES[e.remedy]}: {e.remedy_text}" for e in wrong]
+    if finding.verdict == "unknown":
         why.append("something is missing in the model that the catalogue does not know, and a table would hide it")
-    unnamed = finding["verdict"] == "unknown" and not finding["effects"]
+    unnamed = finding.verdict == "unknown" and not finding.effects
     return {"against": "; ".join(why), "rms_um": rms_um, "unnamed": unnamed}
 
 

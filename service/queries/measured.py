@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from abbe.service.domain.document import Doc
+from abbe.service.domain.machine_object import MachineObject
 from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, RunFacts, RunRecord
 from abbe.service.queries.reader import Reader, of_row, read_as
-from abbe.service.runs.machine_object import MachineObject
 from abbe.service.storage.repositories.pages import visible_status
 from abbe.service.storage.store import Store
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 
-from abbe.service.discovery.changed_words import proved
-from abbe.service.discovery.discovery_states import taken_back
+from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.discovery.discovery_store import stored_steps
+from abbe.service.domain.discovery_file import DiscoveryFile
+from abbe.service.domain.finding import ChangedSince
 from abbe.service.domain.results import StepRecord
+from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import Unusable
 from abbe.service.identification.solution_field import node_map, stored_field
-from abbe.service.queries.reader import Doc, Reader, as_stored, of_row, read_as
-from abbe.service.runs.discovery_file import DiscoveryFile
-from abbe.service.runs.solution_file import SolutionFile
+from abbe.service.queries.reader import Reader, as_stored, of_row, read_as
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,60 +54,6 @@ class DiscoveryState:
     state: str
     utc: str
     why: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChangeRival:
-    """Another change that explains nearly as much: natural logarithm of how much less likely it is."""
-
-    name: str
-    less_evidence: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MotionChange:
-    """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
-
-    ``u``: standard uncertainty; ``rivals``: what these runs cannot tell it from; ``halves``: by how many of two halves of the runs it was
-    chosen without the other.
-    """
-
-    motion: str
-    part: Literal["linear", "shape"]
-    value: float
-    u: float
-    unit: Literal["um/m", "urad", "um"]
-    evidence: float
-    rivals: list[ChangeRival]
-    halves: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChangeGap:
-    """Measured less the solution from before, rms over runs that did not choose what changed: without and with it, and noise."""
-
-    before_um: float
-    after_um: float
-    floor_um: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChangedSince:
-    """What has changed since an earlier solution.
-
-    ``gap``, ``judged``: None where too few set-ups judge; ``judged``: log of how much more likely runs are with what they did not choose;
-    ``hidden_um_m``: how much each scale and squareness may have changed all the same; ``beside``: effects that were found in the same runs
-    and may be the same thing; ``trouble``: why the runs say nothing.
-    """
-
-    since: int
-    changes: list[MotionChange]
-    gap: ChangeGap | None
-    judged: float | None
-    hidden_um_m: dict[str, float]
-    proved: bool
-    beside: tuple[str, ...] = ()
-    trouble: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,11 +163,11 @@ def discoveries(
 def discovery(reader: Reader, number: int) -> DiscoveryDetail:
     """A search: its states, and what it found. Raises NotStored."""
     row = reader.row("discoveries", number, "discovery")
-    steps = reader.store.discovery_steps(number)
-    states = _states(steps)
-    found: Doc | None = next((taken_back(one.doc["finding"]) for one in steps if "finding" in one.doc), None)
-    answer = None if found is None else read_as(DiscoveryFile, found.get("answer"))
-    return of_row(DiscoveryDetail, row, **_last(states), states=states, answer=answer, changed=_changed(found))
+    states = _states(reader.store.discovery_steps(number))
+    found = next((step.finding for step in stored_steps(reader.store, number) if step.finding is not None), None)
+    answer = None if found is None else read_as(DiscoveryFile, answer_doc(found))
+    changed = None if found is None else found.changed
+    return of_row(DiscoveryDetail, row, **_last(states), states=states, answer=answer, changed=changed)
 
 
 def _states(steps: Sequence[StepRecord]) -> list[DiscoveryState]:
@@ -230,8 +176,3 @@ def _states(steps: Sequence[StepRecord]) -> list[DiscoveryState]:
 
 def _last(states: Sequence[DiscoveryState]) -> dict[str, str]:
     return {"state": states[-1].state, "why": states[-1].why} if states else {"state": "", "why": ""}
-
-
-def _changed(found: Doc | None) -> ChangedSince | None:
-    told: Any = None if found is None else found.get("changed")
-    return None if told is None else read_as(ChangedSince, told | {"proved": proved(told)})

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.service.campaign_data.packed_arrays import unpacked
 from abbe.service.discovery.changed_words import changed_lines, changed_words
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
-from abbe.service.discovery.discovery_states import closed, entering
+from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_words import (
     ROLES,
     next_of,
@@ -20,7 +19,8 @@ from abbe.service.discovery.discovery_words import (
     verdict_of,
     where_lines,
 )
-from abbe.service.effects.model_book import REMEDIES, name_of
+from abbe.service.domain.finding import EffectFound, Finding, RunFit
+from abbe.service.effects.model_book import REMEDIES
 from abbe.service.rendering.discovery_model import DiscoveryPage, EffectCard, GapRow, PlaceMap, RunGap, Trace
 from abbe.service.rendering.numbers import plain
 
@@ -38,22 +38,21 @@ def page_facts(job: DiscoveryJob, journal: DiscoveryJournal, made: str) -> tuple
     facts = {"machine": machine, "chain": job.case.machine.chain, "runs": str(len(job.campaign.runs)), "made": made}
     provenance = {"campaign": job.campaign.name, "present model": ", ".join(sorted(job.case.includes))}
     provenance["catalogue"] = f"{len(job.effects)} effects"
-    provenance |= {name: str(v) for name, v in source["versions"].items()}
+    provenance |= {name: str(v) for name, v in source.versions.items()}
     if journal.id is not None:
         provenance["stored"] = f"discovery {journal.id}" + (f", model version {journal.version}" if journal.version else "")
     provenance["SHA-256 of the search"] = job.digest
-    states = [(state, str(doc["why"])) for state, doc in journal.states]
+    states = [(step.state, step.why) for step in journal.steps]
     title = f"Campaign {job.campaign.name} - what the simulation of {machine} lacks"
     return facts, {"title": title, "flags": list(job.flags), "states": states, "provenance": provenance}
 
 
-def discovery_page(finding: dict[str, Any], runs: list[dict[str, Any]], facts: dict[str, str], told: dict[str, Any]) -> DiscoveryPage:
+def discovery_page(finding: Finding, runs: list[dict[str, Any]], facts: dict[str, str], told: dict[str, Any]) -> DiscoveryPage:
     """Everything the page shows.
 
     Parameters
     ----------
-    finding : dict
-        `abbe.service.discovery.discovery_doc.finding_doc`.
+    finding : Finding
     runs : list of dict
         ``abbe-run/1`` objects of the campaign.
     facts : dict
@@ -66,88 +65,88 @@ def discovery_page(finding: dict[str, Any], runs: list[dict[str, Any]], facts: d
         title=told["title"],
         facts=facts,
         verdict=told.get("verdict") or _verdict(finding),
-        effects=[_card(e) for e in finding["effects"]],
-        located=where_lines(finding["where"]),
-        changed=changed_lines(finding),
+        effects=[_card(e) for e in finding.effects],
+        located=where_lines(finding.where),
+        changed=changed_lines(finding.changed),
         gaps=gap_rows(finding),
-        runs=[_run(label, doc) for label, doc in finding["runs"].items()],
+        runs=[_run(label, run) for label, run in finding.runs.items()],
         traces=_traces(finding, measured),
         places=[p for p in (_place(finding, measured, a, b) for a, b in ((0, 1), (0, 2))) if p is not None],
-        tests=[(t["kind"], t["value"], plain(t["statistic"]), f"{t['p']:.2g}") for t in finding["where"].get("table", [])],
+        tests=[(t.kind, t.value, plain(t.statistic), f"{t.p:.2g}") for t in finding.where.table],
         next_test=next_of(finding),
-        rejected=[(label, why) for label, why in finding["rejected"][:REJECTED]],
+        rejected=list(finding.rejected[:REJECTED]),
         flags=told["flags"],
         states=told["states"],
         provenance=told["provenance"],
-        found={"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding["verdict"]],
+        found={"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding.verdict],
     )
 
 
-def _verdict(finding: dict[str, Any]) -> tuple[str, str, str]:
+def _verdict(finding: Finding) -> tuple[str, str, str]:
     """The finding's, with what has changed where an earlier solution could be compared."""
     sign, word, text = verdict_of(finding)
-    changes = changed_words(finding)
+    changes = changed_words(finding.changed)
     return sign, word, f"{text} {changes[:1].upper()}{changes[1:]}." if changes else text
 
 
-def gap_rows(finding: dict[str, Any]) -> list[GapRow]:
-    """The gap by role; sealed runs are told by their number only: nobody here knows their readings."""
-    only_scatter = bool(finding["effects"]) and not entering(finding)  # closes no gap, and need not
+def gap_rows(finding: Finding) -> list[GapRow]:
+    """The gap by role; sealed runs are only counted: their readings are unknown here."""
+    only_scatter = bool(finding.effects) and not entering(finding)  # closes no gap, and need not
     rows = [
-        GapRow(role, ROLES.get(role, ""), g["before_um"], g["after_um"], g["floor_um"], None if only_scatter else closed(g))
-        for role, g in finding["gaps"].items()
+        GapRow(role, ROLES.get(role, ""), g.before_um, g.after_um, g.floor_um, None if only_scatter else g.closed)
+        for role, g in finding.gaps.items()
     ]
-    sealed = [r for r in finding["runs"].values() if r["role"] == "sealed"]
+    sealed = [r for r in finding.runs.values() if r.role == "sealed"]
     if sealed:
         rows.append(GapRow("sealed", f"{len(sealed)} runs predicted, their readings are unknown here", None, None, None, None))
     return rows
 
 
-def _card(effect: dict[str, Any]) -> EffectCard:
-    facts = {name: parameter_text(p) for name, p in effect["parameters"].items()}
-    facts["evidence"] = f"{plain(effect['evidence'])} (natural logarithm of how much more likely the readings are with it, after its price)"
-    if effect["forms"]:
-        facts["form"] = "not quite the textbook's: " + ", ".join(effect["forms"])
+def _card(effect: EffectFound) -> EffectCard:
+    facts = {name: parameter_text(p) for name, p in effect.parameters.items()}
+    facts["evidence"] = f"{plain(effect.evidence)} (natural logarithm of how much more likely the readings are with it, after its price)"
+    if effect.forms:
+        facts["form"] = "not quite the textbook's: " + ", ".join(effect.forms)
     return EffectCard(
-        name=name_of(effect),
+        name=effect.words,
         size=size(effect),
         facts=facts,
-        where="; ".join(where_lines(effect["where"])),
-        do=effect["remedy_text"],
-        remedy=REMEDIES[effect["remedy"]],
-        signature=effect["signature"],
+        where="; ".join(where_lines(effect.where)),
+        do=effect.remedy_text,
+        remedy=REMEDIES[effect.remedy],
+        signature=effect.signature,
         rivals=rival_lines(effect),
-        source=effect["source"],
+        source=effect.source,
     )
 
 
-def _run(label: str, doc: dict[str, Any]) -> RunGap:
-    return RunGap(label, doc["test"], doc["role"], doc["readings"], doc.get("rms_before_um"), doc.get("rms_after_um"), doc["floor_um"])
+def _run(label: str, run: RunFit) -> RunGap:
+    return RunGap(label, run.test, run.role, run.readings, run.rms_before_um, run.rms_after_um, run.floor_um)
 
 
-def telling_run(finding: dict[str, Any]) -> str | None:
+def telling_run(finding: Finding) -> str | None:
     """The run in which most of the gap closes, against its noise; where nothing was found, the one with the largest gap."""
-    judged = {label: r for label, r in finding["runs"].items() if "rms_before_um" in r}
-
-    def shows(label: str) -> float:
-        r = judged[label]
-        after = r["rms_after_um"] if finding["effects"] else 0.0
-        return float((r["rms_before_um"] ** 2 - after**2) / r["floor_um"] ** 2)
-
-    return max(judged, key=shows, default=None)
+    shows = {}
+    for label, run in finding.runs.items():
+        if run.rms_before_um is not None and run.rms_after_um is not None:
+            after_um = run.rms_after_um if finding.effects else 0.0
+            shows[label] = (run.rms_before_um**2 - after_um**2) / run.floor_um**2
+    return max(shows, key=lambda label: shows[label], default=None)
 
 
-def _traces(finding: dict[str, Any], measured: dict[str, dict[str, Any]]) -> list[Trace]:
+def _traces(finding: Finding, measured: dict[str, dict[str, Any]]) -> list[Trace]:
     """The run that shows most: along time and, where an axis is named, against its position."""
     label = telling_run(finding)
     if label is None:
         return []
-    columns, doc = measured[label]["columns"], finding["series"][label]
-    before, after = (unpacked(doc[k]) * 1e3 for k in ("before", "after"))
-    noise, why = finding["runs"][label]["floor_um"], "the gap shows most here"
+    columns, series = measured[label]["columns"], finding.series[label]
+    if series.before is None or series.after is None:
+        return []
+    before, after = series.before.values_mm * 1e3, series.after.values_mm * 1e3
+    noise, why = finding.runs[label].floor_um, "the gap shows most here"
     t = np.asarray(columns["t_s"], dtype=np.float64)
     out = [Trace(label, "time of the session in s", t, before, after, noise, why)]
-    key = finding["effects"][0]["key"] if finding["effects"] else "".join(finding["where"].get("axes", ())[:1])
+    key = finding.effects[0].key if finding.effects else "".join(finding.where.axes[:1])
     if key[-1:] in AXES and key:
         x = np.asarray(columns[f"{key[-1].lower()}_mm"], dtype=np.float64)
         if float(np.ptp(x)) > 0.0:
@@ -155,7 +154,7 @@ def _traces(finding: dict[str, Any], measured: dict[str, dict[str, Any]]) -> lis
     return out
 
 
-def _place(finding: dict[str, Any], measured: dict[str, dict[str, Any]], a: int, b: int) -> PlaceMap | None:
+def _place(finding: Finding, measured: dict[str, dict[str, Any]], a: int, b: int) -> PlaceMap | None:
     """Cells of one plane with the rms of the gap before over its noise."""
     points, ratio = _points(finding, measured)
     if not len(points):
@@ -169,18 +168,20 @@ def _place(finding: dict[str, Any], measured: dict[str, dict[str, Any]], a: int,
     keep = count >= FEWEST
     times = np.sqrt(np.bincount(which.ravel(), weights=ratio**2) / count)[keep]
     centre = (cells[keep] + 0.5) * side
-    spot, at = None, finding["where"].get("position_mm")
+    spot, at = None, finding.where.position_mm
     if at is not None:
-        spot = (float(at[a]), float(at[b]), float(finding["where"].get("radius_mm", 0.0)))
+        spot = (at[a], at[b], finding.where.radius_mm or 0.0)
     return PlaceMap(AXES[a], AXES[b], centre[:, 0], centre[:, 1], times, spot)
 
 
-def _points(finding: dict[str, Any], measured: dict[str, dict[str, Any]]) -> tuple[F1, F1]:
+def _points(finding: Finding, measured: dict[str, dict[str, Any]]) -> tuple[F1, F1]:
     """Where every judged reading was taken, shape (n, 3), and its gap over the noise, shape (n,)."""
     places, ratios = [np.zeros((0, 3))], [np.zeros(0)]
     for label, run in measured.items():
-        columns = run["columns"]
-        gap = unpacked(finding["series"][label]["before"]) * 1e3 / finding["runs"][label]["floor_um"]
+        columns, before = run["columns"], finding.series[label].before
+        if before is None:
+            continue
+        gap = before.values_mm * 1e3 / finding.runs[label].floor_um
         keep = np.isfinite(gap)
         places.append(np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])[keep])
         ratios.append(gap[keep])

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.campaign_data.decimation import thinned
-from abbe.service.discovery.discovery_states import taken_back
+from abbe.service.discovery.discovery_store import stored_steps
 from abbe.service.discovery.discovery_words import book_lines, rival_lines, unit
-from abbe.service.effects.model_book import name_of
+from abbe.service.domain.finding import Finding
 from abbe.service.errors import StoreError
 from abbe.service.rendering.discovery_model import DiscoveryPage
 from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
@@ -33,54 +31,54 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
         There is no such discovery, or it has not found anything yet.
     """
     record = store.discovery(number)
-    steps = store.discovery_steps(number)
-    finding = next((taken_back(s.doc["finding"]) for s in steps if "finding" in s.doc), None)
-    if finding is None:
+    steps = stored_steps(store, number)
+    finding = next((step.finding for step in steps if step.finding is not None), None)
+    start = steps[0].start if steps else None
+    if finding is None or start is None:
         raise StoreError(f"discovery {number} has not ended", "give the same abbe discover command again: it goes on there")
     name = next(c.name for c in store.campaigns() if c.id == record.campaign_id)
     campaign = from_store(store, name)
-    first = steps[0].doc
-    states = [(s.state, str(s.doc.get("why", ""))) for s in steps]
-    told = {"title": "", "flags": list(first.get("flags", [])), "states": states, "provenance": {}}
-    page = discovery_page(finding, thinned(campaign.runs), {}, told)
+    states = [(step.state, step.why) for step in steps]
+    page = discovery_page(
+        finding, thinned(campaign.runs), {}, {"title": "", "flags": list(start.flags), "states": states, "provenance": {}}
+    )
     condition, remarks = parts.conditions(campaign.runs, rules)
-    made = {str(k): str(v) for k, v in (first.get("versions") or {}).items()}
     sign, word, text = page.verdict
     return Document(
         kind="discovery",
         title=f"Discovery {number}: what the simulation of {campaign.site.name} lacks",
         about=parts.machine_facts(campaign.site.doc)
-        | {"Campaign": name, "Begun": record.created_utc, "Ended": steps[-1].utc, "State": steps[-1].state}
-        | {"Present model": ", ".join(first.get("present_model", []))},
+        | {"Campaign": name, "Begun": record.created_utc, "Ended": store.discovery_steps(number)[-1].utc, "State": steps[-1].state}
+        | {"Present model": ", ".join(start.present_model)},
         verdict=(SIGNS[sign], word, text),
         figures=_figures(finding),
         instruments=parts.instruments(campaign.runs, campaign.doc, rules),
         conditions=condition,
         not_observable=_open(finding, page),
-        remarks=[*told["flags"], *book_lines(finding), *remarks],
+        remarks=[*start.flags, *book_lines(finding), *remarks],
         statements=["U of a named effect is that of its refit together with everything else that these runs leave free."],
-        provenance=parts.provenance(parts.data_digest(campaign.runs), made) | {"Search (SHA-256)": record.digest},
+        provenance=parts.provenance(parts.data_digest(campaign.runs), dict(start.source.versions)) | {"Search (SHA-256)": record.digest},
         appendix=[*picture_section(_pictures(page)), *_tables(page)],
     )
 
 
-def _figures(finding: dict[str, Any]) -> list[Figure]:
+def _figures(finding: Finding) -> list[Figure]:
     out = []
-    for e in finding["effects"]:
-        group = f"Effect: {name_of(e)}"
-        out.append(Figure(group, e["label"], e["title"], e["strength"], e["u_strength"], unit(e["unit"]), e["source"]))
-        out += [
-            Figure(group, n, n.replace("_", " "), p.get("value"), p.get("u"), unit(p.get("unit", ""))) for n, p in e["parameters"].items()
-        ]
-    for role, gap in finding["gaps"].items():
-        for key, words in (("before", "measured minus simulated, rms"), ("after", "the same with what was found"), ("floor", "noise")):
-            out.append(Figure(f"Gap of the {role} runs", key, words, gap.get(f"{key}_um"), None, "µm"))
+    for e in finding.effects:
+        group = f"Effect: {e.words}"
+        out.append(Figure(group, e.label, e.title, e.strength, e.u_strength, unit(e.unit), e.source))
+        out += [Figure(group, n, n.replace("_", " "), p.value, p.u, unit(p.unit)) for n, p in e.parameters.items()]
+    for role, gap in finding.gaps.items():
+        group = f"Gap of the {role} runs"
+        out.append(Figure(group, "before", "measured minus simulated, rms", gap.before_um, None, "µm"))
+        out.append(Figure(group, "after", "the same with what was found", gap.after_um, None, "µm"))
+        out.append(Figure(group, "floor", "noise", gap.floor_um, None, "µm"))
     return out
 
 
-def _open(finding: dict[str, Any], page: DiscoveryPage) -> list[str]:
-    out = ["these runs cannot tell it from: " + ", ".join(finding["confounded_with"])] if finding["confounded_with"] else []
-    out += [f"{name_of(e)} could also be: {line}" for e in finding["effects"] for line in rival_lines(e)]
+def _open(finding: Finding, page: DiscoveryPage) -> list[str]:
+    out = ["these runs cannot tell it from: " + ", ".join(finding.confounded_with)] if finding.confounded_with else []
+    out += [f"{e.words} could also be: {line}" for e in finding.effects for line in rival_lines(e)]
     return out + list(page.next_test)
 
 

@@ -12,9 +12,9 @@ from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, driven, since_reversal, standing
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
+from abbe.service.domain.run_file import ASSUMED_MODEL
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.approached import came_from
-from abbe.service.runs.formats import ASSUMED_MODEL
 
 RESOLUTION_MM = {"bar": 1e-4, "laser": 1e-5}
 SENSORS = ("x", "y", "z", "spindle", "air")

@@ -9,10 +9,10 @@ from pathlib import Path
 from pydantic import BaseModel, ValidationError
 
 from abbe.service.domain.document import Doc
+from abbe.service.domain.run_file import Columns, RunFile, Setup
 from abbe.service.errors import FileFormatError
 from abbe.service.explain import expected, shown, where
 from abbe.service.files import NotPlainError, read_plain
-from abbe.service.runs.formats import Columns, RunFile, Setup
 from abbe.service.runs.json_text import strict_json
 
 _OF_MOTION = ("mm", "um", "nm", "m", "rad", "urad", "mrad", "deg", "s", "ms", "us", "h", "mm_min", "mm_s", "rpm", "Hz", "kHz")
@@ -67,7 +67,7 @@ def check(path: Path, document: Doc, model: type[BaseModel]) -> None:
     document : dict
         The document; it is not changed.
     model : type
-        A model of abbe.service.runs.formats.
+        A model of abbe.service.domain.run_file.
 
     Raises
     ------

@@ -20,9 +20,9 @@ from abbe.models.functions.motions import SQUARENESS, ErrorMotions
 from abbe.models.functions.polynomial import Polynomial
 from abbe.models.functions.table import Table
 from abbe.models.geometry.propagation import checked_covariance
+from abbe.service.domain import run_file as formats
 from abbe.service.errors import FileFormatError
 from abbe.service.explain import nearest, shown
-from abbe.service.runs import formats
 from abbe.service.runs.checks import check, read_json
 
 NOT_GIVEN = "no uncertainty given in the errors file"

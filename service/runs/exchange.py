@@ -11,11 +11,11 @@ from pathlib import Path
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import CampaignRecord, ImportedRun, RunRecord
+from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
 from abbe.service.errors import FileFormatError
 from abbe.service.runs.checks import check, check_run, read_json
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns, run_document, whole_document
-from abbe.service.runs.formats import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
 from abbe.service.runs.pieces import pieces_of
 from abbe.service.storage.store import Store
 

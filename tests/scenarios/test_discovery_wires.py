@@ -36,7 +36,7 @@ def played(name, folder, *, tables=False):
 
 
 def labels(found):
-    return [e["label"] for e in found.finding["effects"]]
+    return [e.label for e in found.finding.effects]
 
 
 def book(folder):
@@ -58,7 +58,7 @@ LONG = pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="a minute
 def test_what_a_machine_hides_is_named_and_the_model_with_it_holds_on_a_new_measurement(family, tmp_path):
     found = played(family, tmp_path / "kept")
     said = "\n".join(story(found))
-    assert (found.finding["verdict"], labels(found)) == ("named", [NAMED[family]]), said
+    assert (found.finding.verdict, labels(found)) == ("named", [NAMED[family]]), said
     assert judged(found)[0], said
     assert book(tmp_path / "kept") == [[NAMED[family]]]
     gap = found.anew.gap
@@ -71,9 +71,9 @@ def test_what_a_machine_hides_is_named_and_the_model_with_it_holds_on_a_new_meas
 def test_what_no_catalogue_names_is_called_unknown_and_located(tmp_path):
     found = played("unlisted", tmp_path / "kept")
     said = "\n".join(story(found))
-    assert (found.finding["verdict"], labels(found)) == ("unknown", []), said
-    assert found.finding["where"]["period_s"] == pytest.approx(40.0, rel=0.01), said
-    assert found.finding["where"]["axes"] == ["Z"], said
+    assert (found.finding.verdict, labels(found)) == ("unknown", []), said
+    assert found.finding.where.period_s == pytest.approx(40.0, rel=0.01), said
+    assert found.finding.where.axes == ("Z",), said
     assert judged(found)[0]
     assert book(tmp_path / "kept") == []
     assert found.anew.gap.after_um == found.anew.gap.before_um  # nothing is claimed, nothing is closed
@@ -84,7 +84,7 @@ def test_what_no_catalogue_names_is_called_unknown_and_located(tmp_path):
 def test_where_nothing_is_hidden_nothing_is_found(tmp_path):
     found = played("none", tmp_path / "kept")
     said = "\n".join(story(found))
-    assert (found.finding["verdict"], labels(found)) == ("none", []), said
+    assert (found.finding.verdict, labels(found)) == ("none", []), said
     assert found.anew.gap.before_um < NEAR * found.anew.gap.floor_um, said
     assert judged(found)[0]
     assert book(tmp_path / "kept") == []
@@ -95,7 +95,7 @@ def test_an_instrument_error_that_this_campaign_cannot_show_is_not_named(tmp_pat
     """4 mrad in every set-up is one scale of 8 ppm, 1.2 um of a bar of 145 mm known to 2 um: nothing may be made of it."""
     found = played("cosine", tmp_path / "kept")
     said = "\n".join(story(found))
-    assert (found.finding["verdict"], labels(found)) == ("none", []), said
+    assert (found.finding.verdict, labels(found)) == ("none", []), said
     assert found.anew.gap.before_um < NEAR * found.anew.gap.floor_um, said
     assert book(tmp_path / "kept") == []
     assert not judged(found)[0]  # it is there all the same, and the story says so

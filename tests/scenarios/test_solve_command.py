@@ -10,10 +10,10 @@ import pytest
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.runs.exchange import import_folder
-from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from tests.experiments.campaigns.population import draw_case

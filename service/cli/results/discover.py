@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
     from abbe.service.discovery.discover_live import Added
+    from abbe.service.domain.finding import Finding
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
 
@@ -100,9 +101,10 @@ def _live_needs(campaign: str, machine: Path | None) -> None:
 
 
 def _gone_on(
-    store: Store, machine: Path, at: tuple[DiscoveryJob, DiscoveryJournal, dict[str, Any]], *, accept_table: bool = False
-) -> tuple[DiscoveryJob, DiscoveryJournal, dict[str, Any]]:
+    store: Store, machine: Path, at: tuple[DiscoveryJob, DiscoveryJournal, Finding], *, accept_table: bool = False
+) -> tuple[DiscoveryJob, DiscoveryJournal, Finding]:
     """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is done twice."""
+    from dataclasses import replace
     from datetime import timedelta
 
     from abbe.service.clock import SystemClock
@@ -115,14 +117,14 @@ def _gone_on(
     site = site_of(load_machine(machine).machine)
     job, journal, finding = at
     for _ in range(ROUNDS):
-        if finding["next_test"] is None or not isinstance(journal, StoredJournal):
+        if finding.next_test is None or not isinstance(journal, StoredJournal):
             break
         _print(job, journal, finding)
         number = rounds(store, job.campaign.name) + 1
         name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
-        test = finding["next_test"]
-        about = finding["where"] | {"runs": [test["like"]]} if finding["verdict"] == "unknown" and test.get("like") else None
-        wanted = next_plan(test["adds"], site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
+        test = finding.next_test
+        about = replace(finding.where, runs=(test.like,)) if finding.verdict == "unknown" and test.like else None
+        wanted = next_plan(test.adds, site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
         if wanted.plan is None:
             typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe runs on this machine by itself")
             break
@@ -131,7 +133,7 @@ def _gone_on(
         accept_table = accept_table and what.left is None  # the person has looked at the table of now, not at one that comes later
         if wait_s > 0.0:
             start = SystemClock().utc() + timedelta(seconds=wait_s + 1.0)
-            what_for = ", ".join(test["adds"])
+            what_for = ", ".join(test.adds)
             typer.echo(f"too early for {what_for}: give the same command at {start:%H:%M:%S} UTC or later; nothing has moved")
             break
         job, journal = next_search(store, job, journal, what.plan.name)
@@ -164,7 +166,7 @@ def _measured(store: Store, site: Site, campaign: Campaign, what: Added, *, acce
         raise
 
 
-def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> dict[str, Any]:
+def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
     """The finding, with progress on stderr; Ctrl-C says what is kept."""
     from abbe.service.cli.progress import display
     from abbe.service.discovery.discover import discover as work
@@ -174,7 +176,7 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> dict[str, Any]:
         try:
             return work(job, journal, search, sink)
         except KeyboardInterrupt:
-            state = journal.states[-1][0] if journal.states else "nothing"
+            state = journal.steps[-1].state if journal.steps else "nothing"
             kept = (
                 f"discovery {journal.id} stands at {state}; the same command goes on there"
                 if journal.id
@@ -184,29 +186,30 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> dict[str, Any]:
             raise
 
 
-def _written(job: DiscoveryJob, journal: DiscoveryJournal, finding: dict[str, Any], json_file: Path | None, report: Path | None) -> None:
+def _written(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding, json_file: Path | None, report: Path | None) -> None:
     """Files that were asked for, each whole or not at all."""
     from abbe.service.clock import SystemClock
+    from abbe.service.discovery.discovery_answer import answer_doc
     from abbe.service.rendering.discovery_page import render_discovery
     from abbe.service.rendering.page_file import write_page
     from abbe.service.report.discovery_pages import discovery_page, page_facts
 
     if json_file is not None:
-        text = json.dumps(finding["answer"], ensure_ascii=False) + "\n"
+        text = json.dumps(answer_doc(finding), ensure_ascii=False) + "\n"
         typer.echo(text, nl=False) if str(json_file) == "-" else write_page(text, json_file)
     if report is not None:
         made = SystemClock().utc().isoformat(timespec="seconds")
         write_page(render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, made))), report)
 
 
-def _print(job: DiscoveryJob, journal: DiscoveryJournal, finding: dict[str, Any]) -> None:
+def _print(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> None:
     from abbe.service.discovery.discovery_words import lines_of
 
-    typer.echo(f"campaign {job.campaign.name}: {len(finding['runs'])} runs, {len(job.effects)} effects in the catalogue")
+    typer.echo(f"campaign {job.campaign.name}: {len(finding.runs)} runs, {len(job.effects)} effects in the catalogue")
     for line in job.flags:
         typer.echo(f"look at this: {line}")
     for line in lines_of(finding):
         typer.echo(line)
     if journal.id is not None:
         brought = f", model version {journal.version} of {job.campaign.site.name}" if journal.version else ""
-        typer.echo(f"stored: discovery {journal.id}, {journal.states[-1][0]}{brought}")
+        typer.echo(f"stored: discovery {journal.id}, {journal.steps[-1].state}{brought}")

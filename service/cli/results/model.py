@@ -9,7 +9,9 @@ import typer
 from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
 
 if TYPE_CHECKING:
-    from abbe.service.domain.results import ModelRecord
+    from abbe.service.domain.model_book import ModelVersion
+    from abbe.service.effects.model_book import LabelSize
+    from abbe.service.storage.store import Store
 
 model = typer.Typer(
     help="The model book of a machine: versions with their effects, where each came from, and the way back.", no_args_is_help=True
@@ -26,12 +28,14 @@ def list_models(
     as_json: JsonOption = False,
 ) -> None:
     """List the versions of models, oldest first; the last one of a machine is its current one."""
+    from abbe.service.effects.model_book import versions
+
     with open_store(database_url(db, machine_file)) as store:
-        found = store.models(machine)
+        found = versions(store, machine)
     if as_json:
         print_json([_doc(m) for m in found])
         return
-    rows = [(m.machine, str(m.version), m.created_utc[:19], ", ".join(e["label"] for e in m.doc["effects"]), m.doc["why"]) for m in found]
+    rows = [(m.machine, str(m.version), m.created_utc[:19], ", ".join(e.label for e in m.book.effects), m.book.why) for m in found]
     print_table(("machine", "version", "made (UTC)", "effects", "why"), rows)
 
 
@@ -45,20 +49,21 @@ def show_model(
 ) -> None:
     """Show one version: its effects with their size, what takes them out, and the runs they came from."""
     from abbe.service.discovery.discovery_words import size_text
-    from abbe.service.effects.model_book import REMEDIES, name_of
+    from abbe.service.effects.model_book import REMEDIES
 
     with open_store(database_url(db, machine_file)) as store:
         found = _version(store, machine, version)
     if as_json:
         print_json(_doc(found))
         return
-    typer.echo(f"machine {machine}, model version {found.version}: {found.doc['why']}")
-    rows = [(name_of(e), size_text(e), f"{REMEDIES[e['remedy']]}: {e['remedy_text']}", e["from"]["campaign"]) for e in found.doc["effects"]]
+    typer.echo(f"machine {machine}, model version {found.version}: {found.book.why}")
+    rows = [(e.words, size_text(e), f"{REMEDIES[e.remedy]}: {e.remedy_text}", e.origin.campaign) for e in found.book.effects]
     print_table(("effect", "size, U (k = 2)", "taken out by", "from campaign"), rows)
-    if found.doc["gone"]:
-        typer.echo("no longer there: " + ", ".join(found.doc["gone"]))
-    source = found.doc["provenance"]
-    typer.echo(f"{len(source['runs'])} runs of campaign {source['campaign']}, Abbe {source['versions']['abbe']}")
+    if found.book.gone:
+        typer.echo("no longer there: " + ", ".join(found.book.gone))
+    source = found.book.provenance
+    if source is not None:
+        typer.echo(f"{len(source.runs)} runs of campaign {source.campaign}, Abbe {source.versions.get('abbe', '?')}")
 
 
 @model.command("diff")
@@ -80,17 +85,18 @@ def diff_models(
         a, b = version(store, machine, first), _version(store, machine, second)
     found = differences(a, b, catalogue())
     if as_json:
-        print_json({"machine": machine, "first": a.version, "second": b.version, "differences": found})
+        rows = [{"label": d.label, "what": d.what, "unit": d.unit, "before": _size(d.before), "after": _size(d.after)} for d in found]
+        print_json({"machine": machine, "first": a.version, "second": b.version, "differences": rows})
         return
     if not found:
         typer.echo(f"versions {a.version} and {b.version} hold the same effects")
         return
 
-    def cell(value: dict[str, float] | None) -> str:
-        return "-" if value is None else "{} ± {}".format(*with_uncertainty(value["strength"], value["u"]))
+    def cell(size: LabelSize | None) -> str:
+        return "-" if size is None else "{} ± {}".format(*with_uncertainty(size.strength, size.u))
 
-    rows = [(d["label"], d["what"], cell(d["before"]), cell(d["after"]), unit(d["unit"])) for d in found]
-    print_table(("effect", "", f"version {a.version}", f"version {b.version}", "unit"), rows)
+    cells = [(d.label, d.what, cell(d.before), cell(d.after), unit(d.unit)) for d in found]
+    print_table(("effect", "", f"version {a.version}", f"version {b.version}", "unit"), cells)
 
 
 @model.command("revert")
@@ -108,7 +114,11 @@ def revert_model(
     typer.echo(f"machine {machine}: version {number} is version {version} again")
 
 
-def _version(store: Any, machine: str, number: int | None) -> ModelRecord:
+def _size(size: LabelSize | None) -> dict[str, float] | None:
+    return None if size is None else {"strength": size.strength, "u": size.u}
+
+
+def _version(store: Store, machine: str, number: int | None) -> ModelVersion:
     """A version, or the current one."""
     from abbe.service.effects.model_book import current, version
 
@@ -116,5 +126,7 @@ def _version(store: Any, machine: str, number: int | None) -> ModelRecord:
     return version(store, machine, number if number is not None else (newest.version if newest is not None else 0))
 
 
-def _doc(found: ModelRecord) -> dict[str, Any]:
-    return {"machine": found.machine, "version": found.version, "created_utc": found.created_utc} | found.doc
+def _doc(found: ModelVersion) -> dict[str, Any]:
+    from abbe.service.domain.document import document
+
+    return {"machine": found.machine, "version": found.version, "created_utc": found.created_utc} | document(found.book)

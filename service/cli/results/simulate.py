@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -41,20 +41,19 @@ def simulate(
         base, table = (None, NO_TABLE) if store is None else (current(store, found.site.name), table_then(store, found))
         job = prepare(found, catalogue(), base, table=table)
         sink(Progress("simulate", 1.0, 2.0, None, "present model fitted to the identify runs"))
-        told = work(job)
+        simulation = work(job)
         sink(Progress("simulate", 2.0, 2.0, 0.0, "done"))
-    doc = simulation_doc(job, told)
     if report is not None:
-        _write_report(job, told, report)
+        _write_report(job, simulation, report)
     if as_json:
-        print_json(doc)
+        print_json(simulation_doc(job, simulation))
         return
-    _print(doc)
+    _print(job, simulation)
     if report is not None:
         typer.echo(f"report: {report}")
 
 
-def _write_report(job: DiscoveryJob, told: Simulation, target: Path) -> None:
+def _write_report(job: DiscoveryJob, simulation: Simulation, target: Path) -> None:
     from abbe.service.clock import SystemClock
     from abbe.service.discovery.discover import DiscoveryJournal
     from abbe.service.discovery.simulate import simulated_finding, verdict_line
@@ -63,26 +62,24 @@ def _write_report(job: DiscoveryJob, told: Simulation, target: Path) -> None:
     from abbe.service.report.discovery_pages import discovery_page, page_facts
 
     facts, said = page_facts(job, DiscoveryJournal(), SystemClock().utc().isoformat(timespec="seconds"))
-    finding = simulated_finding(job, told)
+    finding = simulated_finding(job, simulation)
     said |= {"title": f"Campaign {job.campaign.name} - measured against simulated", "verdict": verdict_line(finding)}
     write_page(render_discovery(discovery_page(finding, job.runs, facts, said)), target)
 
 
-def _print(doc: dict[str, Any]) -> None:
-    from abbe.service.discovery.simulate import verdict_line
+def _print(job: DiscoveryJob, simulation: Simulation) -> None:
+    from abbe.service.discovery.simulate import simulated_finding, verdict_line
     from abbe.service.rendering.numbers import plain
 
-    version = (
-        "" if doc["model_version"] is None else f", model version {doc['model_version']} ({', '.join(doc['known_effects']) or 'no effect'})"
-    )
-    typer.echo(f"campaign {doc['campaign']}: present model {', '.join(doc['present_model'])}{version}")
-    for line in doc["flags"]:
+    found = simulated_finding(job, simulation)
+    version = "" if job.base is None else f", model version {job.base.version} ({', '.join(job.known) or 'no effect'})"
+    typer.echo(f"campaign {job.campaign.name}: present model {', '.join(sorted(job.case.includes))}{version}")
+    for line in job.flags:
         typer.echo(f"look at this: {line}")
     rows = []
-    for label, r in doc["runs"].items():
-        gap = r.get("rms_before_um")
-        times = "sealed" if gap is None else f"{gap / r['floor_um']:.2f}"
-        rows.append((label, r["test"], r["role"], str(r["readings"]), plain(gap), plain(r["floor_um"]), times))
+    for label, r in found.runs.items():
+        times = "sealed" if r.rms_before_um is None else f"{r.rms_before_um / r.floor_um:.2f}"
+        rows.append((label, r.test, r.role, str(r.readings), plain(r.rms_before_um), plain(r.floor_um), times))
     headings = ("run", "test", "role", "readings", "measured - simulated, rms (µm)", "noise (µm)", "times the noise")
     print_table(headings, rows)
-    typer.echo(" ".join(verdict_line(doc)[1:]))
+    typer.echo(" ".join(verdict_line(found)[1:]))

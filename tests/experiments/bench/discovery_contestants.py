@@ -22,6 +22,7 @@ from abbe.models.discovery.selection import Contest
 from abbe.models.discovery.whitened_problem import scene_of
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.discovery.finding import finding_of
 
 MOST_GROUPS = 10
 """Forward selection stops here at the latest: twice as many as `discover` may name. Plain BIC would go on and only add wrong names."""
@@ -134,7 +135,7 @@ def answer(evidence: dict[str, float]) -> dict:
 
 def ours(case: Case) -> dict:
     """The product, as `abbe discover` calls it."""
-    return answer_doc(discover(case, CATALOGUE), case)
+    return answer_doc(finding_of(discover(case, CATALOGUE), case, CATALOGUE, {r.path.label: np.zeros(r.path.n) for r in case.runs}))
 
 
 def forward(c: Candidates) -> dict:

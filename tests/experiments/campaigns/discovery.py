@@ -18,7 +18,8 @@ import numpy as np
 
 from abbe.models.discovery.discover import discover
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.service.discovery.discovery_doc import finding_doc
+from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.discovery.finding import finding_of
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
 from abbe.service.site import machine_from_doc
@@ -32,7 +33,7 @@ def answered(folder: Path, out: Path) -> tuple[str, float]:
     found = discover(case, CATALOGUE)
     seconds = time.process_time() - start
     nothing = {r.path.label: np.zeros(r.path.n) for r in case.runs}
-    answer = finding_doc(found, case, CATALOGUE, nothing)["answer"]
+    answer = answer_doc(finding_of(found, case, CATALOGUE, nothing))
     doc = answer | {"cpu_s": round(seconds, 2), "rejected": [list(r) for r in found.rejected]}
     (out / f"{folder.name}.json").write_text(json.dumps(doc))
     return folder.name, seconds

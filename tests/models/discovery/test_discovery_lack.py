@@ -11,6 +11,7 @@ from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.experiment.candidates import offers
 from abbe.models.discovery.lack import floors, repeat_steps
 from abbe.models.discovery.whitened_problem import scene_of
+from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.discovery_words import verdict_of
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
@@ -40,7 +41,7 @@ def test_a_shape_that_no_effect_explains_is_unknown_with_place_and_shape() -> No
     assert (found.where.axes, found.where.runs) == (("X",), ("r01",))
     assert "position" in found.where.depends_on
     assert "a shape along X, alike in both directions" in found.where.shape
-    assert finding["answer"]["where"]["shape"] == found.where.shape
+    assert answer_doc(finding)["where"]["shape"] == found.where.shape
     sign, word, text = verdict_of(finding)
     assert (sign, word) == ("bad", "Something is missing that the catalogue does not explain")
     assert found.where.shape in text
@@ -54,7 +55,7 @@ def test_a_name_that_leaves_most_of_the_gap_and_that_nothing_proves_is_only_a_su
     found, finding = searched(with_repeats(lambda x: np.interp(x, nodes, heights)))
     assert [e.name for e in found.effects] == ["cyclic_error"]
     assert found.gaps["identify"].after_mm > 1.5 * found.gaps["identify"].floor_mm
-    answer = finding["answer"]
+    answer = answer_doc(finding)
     assert (answer["verdict"], answer["effects"], answer["proved"]) == ("unknown", [], False)
     assert [e["name"] for e in answer["suspects"]] == ["cyclic_error"]
     assert "the fitted runs are still off by" in answer["proof"]
@@ -80,7 +81,7 @@ def test_lost_motion_that_the_line_shows_is_proved_by_repeats_from_both_sides() 
     found, finding = searched(with_repeats(lambda x: 0.0 * x, lost_um=3.0))
     assert [e.label for e in found.effects] == ["backlash:X"]
     assert found.effects[0].strength == pytest.approx(3.0, abs=0.4)
-    assert (finding["verdict"], finding["proved"]) == ("named", True)
+    assert (finding.verdict, finding.proved) == ("named", True)
 
 
 def test_no_ball_bar_is_offered_where_none_has_room() -> None:
@@ -97,7 +98,7 @@ def real(shared: Path, name: str):  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("name", BIFROST)
 def test_no_real_axis_is_called_complete_over_a_gap(shared: Path, name: str) -> None:
     found, finding = real(shared, name)
-    answer = finding["answer"]
+    answer = answer_doc(finding)
     assert answer["verdict"] != "none" or answer["rms_before_um"] <= 1.5 * answer["noise_floor_um"]
     if name.endswith("-ild"):  # tens of um, the same in both directions, in a sensor that repeats to less than 1 um
         assert (answer["verdict"], answer["effects"]) == ("unknown", [])

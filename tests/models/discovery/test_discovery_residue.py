@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,10 @@ from abbe.models.discovery.answer import NamedEffect
 from abbe.models.discovery.finding import _confounded, _of_scatter, residues
 from abbe.models.discovery.localization import Where
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
-from abbe.service.discovery.discovery_answer import _effect
+from abbe.models.effects.catalogue import CATALOGUE
+from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.discovery.finding import effect_found
+from abbe.service.domain.finding import Finding
 
 SCATTER = frozenset({"vibration:Z", "stick_slip:X", "beam_outliers"})
 
@@ -21,6 +25,13 @@ SCATTER = frozenset({"vibration:Z", "stick_slip:X", "beam_outliers"})
 def effect(label: str, evidence: float) -> NamedEffect:
     name, _, key = label.partition(":")
     return NamedEffect(name, key, 1.0, 0.1, {}, np.ones(1), np.ones((1, 1)), evidence)
+
+
+def answered(named: NamedEffect) -> dict[str, Any]:
+    """The effect as `abbe discover` writes it."""
+    by_name = {e.name: e for e in CATALOGUE}
+    (told,) = answer_doc(Finding(verdict="named", effects=(effect_found(named, by_name[named.name], by_name),)))["effects"]
+    return told
 
 
 @pytest.mark.parametrize(
@@ -71,7 +82,7 @@ def test_the_strongest_name_is_never_a_residue() -> None:
 def test_a_parameter_of_the_scatter_claims_no_certainty() -> None:
     named = _of_scatter(VarianceFinding("vibration", "Z", 1.0, 0.1, {"frequency_hz": 7.0}, 50.0, Where()))
     assert math.isnan(named.parameters["frequency_hz"][1])
-    answer = _effect(named)["parameters"]
+    answer = answered(named)["parameters"]
     assert answer["frequency_hz"] == 7.0
     assert "u_frequency_hz" not in answer
     assert json.loads(json.dumps(answer, allow_nan=False)) == answer
@@ -80,4 +91,4 @@ def test_a_parameter_of_the_scatter_claims_no_certainty() -> None:
 def test_only_rivals_that_the_price_rule_does_not_exclude_are_confounded() -> None:
     named = replace(effect("backlash:X", 900.0), alternatives=(("lateral_play:EYX", 5.9), ("servo_mismatch:X", 6.1), ("ram_sag", 800.0)))
     assert _confounded([named, named]) == ("lateral_play:EYX",)
-    assert _effect(named)["alternatives"] == ["lateral_play:EYX", "servo_mismatch:X", "ram_sag"]
+    assert answered(named)["alternatives"] == ["lateral_play:EYX", "servo_mismatch:X", "ram_sag"]

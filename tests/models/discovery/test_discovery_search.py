@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path, driven, standing
 from abbe.models.machine import Machine
 from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.discovery.finding import finding_of
 
 R, N = 100.0, 109
 MACHINE = Machine("w-X-b-Y-Z-t", np.array([[0.0, 400.0]] * 3))
@@ -105,6 +107,11 @@ def run(label: str, setup: str, cup: F1, q: F2, t: F1, feed: float, direction: i
 def of_backlash() -> tuple[Case, Discovery]:
     case = campaign(backlash_um=4.0)
     return case, discover(case, CATALOGUE)
+
+
+def answered(found: Discovery, case: Case) -> dict[str, Any]:
+    """What `abbe discover` writes of it."""
+    return answer_doc(finding_of(found, case, CATALOGUE, {r.path.label: np.zeros(r.path.n) for r in case.runs}))
 
 
 def test_nothing_missing_is_none() -> None:
@@ -203,7 +210,7 @@ def test_a_step_beside_a_name_is_not_credited_to_the_name() -> None:
     told = dict(found.rejected)
     for label, value in found.beside:
         assert told[label].startswith(f"{value:.0f} nats, without a name: ")
-    assert answer_doc(found, case)["beside"] == [{"label": label, "evidence": value} for label, value in found.beside]
+    assert answered(found, case)["beside"] == [{"label": label, "evidence": value} for label, value in found.beside]
 
 
 def test_nothing_stands_beside_a_lone_name_or_an_unknown() -> None:
@@ -219,7 +226,7 @@ def test_a_role_whose_readings_are_all_flagged_has_no_gap() -> None:
     runs = tuple(replace(r, valid=r.valid & (r.role != "holdout")) for r in case.runs)
     found = discover(replace(case, runs=runs), FEW)
     assert set(found.gaps) == {"identify"}
-    assert "holdout_rms_um" not in answer_doc(found, case)
+    assert "holdout_rms_um" not in answered(found, case)
 
 
 def test_whitened_noise_has_unit_variance_and_no_memory() -> None:

@@ -10,13 +10,14 @@ import pytest
 
 from abbe.service.campaign_data import decimation as module
 from abbe.service.campaign_data.campaign_folder import from_folder
-from abbe.service.campaign_data.decimation import picked, thinned, thinning
+from abbe.service.campaign_data.decimation import lines_of, picked, thinned, thinning
 from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
+from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.rendering.discovery_page import render_discovery
 from abbe.service.report.discovery_pages import discovery_page, page_facts
-from abbe.service.runs.discovery_file import DiscoveryFile
 from tests.service.discovery.discovery_bench import Search, circle, write_case
 
 
@@ -67,7 +68,7 @@ def test_lost_readings_do_not_change_how_many_one_value_stands_for(monkeypatch: 
     told = thinning([run], short)
     assert told is not None
     assert len(short[0]["columns"]["t_s"]) == 16
-    assert told.each == 6  # 118 readings over 16 values are 7
+    assert told.readings_per_value == 6  # 118 readings over 16 values are 7
 
 
 def test_a_flagged_reading_that_is_no_number_leaves_its_mean_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +81,7 @@ def test_a_flagged_reading_that_is_no_number_leaves_its_mean_one(monkeypatch: py
     assert columns["valid"] == [1] * 40
     told = thinning([run], picked([run], 40))
     assert told is not None
-    assert not told.means  # a reading that is no number is not another one
+    assert told.how == "picked"  # a reading that is no number is not another one
 
 
 def test_a_short_run_beside_long_ones_keeps_its_readings() -> None:
@@ -90,7 +91,7 @@ def test_a_short_run_beside_long_ones_keeps_its_readings() -> None:
     assert few[1] is short
     told = thinning([long, short], few)
     assert told is not None
-    assert (told.each, told.kept) == (13, 13)
+    assert (told.readings_per_value, told.kept) == (13, 13)
 
 
 def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,16 +100,16 @@ def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch)
     assert thinning(runs, runs) is None
     told = thinning(runs, thinned(runs))
     assert told is not None
-    assert (told.readings, told.kept, told.each, told.means) == (240, 80, 3, True)
+    assert (told.readings, told.kept, told.readings_per_value, told.how) == (240, 80, 3, "means")
     step = np.diff(runs[0]["columns"]["t_s"])[0]
     assert told.interval_s == pytest.approx(3.0 * step)
-    assert told.hertz == pytest.approx(1.0 / (6.0 * step))
-    assert 4 <= told.turning <= 8  # X and Y turn round twice a turn each; one of these is where the circle begins
-    done, hidden, remedy = told.lines
+    assert told.highest_hz == pytest.approx(1.0 / (6.0 * step))
+    assert 4 <= told.values_with_reversal <= 8  # X and Y turn round twice a turn each; one of these is where the circle begins
+    done, hidden, remedy = lines_of(told)
     assert "every 3 of them became one mean, 80 values in all" in done
     assert "could not be seen, which does not say that it is absent" in hidden
-    assert f"in {told.turning} means an axis turns round" in hidden
-    assert f"vibration above {told.hertz:.2g} Hz" in hidden
+    assert f"in {told.values_with_reversal} means an axis turns round" in hidden
+    assert f"vibration above {told.highest_hz:.2g} Hz" in hidden
     assert "is 1/3 as high" in hidden
     assert f"keeps its height from {6.0 * step:.2g} s on" in hidden  # half as long, it lies in two means
     assert "--without RUN" in remedy
@@ -118,9 +119,8 @@ def test_readings_that_were_left_out_are_told_too() -> None:
     runs = [circle(1, "identify"), circle(2, "holdout")]
     told = thinning(runs, picked(runs, 80))
     assert told is not None
-    assert (told.means, told.each) == (False, 3)
-    assert "of every 3 one was looked at" in told.lines[0]
-    assert told.doc()["how"] == "picked"
+    assert (told.how, told.readings_per_value) == ("picked", 3)
+    assert "of every 3 one was looked at" in lines_of(told)[0]
 
 
 def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,9 +130,10 @@ def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, m
     journal = DiscoveryJournal()
     finding = discover(job, journal, Search("none"), ignore_progress)
     assert job.thinning is not None
-    assert set(job.thinning.lines) <= set(job.flags)  # `abbe discover` prints every flag
-    assert journal.states[0][1]["flags"] == list(job.flags)
-    answer = finding["answer"]
+    assert set(lines_of(job.thinning)) <= set(job.flags)  # `abbe discover` prints every flag
+    assert journal.steps[0].start is not None
+    assert journal.steps[0].start.flags == job.flags
+    answer = answer_doc(finding)
     assert DiscoveryFile.model_validate_json(json.dumps(answer)).thinning is not None
     assert (answer["thinning"]["readings"], answer["thinning"]["readings_per_value"]) == (360, 2)
     assert len(answer["thinning"]["not_seen"]) == 3
@@ -145,5 +146,5 @@ def test_a_short_campaign_says_nothing_of_it(tmp_path: Path) -> None:
     job = prepare(from_folder(write_case(tmp_path / "c1")), catalogue())
     finding = discover(job, DiscoveryJournal(), Search("none"), ignore_progress)
     assert job.thinning is None
-    assert "thinning" not in finding["answer"]
+    assert "thinning" not in answer_doc(finding)
     assert not any("readings are more than" in line for line in job.flags)

@@ -9,7 +9,7 @@ from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import step_diagonal
 from abbe.service.campaign_data.campaign_checks import check_files, refuse
-from abbe.service.campaign_data.campaign_issue import Finding
+from abbe.service.campaign_data.campaign_issue import CampaignIssue
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, revision, run_digest, versions
 from abbe.service.campaign_data.run_geometry import geometry
 from abbe.service.campaign_data.run_times import times
@@ -107,7 +107,11 @@ def test_a_line_along_another_axis_than_it_says():
 
 
 def test_a_refusal_names_the_first_run_and_how_many_more():
-    findings = [Finding("a", "odd", "look", False), Finding("b", "bad", "mend", True), Finding("c", "bad too", "mend", True)]
+    findings = [
+        CampaignIssue("a", "odd", "look", False),
+        CampaignIssue("b", "bad", "mend", True),
+        CampaignIssue("c", "bad too", "mend", True),
+    ]
     with pytest.raises(CampaignRefused) as told:
         refuse(findings)
     assert str(told.value) == "run b: bad (and 1 more: c) - mend; nothing was stored"

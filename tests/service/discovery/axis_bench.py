@@ -8,8 +8,9 @@ import numpy as np
 
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.case import Case
-from abbe.service.discovery.discovery_doc import finding_doc
 from abbe.service.discovery.discovery_engine import search
+from abbe.service.discovery.finding import finding_of
+from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.runs.cases import case_of
@@ -88,14 +89,14 @@ def axis_case(runs: list[Doc]) -> Case:
     return case_of(HEAD, machine_from_doc(MACHINE), runs)
 
 
-def searched(runs: list[Doc]) -> tuple[Discovery, Doc]:
+def searched(runs: list[Doc]) -> tuple[Discovery, Finding]:
     """What the search finds, as it is, and as the finding that is stored."""
     return found_in(axis_case(runs))
 
 
-def found_in(case: Case) -> tuple[Discovery, Doc]:
+def found_in(case: Case) -> tuple[Discovery, Finding]:
     """The same of a case."""
     from abbe.service.effects.axis_test import SLOW_DRIFT
 
     found = search(case, catalogue(), ignore_progress)
-    return found, finding_doc(found, case, (*catalogue(), SLOW_DRIFT), {r.path.label: np.zeros(r.path.n) for r in case.runs})
+    return found, finding_of(found, case, (*catalogue(), SLOW_DRIFT), {r.path.label: np.zeros(r.path.n) for r in case.runs})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from abbe.service.discovery.discovery_states import closed
+from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.discovery_words import verdict_of
 from tests.service.discovery.axis_bench import cycles, searched
 
@@ -19,8 +19,8 @@ def test_lost_motion_and_scale_are_found_as_the_solver_finds_them(count: int) ->
     assert (scale.name, scale.key, scale.unit) == ("scale", "X", "um/m")
     assert abs(scale.value + 100.0) < 3.0 * scale.u
     assert scale.u < 3.0
-    assert finding["answer"]["fitted"][0]["value"] == scale.value
-    assert finding["answer"]["proved"] is (count > 2)  # else no run only judges
+    assert answer_doc(finding)["fitted"][0]["value"] == scale.value
+    assert answer_doc(finding)["proved"] is (count > 2)  # else no run only judges
     assert "In the present model, as fitted: scale of X" in verdict_of(finding)[2]
 
 
@@ -35,16 +35,16 @@ def test_a_drift_does_not_hide_lost_motion_nor_lost_motion_the_drift() -> None:
     sizes = {e.label: e.strength for e in found.effects}
     assert sizes["slow_drift:X"] == pytest.approx(40.0 * (4 * 600.0 - 600.0 + 210.0) / 3600.0, rel=0.1)  # over the fitted cycles
     assert sizes["backlash:X"] == pytest.approx(10.0, abs=0.8)
-    assert finding["proved"] is True
+    assert finding.proved is True
 
 
 def test_a_drift_alone_says_what_closed_on_the_cycle_that_was_never_fitted() -> None:
     found, finding = searched(cycles(drift_um_h=40.0))
     assert [e.label for e in found.effects] == ["slow_drift:X"]
     text = verdict_of(finding)[2]
-    held = finding["gaps"]["holdout"]
-    assert f"also on runs that were never fitted, from {held['before_um']:.3g} to" in text
-    assert f"({closed(held):.0%} closed)" in text
+    held = finding.gaps["holdout"]
+    assert f"also on runs that were never fitted, from {held.before_um:.3g} to" in text
+    assert f"({held.closed:.0%} closed)" in text
 
 
 def test_a_repeatable_shape_beyond_the_present_model_is_not_called_complete() -> None:

@@ -7,6 +7,7 @@ import json
 import pickle
 import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,14 @@ from abbe.models.compensation.tables import NineTables
 from abbe.models.discovery.changed import comparison as changed
 from abbe.service.campaign_data.campaign_folder import from_store, keep
 from abbe.service.discovery.changed_since import since_of
-from abbe.service.discovery.changed_words import changed_lines, changed_words
+from abbe.service.discovery.changed_words import changed_lines, changed_words, proved
 from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
+from abbe.service.domain.discovery import FindingSource
+from abbe.service.domain.document import document, record
+from abbe.service.domain.finding import ChangedSince, EffectFound, Finding
 from abbe.service.domain.results import NewVersion
 from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.effects.model_book import grown
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import solution_doc
 from abbe.service.runs.exchange import import_folder
@@ -109,23 +114,24 @@ def put(store: Store, place: Path, name: str, runs: list[Doc]) -> None:
     import_folder(store, folder)
 
 
-def compared(store: Store, name: str, found: Sequence[Doc] = ()) -> Doc | None:
+def compared(store: Store, name: str, found: Sequence[EffectFound] = ()) -> ChangedSince | None:
     campaign = from_store(store, name)
     since = since_of(store, campaign)
-    return None if since is None else {"changed": since.compare(campaign, found)}
+    return None if since is None else since.compare(campaign, found)
 
 
 def test_an_axis_that_grows_is_named_and_proved_by_runs_that_did_not_choose_it(store: Store, tmp_path: Path) -> None:
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
     found = compared(store, "july")
     assert found is not None
-    (change,) = found["changed"]["changes"]
-    assert (change["motion"], change["part"], change["unit"], change["halves"]) == ("EXX", "linear", "um/m", 2)
-    assert abs(change["value"] - GROWN * 1e6) <= 2.0 * change["u"] < 6.0
+    (change,) = found.changes
+    assert (change.motion, change.part, change.unit, change.halves) == ("EXX", "linear", "um/m", 2)
+    assert abs(change.value - GROWN * 1e6) <= 2.0 * change.u < 6.0
     assert changed_words(found).startswith("changed since solution 1: scale of X +")
     assert "proved" not in changed_words(found)
-    gap = found["changed"]["gap"]
-    assert gap["after_um"] < gap["floor_um"] + 0.1 * (gap["before_um"] - gap["floor_um"])
+    gap = found.gap
+    assert gap is not None
+    assert gap.after_um < gap.floor_um + 0.1 * (gap.before_um - gap.floor_um)
     assert any("on runs that did not choose it the gap shrinks from" in line for line in changed_lines(found))
 
 
@@ -133,7 +139,7 @@ def test_without_a_change_what_could_hide_is_told(store: Store, tmp_path: Path) 
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
     found = compared(store, "july")
     assert found is not None
-    assert found["changed"]["changes"] == []
+    assert found.changes == ()
     assert changed_words(found) == "nothing has changed since solution 1 that these runs can tell"
     assert "scale of Z" in changed_lines(found)[1]
 
@@ -147,8 +153,8 @@ def test_a_table_that_was_put_in_force_is_no_change_of_the_machine(store: Store,
     store.add_table(store.campaign("july").machine_id, None, image, crc32(image), {})
     found = compared(store, "july")
     assert found is not None
-    assert [c["motion"] for c in found["changed"]["changes"]] == ["EZZ"]
-    assert abs(found["changed"]["changes"][0]["value"] - GROWN * 1e6) <= 2.0 * found["changed"]["changes"][0]["u"]
+    assert [c.motion for c in found.changes] == ["EZZ"]
+    assert abs(found.changes[0].value - GROWN * 1e6) <= 2.0 * found.changes[0].u
 
 
 @pytest.mark.parametrize(
@@ -182,7 +188,7 @@ def test_a_table_that_was_switched_on_in_between_is_another_table(tmp_path: Path
         put(store, tmp_path, "july", [run | {"table": {"crc": crc, "acting": True}} for run in runs])
         found = compared(store, "july")
     assert found is not None
-    assert found["changed"]["changes"] == []
+    assert found.changes == ()
 
 
 def test_with_the_same_table_both_times_it_need_not_be_known(tmp_path: Path) -> None:
@@ -194,37 +200,39 @@ def test_with_the_same_table_both_times_it_need_not_be_known(tmp_path: Path) -> 
         put(store, tmp_path, "july", [run | {"table": told} for run in moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 1)])
         found = compared(store, "july")
     assert found is not None
-    assert [c["motion"] for c in found["changed"]["changes"]] == ["EXX"]
+    assert [c.motion for c in found.changes] == ["EXX"]
 
 
-def entry(name: str, key: str, family: str, coefficient: float) -> Doc:
-    """An effect as a finding and a model book have it."""
-    told = {"label": f"{name}:{key}", "name": name, "key": key, "title": name, "family": family, "kind": "mean", "remedy": "parameter"}
-    return told | {"parameters": {}, "forms": [], "coefficients": [coefficient], "from": {"campaign": "june", "discovery": 1}}
+def entry(name: str, key: str, family: str, coefficient: float) -> EffectFound:
+    """An effect as a finding has it."""
+    size = {"strength": 8.0, "u_strength": 0.1, "unit": "um", "coefficients": (coefficient,)}
+    head = {"label": f"{name}:{key}", "name": name, "key": key, "title": name, "kind": "mean", "remedy": "control parameter"}
+    return EffectFound(**head, family=family, **size)
 
 
 def test_what_was_taken_out_of_the_readings_then_is_taken_out_now(store: Store, tmp_path: Path) -> None:
     """Lost motion of X by the model book of June: in July it is taken out by that same version, whatever the book says today."""
     machine, text, doc = june()
-    book = {"machine_digest": doc["inputs"]["machine"], "effects": [entry("backlash", "X", "drive", 4.0)]}
-    store.add_model(NewVersion(machine["name"], None, book))
+    source = FindingSource(campaign="june", machine_digest=doc["inputs"]["machine"])
+    book = grown(None, Finding(verdict="named", effects=(entry("backlash", "X", "drive", 4.0),)), source, 1)
+    store.add_model(NewVersion(machine["name"], None, document(book)))
     keep(store, from_store(store, "june"), doc | {"machine_model": {"version": 1, "taken_out": ["backlash:X"], "not_for_tables": []}})
     put(store, tmp_path, "july", moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 1))
     found = compared(store, "july")
     assert found is not None
-    assert found["changed"]["since"] == 2
-    assert [c["motion"] for c in found["changed"]["changes"]] == ["EXX"]
-    store.add_model(NewVersion(machine["name"], 1, book | {"effects": []}))
+    assert found.since == 2
+    assert [c.motion for c in found.changes] == ["EXX"]
+    store.add_model(NewVersion(machine["name"], 1, document(replace(book, effects=()))))
     again = compared(store, "july")
     assert again is not None
-    assert again["changed"] == found["changed"]
+    assert again == found
 
 
 def test_a_lasting_effect_that_was_found_beside_leaves_a_change_unproved(store: Store, tmp_path: Path) -> None:
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
     own = compared(store, "july", [entry("backlash", "X", "drive", 0.0)])
     assert own is not None
-    assert (own["changed"]["beside"], "not proved" in changed_words(own)) == ([], False)
+    assert (own.beside, "not proved" in changed_words(own)) == ((), False)
     other = compared(store, "july", [entry("lateral_play", "EYX", "structure", 0.0)])
     assert other is not None
     assert changed_words(other).endswith("(not proved)")
@@ -235,7 +243,7 @@ def test_what_heat_did_in_these_runs_is_taken_out_first(store: Store, tmp_path: 
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
     taken: list[str] = []
     monkeypatch.setattr(
-        "abbe.service.discovery.changed_since.less_effects", lambda c, entries, whose: taken.extend(e["label"] for e in entries) or c
+        "abbe.service.discovery.changed_since.less_effects", lambda c, entries, whose: taken.extend(e.label for e in entries) or c
     )
     compared(store, "july", [entry("spindle_growth", "Z", "thermal", 1.0), entry("backlash", "X", "drive", 1.0)])
     assert taken == ["spindle_growth:Z"]
@@ -243,8 +251,8 @@ def test_what_heat_did_in_these_runs_is_taken_out_first(store: Store, tmp_path: 
 
 def test_the_first_campaign_is_compared_with_nothing_and_none_with_a_later_one(store: Store, tmp_path: Path) -> None:
     assert compared(store, "june") is None
-    assert changed_lines({}) == []
-    assert changed_words({}) == ""
+    assert changed_lines(None) == []
+    assert changed_words(None) == ""
 
 
 def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path: Path) -> None:
@@ -255,8 +263,9 @@ def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path
     journal = DiscoveryJournal()
     search = Search("none")
     finding = discover(job, journal, search, lambda _: None)
-    assert finding["changed"]["since"] == 1
-    assert json.loads(json.dumps(finding["changed"])) == finding["changed"]
+    assert finding.changed is not None
+    assert finding.changed.since == 1
+    assert record(ChangedSince, json.loads(json.dumps(document(finding.changed))), "a change") == finding.changed
     assert discover(job, journal, search, lambda _: None) is finding
 
 
@@ -290,6 +299,7 @@ GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
 )
 def test_a_change_that_is_not_proved_says_so(told: Doc, change: Doc, proof: bool, says: str) -> None:
     one = {"motion": "EXX", "part": "linear", "value": 12.0, "u": 1.0, "unit": "um/m", "rivals": [], "halves": 2} | change
-    finding = {"changed": {"since": 4, "changes": [one], "gap": GAP, "judged": 50.0, "hidden_um_m": {}} | told}
-    assert changed_words(finding).endswith("(not proved)") is not proof
-    assert any(says in line for line in changed_lines(finding)), changed_lines(finding)
+    found = record(ChangedSince, {"since": 4, "changes": [one], "gap": GAP, "judged": 50.0, "hidden_um_m": {}} | told, "a change")
+    found = replace(found, proved=proved(found))
+    assert changed_words(found).endswith("(not proved)") is not proof
+    assert any(says in line for line in changed_lines(found)), changed_lines(found)

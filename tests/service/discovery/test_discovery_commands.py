@@ -14,11 +14,11 @@ from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder, from_store
 from abbe.service.discovery.discover import prepare
+from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current, no_table_lines
 from abbe.service.identification.effect_removal import taken_out
 from abbe.service.identification.table_removal import NO_TABLE
-from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.storage.store import Store
 from tests.service.discovery.discovery_bench import WIDTH_MM, Search, write_case
 

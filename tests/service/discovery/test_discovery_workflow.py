@@ -18,17 +18,20 @@ import pytest
 from abbe.models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
-from abbe.service.discovery.discovery_doc import finite
-from abbe.service.discovery.discovery_states import closed, entering, judge, not_entered, taken_back
-from abbe.service.discovery.discovery_store import StoredJournal, journal_of
+from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.discovery.discovery_states import entering, judge, not_entered
+from abbe.service.discovery.discovery_store import StoredJournal, journal_of, stored_steps
 from abbe.service.discovery.discovery_words import lines_of, next_of, rival_lines, verdict_of
-from abbe.service.discovery.simulate import gap_doc, simulate
+from abbe.service.discovery.simulate import simulate, simulated_finding
+from abbe.service.domain.discovery import DiscoveryStep
+from abbe.service.domain.discovery_file import DiscoveryFile
+from abbe.service.domain.document import document, record
+from abbe.service.domain.finding import EffectFound, Finding, GapUm, Unnamed
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current
-from abbe.service.errors import CampaignRefused, NotObservable, StoreError
+from abbe.service.errors import CampaignRefused, NotObservable, StoreError, Unusable
 from abbe.service.report.discovery_pages import discovery_page, gap_rows
-from abbe.service.runs.discovery_file import DiscoveryFile
 from abbe.service.storage.store import Store
 from tests.service.discovery.discovery_bench import Search, write_case
 
@@ -64,18 +67,21 @@ def test_states_follow_from_the_finding(folder: Path, book: Store, search: Searc
     job = job_of(folder)
     journal = journal_of(book, job)
     discover(job, journal, search, ignore_progress)
-    assert [state for state, _ in journal.states] == states
-    stored = book.discovery_steps(journal.id or 0)
-    assert [s.state for s in stored] == states
-    assert all(s.doc["decided_by"] == "abbe discover" and s.doc["why"] for s in stored)
-    assert stored[0].doc["runs"].keys() == {"r01", "r02", "r03", "r04"}
-    assert stored[0].doc["versions"]["abbe"]
+    assert [step.state for step in journal.steps] == states
+    stored = stored_steps(book, journal.id or 0)
+    assert [s.state for s in stored] == [s.state for s in book.discovery_steps(journal.id or 0)] == states
+    assert all(s.decided_by == "abbe discover" and s.why for s in stored)
+    assert stored[0].start is not None
+    source = stored[0].start.source
+    assert source.runs.keys() == {"r01", "r02", "r03", "r04"}
+    assert source.versions["abbe"]
     model = current(book, "VMC-1")
     if states == ALL:
         assert model is not None
         assert (model.version, model.discovery_id, journal.version) == (1, journal.id, 1)
-        assert [e["label"] for e in model.doc["effects"]] == ["backlash:X"]
-        assert model.doc["provenance"]["runs"] == stored[0].doc["runs"]
+        assert [e.label for e in model.book.effects] == ["backlash:X"]
+        assert model.book.provenance is not None
+        assert model.book.provenance.runs == source.runs
     else:
         assert model is None
 
@@ -84,81 +90,95 @@ def test_a_wrong_name_that_only_fits_is_not_proved(folder: Path) -> None:
     job = job_of(folder)
     good = judge(discover(job, DiscoveryJournal(), Search(), ignore_progress))
     bad = judge(discover(job, DiscoveryJournal(), Search(holds=False), ignore_progress))
-    assert (good["proved"], bad["proved"]) == (True, False)
-    assert good["closed"] > 0.9
-    assert bad["closed"] == pytest.approx(0.0, abs=1e-9)
-    assert judge({"gaps": {}})["proved"] is None
-    assert judge({"gaps": {"holdout": {"before_um": 0.31, "after_um": 0.3, "floor_um": 0.3}}})["proved"] is None
-    held = {"holdout": {"before_um": 0.9, "after_um": 0.9, "floor_um": 0.3}}
-    assert judge({"gaps": held, "effects": [{"kind": "variance"}]})["proved"] is None  # noise that is named stays noise
-    assert judge({"gaps": held, "effects": [{"kind": "mean"}]})["proved"] is False
-    run_away = judge({"gaps": {"identify": {"before_um": 2.0, "after_um": 90.0, "floor_um": 1.0}}, "effects": [{"kind": "mean"}]})
-    assert (run_away["proved"], run_away["rule"]) == (False, "the identify runs agree worse with the effect than without it")
-    assert closed({"before_um": 0.29, "after_um": 0.29, "floor_um": 0.3}) is None
+    assert (good.proved, bad.proved) == (True, False)
+    assert good.closed is not None
+    assert good.closed > 0.9
+    assert bad.closed == pytest.approx(0.0, abs=1e-9)
+
+
+def one_effect(kind: Any = "mean") -> EffectFound:
+    size = {"strength": 8.0, "u_strength": 0.1, "unit": "um"}
+    return EffectFound(label="a:X", name="a", key="X", title="an effect", family="drive", kind=kind, remedy="table", **size)
+
+
+def gap_um(before: float, after: float, floor: float) -> GapUm:
+    return GapUm(before_um=before, after_um=after, floor_um=floor)
+
+
+def judged(role: str, gap: GapUm, *effects: EffectFound) -> Any:
+    return judge(Finding(verdict="named", gaps={role: gap}, effects=effects))
+
+
+def test_runs_judge_only_where_the_gap_shows_in_them() -> None:
+    assert judge(Finding(verdict="none")).proved is None
+    assert judged("holdout", gap_um(0.31, 0.3, 0.3)).proved is None
+    assert judged("holdout", gap_um(0.9, 0.9, 0.3), one_effect("variance")).proved is None  # noise that is named stays noise
+    assert judged("holdout", gap_um(0.9, 0.9, 0.3), one_effect()).proved is False
+    run_away = judged("identify", gap_um(2.0, 90.0, 1.0), one_effect())
+    assert (run_away.proved, run_away.rule) == (False, "the identify runs agree worse with the effect than without it")
+    assert gap_um(0.29, 0.29, 0.3).closed is None
 
 
 def test_a_name_that_is_taken_back_is_a_suspect_in_text_answer_and_page(folder: Path) -> None:
-    """What the text takes back no script may read as a name; found by an older version and stored, it comes out alike."""
+    """What the text takes back no script may read as a name."""
     job = job_of(folder)
     bad = discover(job, DiscoveryJournal(), Search(holds=False), ignore_progress)
-    for told in (bad, bad["answer"]):
-        assert (told["verdict"], told["effects"], told["proved"]) == ("unknown", [], False)
-        assert [e["name"] for e in told["suspects"]] == ["backlash"]
-        assert [e["proved"] for e in told["suspects"]] == [False]
-    DiscoveryFile.model_validate(json.loads(json.dumps(bad["answer"])))
+    answer = DiscoveryFile.model_validate_json(json.dumps(answer_doc(bad)))
+    for told in (bad, answer):
+        assert (told.verdict, list(told.effects), told.proved) == ("unknown", [], False)
+        assert [e.name for e in told.suspects] == ["backlash"]
+        assert [e.proved for e in told.suspects] == [False]
     assert "Something is missing that the catalogue does not explain" in verdict_of(bad)[1]
     assert "Suspected: backlash" in verdict_of(bad)[2]
     assert not any("enter the width" in line for line in lines_of(bad))  # no remedy for what is not confirmed
     page = discovery_page(bad, job.runs, {}, {"title": "", "flags": [], "states": [], "provenance": {}})
     assert (page.effects, page.rejected[0][0]) == ([], "backlash:X")
-    named = {"verdict": "named", "effects": bad["suspects"], "answer": {"verdict": "named", "effects": bad["answer"]["suspects"]}}
-    older = {k: v for k, v in bad.items() if k not in ("proved", "proof", "suspects")} | named
-    assert taken_back(older)["verdict"] == taken_back(older)["answer"]["verdict"] == "unknown"
 
 
 def test_the_answer_says_what_is_proved_and_by_which_rule(folder: Path) -> None:
-    answer = discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress)["answer"]
+    answer = answer_doc(discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress))
     assert (answer["verdict"], answer["proved"]) == ("named", True)
     assert answer["proof"] == "at least 50% of the gap closes on the runs that judge"
     assert [e["proved"] for e in answer["effects"]] == [True]
-    assert discover(job_of(folder), DiscoveryJournal(), Search("none"), ignore_progress)["answer"]["proved"] is False
+    assert answer_doc(discover(job_of(folder), DiscoveryJournal(), Search("none"), ignore_progress))["proved"] is False
 
 
-def variant(finding: dict[str, Any], **changes: Any) -> dict[str, Any]:
+def variant(finding: Finding, **changes: Any) -> Finding:
     """A finding with a second effect that is noise, beside its first one."""
-    key = "effects" if finding["effects"] else "suspects"
-    return finding | {key: [*finding[key], finding[key][0] | {"kind": "variance", "label": "stick_slip:X"} | changes]}
+    names = finding.effects or finding.suspects
+    names = (*names, replace(names[0], kind="variance", label="stick_slip:X", **changes))
+    return replace(finding, effects=names) if finding.effects else replace(finding, suspects=names)
 
 
 def test_noise_that_is_named_does_not_excuse_a_name_beside_it(folder: Path) -> None:
     wrong = discover(job_of(folder), DiscoveryJournal(), Search(holds=False), ignore_progress)
-    assert judge(wrong)["proved"] is judge(variant(wrong))["proved"] is False
+    assert judge(wrong).proved is judge(variant(wrong)).proved is False
     right = variant(discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress))
-    assert judge(right)["proved"] is True
-    assert [e["label"] for e in entering(right)] == ["backlash:X"]
+    assert judge(right).proved is True
+    assert [e.label for e in entering(right)] == ["backlash:X"]
 
 
 def test_each_effect_has_to_be_needed_and_nothing_nameless_may_share_in_what_closes(folder: Path) -> None:
     found = discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress)
     assert not_entered(found, judge(found)) is None
-    second = found["effects"][0] | {"label": "cyclic_error:Y", "alternatives": []}
+    second = replace(found.effects[0], label="cyclic_error:Y", alternatives=())
     for needed, why in ((1.3, None), (1.0, "the runs that judge do not need cyclic_error:Y"), (None, None)):
-        both = found | {"effects": [*found["effects"], second | {"needed": needed}]}
+        both = replace(found, effects=(*found.effects, replace(second, needed=needed)))
         assert not_entered(both, judge(both)) == why
-    nameless = found | {"answer": found["answer"] | {"beside": [{"label": "unnamed_step:Z", "evidence": 144.0}]}}
+    nameless = replace(found, beside=(Unnamed(label="unnamed_step:Z", evidence=144.0),))
     assert not_entered(nameless, judge(nameless)) == "what closes the gap is in part a structure without a name (unnamed step:Z)"
 
 
 def test_scatter_is_told_without_a_gap_that_it_cannot_close(folder: Path) -> None:
     finding = discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress)
-    scatter = variant(finding, alternatives=[])["effects"][1:]
-    alone = finding | {"effects": scatter, "next_test": None, "confounded_with": []}
+    scatter = variant(finding, alternatives=()).effects[1:]
+    alone = replace(finding, effects=scatter, next_test=None, confounded_with=())
     told = "\n".join(lines_of(alone))
     assert "closed" not in verdict_of(alone)[2]
     assert "no model takes scatter out" in told
     assert "what else it could be: no rival was tried" in told
     assert {row.closed for row in gap_rows(alone)} == {None}
-    assert "fits these runs as well" in rival_lines(finding["effects"][0] | {"alternatives": []})[0]
+    assert "fits these runs as well" in rival_lines(replace(finding.effects[0], alternatives=()))[0]
     assert gap_rows(finding)[0].closed is not None
 
 
@@ -200,9 +220,9 @@ def test_runs_that_were_never_fitted_are_asked_before_nothing_is_said_to_be_miss
     told = verdict_of(finding)
     assert told[0] == sign
     assert words in told[2]
-    assert words in journal.states[-1][1]["why"]
+    assert words in journal.steps[-1].why
     assert ("measure next: repeat the runs" in "\n".join(next_of(finding))) is (sign == "open")
-    assert [a["run"] for a in finding["answer"].get("agreement", [])] == [a.run for a in agreement]
+    assert [a["run"] for a in answer_doc(finding).get("agreement", [])] == [a.run for a in agreement]
 
 
 def test_what_could_not_be_seen_is_told_where_nothing_is_missing(folder: Path) -> None:
@@ -212,7 +232,7 @@ def test_what_could_not_be_seen_is_told_where_nothing_is_missing(folder: Path) -
     assert line.startswith("could not be seen: what grows with the feed looks like geometry, because all ball-bar runs have one feed")
     assert line.endswith("what would show it: the same path at a second feed")
     assert line in lines_of(finding)
-    assert finding["answer"]["unseen"] == [{"what": slow.what, "because": slow.because, "adds": "second_feed"}]
+    assert answer_doc(finding)["unseen"] == [{"what": slow.what, "because": slow.because, "adds": "second_feed"}]
 
 
 def test_what_has_no_name_gets_a_proposal_like_a_name(folder: Path) -> None:
@@ -223,39 +243,39 @@ def test_what_has_no_name_gets_a_proposal_like_a_name(folder: Path) -> None:
         "measure next: a repeat late in the session to tell something of the machine from something of that session (about 150 min)"
     )
     assert why == "  run r02 again, later"
-    assert finding["answer"]["next_test"]["adds"] == ["longer_session"]
+    assert answer_doc(finding)["next_test"]["adds"] == ["longer_session"]
 
 
 def test_kin_that_explains_nearly_all_but_costs_more_is_listed_with_its_odds(folder: Path) -> None:
     """It lies 25 behind by its price: no headline, but no reader may miss it."""
     finding = discover(job_of(folder), DiscoveryJournal(), Search(ahead=25.0), ignore_progress)
-    assert finding["confounded_with"] == []
-    (line,) = rival_lines(finding["effects"][0])
+    assert finding.confounded_with == ()
+    (line,) = rival_lines(finding.effects[0])
     assert line.endswith("(10^11 times less likely, but slightly bent it would look the same)")
     assert any(line in told for told in lines_of(finding))
     page = discovery_page(finding, from_folder(folder).runs, {}, {"title": "", "flags": [], "states": [], "provenance": {}})
     assert page.effects[0].rivals == [line]
     near = discover(job_of(folder), DiscoveryJournal(), Search(ahead=4.2), ignore_progress)
-    assert rival_lines(near["effects"][0])[0].endswith("(67 times less likely)")
+    assert rival_lines(near.effects[0])[0].endswith("(67 times less likely)")
 
 
 def test_runs_whose_readings_are_all_flagged_judge_nothing(folder: Path) -> None:
     gaps = {"identify": Gap(3e-3, 3e-4, 3e-4), "holdout": Gap(float("nan"), float("nan"), 3e-4)}
     finding = discover(job_of(folder), DiscoveryJournal(), gapped(Search(), **gaps), ignore_progress)
-    assert list(finding["gaps"]) == ["identify"]
-    assert judge(finding)["rule"] == "no run of this campaign only judges"
+    assert list(finding.gaps) == ["identify"]
+    assert judge(finding).rule == "no run of this campaign only judges"
     for run in folder.glob("r03.json"):
         doc = json.loads(run.read_text())
         doc["columns"]["valid"] = [0] * len(doc["columns"]["t_s"])
         run.write_text(json.dumps(doc))
     job = job_of(folder)
-    assert list(gap_doc(job, simulate(job))["gaps"]) == ["identify"]
+    assert list(simulated_finding(job, simulate(job)).gaps) == ["identify"]
 
 
 def test_an_instrument_that_no_fitted_run_has_is_judged_by_the_noise_of_the_others(folder: Path) -> None:
     job = job_of(folder)
-    doc = gap_doc(job, replace(simulate(job), noise_mm={"laser": 1e-3, "probe": 2e-3}))
-    assert {g["floor_um"] for g in doc["gaps"].values()} == {r["floor_um"] for r in doc["runs"].values()} == {2.0}
+    found = simulated_finding(job, replace(simulate(job), noise_mm={"laser": 1e-3, "probe": 2e-3}))
+    assert {g.floor_um for g in found.gaps.values()} == {r.floor_um for r in found.runs.values()} == {2.0}
 
 
 @pytest.mark.parametrize(
@@ -273,12 +293,12 @@ def test_only_what_was_proved_and_has_no_rival_enters_the_book(
     job = job_of(write_case(tmp_path / "c", roles=roles))
     journal = journal_of(book, job)
     finding = discover(job, journal, Search(ahead=ahead), ignore_progress)
-    state, doc = journal.states[-1]
-    assert (state, doc["not_added"]) == ("EXPLAINED", why)
+    step = journal.steps[-1]
+    assert (step.state, step.not_added) == ("EXPLAINED", why)
     assert len(book.models("VMC-1")) == (1 if why is None else 0)
     told = [line for line in lines_of(finding) if line.startswith("not added to the model book: ")]
     assert told == ([] if why is None else [f"not added to the model book: {why}"])
-    assert (why is None) or doc["why"].endswith(told[0])
+    assert (why is None) or step.why.endswith(told[0])
 
 
 def test_the_same_search_is_found_again_and_not_done_twice(folder: Path, book: Store) -> None:
@@ -290,7 +310,7 @@ def test_the_same_search_is_found_again_and_not_done_twice(folder: Path, book: S
     assert again.known == ("backlash:X",)
     journal = journal_of(book, again)
     assert journal.ended
-    assert discover(again, journal, search, ignore_progress) == json.loads(json.dumps(first))
+    assert discover(again, journal, search, ignore_progress) == first
     assert search.calls == 1
     assert len(book.discoveries()) == len(book.models()) == 1
 
@@ -340,13 +360,13 @@ def test_another_code_under_the_same_name_is_another_search(folder: Path, monkey
 
 def test_states_keep_their_order(folder: Path, book: Store) -> None:
     with pytest.raises(ValueError, match="TESTING cannot follow None"):
-        DiscoveryJournal().write("TESTING", {})
+        DiscoveryJournal().write(DiscoveryStep(state="TESTING", why="a test"))
     job = job_of(folder)
     one, other = journal_of(book, job), journal_of(book, job)
     assert one.id == other.id
-    one.write("FITTED", {"decided_by": "a test", "why": "first"})
+    one.write(DiscoveryStep(state="FITTED", why="first", decided_by="a test"))
     with pytest.raises(StoreError, match="another process works on it"):
-        other.write("FITTED", {"decided_by": "a test", "why": "second"})
+        other.write(DiscoveryStep(state="FITTED", why="second", decided_by="a test"))
 
 
 KILLED = """
@@ -389,8 +409,8 @@ def test_killed_anywhere_it_goes_on_there(folder: Path, tmp_path: Path, step: in
         assert search.calls == searches
         assert [s.state for s in store.discovery_steps(number)] == ALL
         assert journal.version == 1
-        assert finding["effects"][0]["label"] == "backlash:X"
-        assert StoredJournal(store, number, "VMC-1").finding == json.loads(json.dumps(finding))
+        assert finding.effects[0].label == "backlash:X"
+        assert StoredJournal(store, number, "VMC-1").finding == finding
 
 
 def test_what_is_no_campaign_is_refused(tmp_path: Path) -> None:
@@ -403,6 +423,13 @@ def test_what_is_no_campaign_is_refused(tmp_path: Path) -> None:
         job_of(folder)
 
 
-def test_what_is_not_known_is_left_out_of_documents() -> None:
-    found = finite({"u": float("nan"), "value": 1.0, "deep": {"p": float("inf")}, "list": [1.0, float("nan"), {"x": float("-inf")}]})
-    assert found == {"value": 1.0, "deep": {}, "list": [1.0, None, {}]}
+@pytest.mark.parametrize("search", [Search(), Search("none"), Search("unknown"), Search(holds=False)])
+def test_a_finding_comes_back_from_json_as_it_was(folder: Path, search: Search) -> None:
+    finding = discover(job_of(folder), DiscoveryJournal(), search, ignore_progress)
+    text = json.dumps(document(finding), allow_nan=False)
+    assert record(Finding, json.loads(text), "a finding") == finding
+
+
+def test_a_stored_document_of_another_form_is_refused_with_its_place() -> None:
+    with pytest.raises(Unusable, match=r"a finding has another form than expected: gaps\.holdout\.after_um"):
+        record(Finding, {"verdict": "none", "gaps": {"holdout": {"before_um": 1.0, "floor_um": 1.0}}}, "a finding")

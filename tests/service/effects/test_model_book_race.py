@@ -76,7 +76,7 @@ def test_the_later_of_two_discoveries_is_not_put_on_top_of_what_it_has_not_seen(
     assert states_of(one, second) == ALL[:-1]  # the end and the version: both or none
     kept = StoredJournal(one, second.id or 0, NAME).finding
     assert kept is not None
-    assert kept["effects"][0]["strength"] == 9.0
+    assert kept.effects[0].strength == 9.0
 
     search = Search(width_um=1.0)
     again = job_of(july, pair[1])
@@ -87,8 +87,8 @@ def test_the_later_of_two_discoveries_is_not_put_on_top_of_what_it_has_not_seen(
     assert (search.calls, journal.version) == (1, 2)
     newest = current(one, NAME)
     assert newest is not None
-    assert newest.doc["parent"] == 1
-    assert [e["strength"] for e in newest.doc["effects"]] == [8.0, 1.0]
+    assert newest.book.parent == 1
+    assert [e.strength for e in newest.book.effects] == [8.0, 1.0]
 
 
 def test_both_have_looked_before_either_writes(pair: tuple[Store, Store]) -> None:

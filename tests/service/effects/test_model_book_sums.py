@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.service.campaign_data.packed_arrays import packed_covariance
+from abbe.service.domain.discovery import FindingSource
+from abbe.service.domain.finding import EffectFound, Finding
+from abbe.service.domain.packed_arrays import PackedCovariance
 from abbe.service.effects.model_book import grown, total
 
-SOURCE = {"campaign": "c1", "discovery": "d1", "machine_digest": "m", "runs": [], "versions": {}}
+SOURCE = FindingSource(campaign="c1", machine_digest="m")
+
+
+def found(label: str, strength: float, u_strength: float, **more: Any) -> EffectFound:
+    name, _, key = label.partition(":")
+    head = {"label": label, "name": name, "key": key, "title": name, "family": "geometry", "kind": "mean", "unit": "um", "remedy": "table"}
+    return EffectFound(**head, strength=strength, u_strength=u_strength, **more)
+
+
+def finding(*effects: EffectFound) -> Finding:
+    return Finding(verdict="named", effects=effects)
 
 
 @pytest.mark.parametrize(
@@ -22,25 +35,19 @@ SOURCE = {"campaign": "c1", "discovery": "d1", "machine_digest": "m", "runs": []
 def test_only_strengths_of_opposite_sign_cancel(strengths: tuple[float, float], gone: bool) -> None:
     """A straightness is known to 60 %; more of it found later is no repair."""
     u = (0.1, 0.1) if min(strengths) < 0 else (6.2, 1.6)
-    effects = [{"label": "a", "strength": s, "u_strength": v, "alternatives": []} for s, v in zip(strengths, u, strict=True)]
-    doc = grown(None, {"effects": effects, "model": None}, SOURCE)
-    assert doc["gone"] == (["a"] if gone else [])
-    assert len(doc["effects"]) == (0 if gone else 2)
+    effects = [found("a", s, v) for s, v in zip(strengths, u, strict=True)]
+    book = grown(None, finding(*effects), SOURCE, 1)
+    assert book.gone == (("a",) if gone else ())
+    assert len(book.effects) == (0 if gone else 2)
 
 
-def straight(coefficients: tuple[float, ...], noise: float = 0.05) -> dict[str, Any]:
+def straight(coefficients: tuple[float, ...], noise: float = 0.05) -> EffectFound:
     """A straightness of two bends: an rms, so without a sign; stated whole, known to 60 %."""
     effect = next(e for e in CATALOGUE if e.name == "straightness")
     c = np.array(coefficients)
     strength = effect.unseen[0] * effect.strength(c, {}) / effect.per_unit
-    shape = {"coefficients": list(coefficients), "covariance": packed_covariance(noise**2 * np.eye(c.size)), "parameters": {}, "forms": []}
-    return shape | {
-        "label": "straightness:EYX",
-        "name": "straightness",
-        "strength": strength,
-        "u_strength": 0.6 * strength,
-        "alternatives": [],
-    }
+    covariance = PackedCovariance.of(noise**2 * np.eye(c.size))
+    return found("straightness:EYX", strength, 0.6 * strength, coefficients=coefficients, covariance=covariance)
 
 
 @pytest.mark.parametrize(
@@ -56,9 +63,9 @@ def straight(coefficients: tuple[float, ...], noise: float = 0.05) -> dict[str, 
 )
 def test_sizes_without_a_sign_add_up_as_their_coefficients_do(change: tuple[float, ...], gone: bool, share: float) -> None:
     first, second = straight((3.0, 4.0)), straight(change)
-    doc = grown(None, {"effects": [first, second], "model": None}, SOURCE, CATALOGUE)
-    assert doc["gone"] == (["straightness:EYX"] if gone else [])
+    book = grown(None, finding(first, second), SOURCE, 1, CATALOGUE)
+    assert book.gone == (("straightness:EYX",) if gone else ())
     effect = next(e for e in CATALOGUE if e.name == "straightness")
-    assert total([first, second], effect)[0] == pytest.approx(share * first["strength"], abs=0.05 * first["strength"])
-    bent = second | {"forms": ["another form"]}
-    assert total([first, bent], effect)[0] == pytest.approx(first["strength"] + second["strength"])
+    assert total([first, second], effect).strength == pytest.approx(share * first.strength, abs=0.05 * first.strength)
+    bent = replace(second, forms=("another form",))
+    assert total([first, bent], effect).strength == pytest.approx(first.strength + second.strength)

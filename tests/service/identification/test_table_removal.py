@@ -19,10 +19,10 @@ from abbe.service.campaign_data.campaign_folder import from_folder, from_store
 from abbe.service.compensation.proposals import check_same_table
 from abbe.service.discovery.discover import prepare
 from abbe.service.discovery.simulate import simulate
+from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
 from abbe.service.identification.table_removal import NO_TABLE, STAYS, TABLE_OUT, RemovedTable, as_left, less, table_line, table_then
-from abbe.service.runs.solution_file import SolutionFile
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.tables.nine_tables import table_image

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from abbe.service.runs.machine_object import FileObject, MachineObject, Point
+from abbe.service.domain.machine_object import FileObject, MachineObject, Point
 
 Status = Literal["observed", "weak", "not observable"]
 Digest = str
