@@ -1,8 +1,10 @@
-"""The recipes of unattended checks: known also to those who have no way to a device."""
+"""The recipes that Abbe has, and what a campaign is made from. Nothing here reaches a device."""
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Protocol
@@ -10,7 +12,8 @@ from typing import Protocol
 from abbe.models.machine import Machine
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification
-from abbe.service.sequences.recipes.recipe_file import read_recipe
+from abbe.service.sequences.recipes.recipe import Helix
+from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_source, recipe_text
 from abbe.service.sequences.steps import CampaignPlan
 
 IDENTIFICATION = "identification"
@@ -25,15 +28,17 @@ class BuiltinRecipe(Protocol):
     """A recipe that fits itself into a machine."""
 
     def __call__(self, machine: Machine, *, rate_hz: int = ...) -> CampaignPlan:
-        """The plan, with so many ball-bar samples per second."""
+        """Return the plan, with so many ball-bar samples per second."""
         ...
 
 
 RECIPES: dict[str, BuiltinRecipe] = {"quick-check": quick_check, "verification": verification}
+"""Those that end with a verdict, as a schedule needs it."""
+CAMPAIGNS: dict[str, BuiltinRecipe] = {IDENTIFICATION: identification, "verification": verification, "quick-check": quick_check}
 
 
 def named(recipe: str, rate_hz: int) -> str:
-    """A recipe's name together with its rate, as jobs and campaigns tell it: ``quick-check at 1000 Hz``; the usual rate is not said."""
+    """A recipe's name together with its rate, as jobs and campaigns show it: ``quick-check at 1000 Hz``; the usual rate is left out."""
     return recipe if rate_hz == USUAL_HZ else f"{recipe} at {rate_hz} Hz"
 
 
@@ -61,15 +66,58 @@ def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
     return RECIPES[recipe](machine, rate_hz=rate_hz)
 
 
-def campaign_plan(recipe: str, machine: Machine, folder: Path) -> CampaignPlan:
-    """The campaign that the machine file names for investigations: ``identification``, or a recipe file beside it.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecipeSource:
+    """What a campaign's plan is made from. Its journal keeps it, so that a resumed campaign needs no file.
+
+    ``helix``: instead of a recipe, ``X,Y,Z,RADIUS`` in mm. ``text``: of a recipe file, which ``recipe`` names.
+    """
+
+    recipe: str
+    helix: str = ""
+    rate_hz: int = USUAL_HZ
+    text: str | None = None
+
+    def plan(self, machine: Machine) -> CampaignPlan:
+        """Return the campaign, named after its recipe.
+
+        Raises
+        ------
+        ConfigError
+            There is no such recipe, the rate does not divide 1000, or helix or file cannot be used.
+        """
+        if self.rate_hz < 1 or 1000 % self.rate_hz:
+            raise ConfigError(f"rate {self.rate_hz} Hz does not divide 1000", "use 1000, 500, 250, 200, 125, 100, 50 ...")
+        if self.helix:
+            return self._helix(machine)
+        if self.text is not None:
+            name, recipes = parse_recipe(self.text, self.recipe)
+            return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
+        if self.recipe not in CAMPAIGNS:
+            raise ConfigError(f"there is no recipe {self.recipe!r}", f"use one of: {', '.join(CAMPAIGNS)}, or a FILE.toml")
+        return CAMPAIGNS[self.recipe](machine, rate_hz=self.rate_hz)
+
+    def _helix(self, machine: Machine) -> CampaignPlan:
+        try:
+            x, y, z, radius = numbers = tuple(float(v) for v in self.helix.split(","))
+            if not all(map(math.isfinite, numbers)):
+                raise ValueError(self.helix)
+        except ValueError:
+            raise ConfigError(f"--helix {self.helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
+        wanted = Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=self.rate_hz)
+        recipe_text("helix", (wanted,))  # what no recipe file may say is refused here, too
+        return CampaignPlan("helix", (wanted.plan(machine),))
+
+
+def campaign_source(name: str, folder: Path) -> RecipeSource:
+    """Return the source of a full campaign: ``identification``, which may name its rate, or a recipe file of a folder.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, or is no recipe.
+        The file cannot be read.
     """
+    recipe, rate_hz = parted(name)
     if recipe == IDENTIFICATION:
-        return identification(machine)
-    name, recipes = read_recipe(folder / recipe)
-    return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
+        return RecipeSource(recipe=recipe, rate_hz=rate_hz)
+    return RecipeSource(recipe=name, text=recipe_source(folder / name))

@@ -13,6 +13,7 @@ from typing import Any
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.campaigns.bar_link import BarBreaks, bar_ready
+from abbe.service.campaigns.builtin_recipes import RecipeSource
 from abbe.service.campaigns.campaign_run import CampaignRun, Confirm, Resumed, decline, in_mounting, items, plan_hash, read_path
 from abbe.service.campaigns.progress import ProgressMeter
 from abbe.service.capture.live import LiveFeed
@@ -90,7 +91,7 @@ class Manner:
 
     control: Control | None = None
     confirm: Confirm = decline
-    source: dict[str, Any] = field(default_factory=dict)
+    source: RecipeSource | None = None
     resumed: Resumed | None = None
     part: bool = False
     live: LiveFeed | None = None
@@ -173,7 +174,8 @@ async def _campaign_run(
     expected = ExpectedTable(comp.boot_id, comp.bank_crc[comp.active_bank])
     if manner.resumed is not None and manner.resumed.expected is not None:
         expected = manner.resumed.expected  # the table may have been changed since it was looked at: while a question stood
-    begun = {"plan": plan_hash(plan), "source": manner.source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
+    source = {} if manner.source is None else asdict(manner.source)
+    begun = {"plan": plan_hash(plan), "source": source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
     begun["owner"] = asdict(this_process())
     await journal.add(BEGUN, **begun)
     campaign_run = CampaignRun(session, control, site.watching, journal, expected, manner.confirm)

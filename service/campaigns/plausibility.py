@@ -11,7 +11,7 @@ from datetime import date
 from pathlib import Path
 
 from abbe.drivers.links.urls import FixtureConsoleUrl, parse_url
-from abbe.service.campaigns.builtin_recipes import campaign_plan, recipe_plan
+from abbe.service.campaigns.builtin_recipes import campaign_source, recipe_plan
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, ConfigError
@@ -75,7 +75,9 @@ def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
     for entry in config.schedule:
         found += _lines(entry, site, lambda entry=entry: recipe_plan(entry.recipe, site.machine))  # type: ignore[misc]
         if entry.on_alarm == "propose":
-            found += _lines(entry, site, lambda: paced(campaign_plan(config.alarm.campaign, site.machine, folder), site.max_feed_mm_min))
+            found += _lines(
+                entry, site, lambda: paced(campaign_source(config.alarm.campaign, folder).plan(site.machine), site.max_feed_mm_min)
+            )
     return list(dict.fromkeys(found))
 
 

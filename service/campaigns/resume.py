@@ -10,6 +10,7 @@ from typing import Any
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.flags import beam_is_good, is_zeroed
+from abbe.service.campaigns.builtin_recipes import RecipeSource
 from abbe.service.campaigns.campaign_run import (
     Confirm,
     Item,
@@ -72,8 +73,8 @@ def read_journal(store: Store, campaign: CampaignRecord) -> Lines:
     return Lines(begun[-1], ended, hand, {int(one.doc["run"]): one.doc for one in found if one.kind == RUN})
 
 
-def begun_source(store: Store, name: str) -> Doc:
-    """What the plan of a campaign was made of that was broken off.
+def begun_source(store: Store, name: str) -> RecipeSource:
+    """Return what the plan of an interrupted campaign was made from.
 
     Raises
     ------
@@ -83,7 +84,7 @@ def begun_source(store: Store, name: str) -> Doc:
     source: Doc = read_journal(store, store.campaign(name)).begun.get("source") or {}
     if "recipe" not in source:
         raise PreconditionsChanged(f"the journal of campaign {name!r} does not name its recipe", "give it: --recipe FILE.toml (or --helix)")
-    return source
+    return RecipeSource(**source)
 
 
 async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan, name: str, confirm: Confirm) -> Resumed:

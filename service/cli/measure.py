@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from abbe.models.machine import Machine
+    from abbe.service.campaigns.builtin_recipes import RecipeSource
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import MachineFile
     from abbe.service.devices.session import Session
@@ -49,6 +48,7 @@ def measure(  # noqa: PLR0913 - one argument for each option
     accept_table: AcceptTable = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
+    from abbe.service.campaigns.resume import begun_source
     from abbe.service.cli.rehearse import Rehearsal
     from abbe.service.cli.running import run_job
     from abbe.service.clock import SystemClock
@@ -66,8 +66,8 @@ def measure(  # noqa: PLR0913 - one argument for each option
     if resume:
         with Store.open(loaded.database_url) as store:
             store.campaign(resume)
-            source = source if recipe or helix else _begun(store, resume)
-    plan = _plan(site.machine, source)
+            source = source if recipe or helix else begun_source(store, resume)
+    plan = source.plan(site.machine)
     title = resume or name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}"
     plan = replace(paced(plan, site.max_feed_mm_min), name=title)
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
@@ -83,8 +83,8 @@ def measure(  # noqa: PLR0913 - one argument for each option
     with Store.open(loaded.database_url) as store:
         run_job(_measured(store, site, plan, control, source, by_hand), control)
         typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
-        if source["recipe"] in CHECKS and not source["helix"]:
-            typer.echo(_check(store, loaded.machine, plan.name, str(source["recipe"]), begun_s))
+        if source.recipe in CHECKS and not source.helix:
+            typer.echo(_check(store, loaded.machine, plan.name, source.recipe, begun_s))
 
 
 CHECKS = ("quick-check", "verification")
@@ -140,7 +140,7 @@ class ByHand:
     accept_table: bool
 
 
-async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: dict[str, Any], said: ByHand) -> None:
+async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: RecipeSource, said: ByHand) -> None:
     """The measurement itself, from the beginning or from where it was broken off."""
     from abbe.service.campaigns.measure import Manner
     from abbe.service.campaigns.measure import measure as work
@@ -163,19 +163,13 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
             await work(session, store, site, plan, progress=sink, manner=Manner(control, confirm, source, found))
 
 
-def _source(recipe: str, helix: str, rate_hz: int) -> dict[str, Any]:
-    """What a plan is made of; a recipe file's text with it, so that nobody needs the file to go on."""
+def _source(recipe: str, helix: str, rate_hz: int) -> RecipeSource:
+    """What a plan is made from; a recipe file's text with it, so that a resumed campaign does not need the file."""
+    from abbe.service.campaigns.builtin_recipes import RecipeSource
     from abbe.service.sequences.recipes.recipe_file import recipe_source
 
     text = recipe_source(Path(recipe)) if recipe.endswith(".toml") else None
-    return {"recipe": recipe or "quick-check", "helix": helix, "rate_hz": rate_hz, "text": text}
-
-
-def _begun(store: Store, campaign: str) -> dict[str, Any]:
-    """What the plan of a campaign was made of that was broken off."""
-    from abbe.service.campaigns.resume import begun_source
-
-    return begun_source(store, campaign)
+    return RecipeSource(recipe=recipe or "quick-check", helix=helix, rate_hz=rate_hz, text=text)
 
 
 def correct(
@@ -283,33 +277,3 @@ def warn_of_open_push(url: str, site: Site) -> None:
         said = open_pushes(store, site.name, site.control)
     for line in said:
         typer.echo(f"warning: {line}", err=True)
-
-
-def _plan(machine: Machine, source: dict[str, Any]) -> CampaignPlan:
-    """The campaign, named after its recipe."""
-    from abbe.service.errors import ConfigError
-    from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification
-    from abbe.service.sequences.recipes.recipe import Helix
-    from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_text
-    from abbe.service.sequences.steps import CampaignPlan
-
-    recipe, helix, rate_hz = str(source["recipe"]), str(source["helix"]), int(source["rate_hz"])
-    if rate_hz < 1 or 1000 % rate_hz:
-        raise ConfigError(f"rate {rate_hz} Hz does not divide 1000", "use 1000, 500, 250, 200, 125, 100, 50 ...")
-    if helix:
-        try:
-            x, y, z, radius = numbers = tuple(float(v) for v in helix.split(","))
-            if not all(map(math.isfinite, numbers)):
-                raise ValueError(helix)
-        except ValueError:
-            raise ConfigError(f"--helix {helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
-        wanted = Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=rate_hz)
-        recipe_text("helix", (wanted,))  # what no recipe file may say is refused here, too
-        return CampaignPlan("helix", (wanted.plan(machine),))
-    plans = {"identification": identification, "verification": verification, "quick-check": quick_check}
-    if source.get("text") is not None:
-        name, recipes = parse_recipe(str(source["text"]), recipe)
-        return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
-    if recipe not in plans:
-        raise ConfigError(f"there is no recipe {recipe!r}", f"use one of: {RECIPES}, or a FILE.toml")
-    return plans[recipe](machine, rate_hz=rate_hz, name=recipe)

@@ -7,12 +7,9 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 from abbe.models.compensation.tables import Predicted
-from abbe.models.machine import Machine
-from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, USUAL_HZ, parted
+from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, USUAL_HZ, RecipeSource, parted
 from abbe.service.campaigns.measure import Manner, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates
 from abbe.service.compensation.gate import check_promise
@@ -26,9 +23,6 @@ from abbe.service.jobs.investigate import NO, InvestigationContext, made_of, pro
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.needed import check_devices, needed_by
-from abbe.service.sequences.recipes.campaigns import identification
-from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_source
-from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.tables.base_table import read_base
 
 SOLVING = "all is measured, and nothing moves while it is solved"
@@ -40,32 +34,12 @@ def is_full(recipe: str, names: tuple[str, ...]) -> bool:
     return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
 
 
-def full_campaign(recipe: str, machine: Machine, folder: Path) -> tuple[CampaignPlan, dict[str, Any]]:
-    """The plan of ``identification`` or of a recipe file of a folder, and what `abbe measure --resume` can make it from again.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, or is no recipe.
-    """
-    name, rate_hz = parted(recipe)
-    if name == IDENTIFICATION:
-        return identification(machine, rate_hz=rate_hz, name=recipe), _source(name, rate_hz)
-    text = recipe_source(folder / recipe)
-    _, recipes = parse_recipe(text, recipe)
-    return CampaignPlan(recipe, tuple(r.plan(machine) for r in recipes)), _source(recipe, USUAL_HZ, text)
-
-
-def _source(recipe: str, rate_hz: int, text: str | None = None) -> dict[str, Any]:
-    return {"recipe": recipe, "helix": "", "rate_hz": rate_hz, "text": text}
-
-
-async def run_guided_campaign(context: InvestigationContext, source: dict[str, Any], by: str) -> JobOutcome:
-    """Measure the bench's plan under its name, solve it and propose; whoever mounts at a console is asked by ``bench.control.prompts``.
+async def run_guided_campaign(context: InvestigationContext, source: RecipeSource, by: str) -> JobOutcome:
+    """Measure the plan under its name, solve it and propose. ``context.control.prompts`` asks a person at the console to mount.
 
     Parameters
     ----------
-    source : dict
+    source : RecipeSource
         What the plan can be made from again.
     by : str
         Who proposes: where two people are needed another one has to approve.
@@ -97,7 +71,7 @@ async def run_guided_campaign(context: InvestigationContext, source: dict[str, A
         raise
 
 
-async def _measured(context: InvestigationContext, source: dict[str, Any]) -> None:
+async def _measured(context: InvestigationContext, source: RecipeSource) -> None:
     site, store, name = context.site, context.store, context.plan.name
     plan = paced(context.plan, site.max_feed_mm_min)
     prompted = _PromptedPerson(context.control)

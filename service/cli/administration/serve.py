@@ -71,7 +71,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: better now than at
         the first slot, at night.
     """
-    from abbe.service.campaigns.builtin_recipes import RECIPES, campaign_plan
+    from abbe.service.campaigns.builtin_recipes import RECIPES, campaign_source
     from abbe.service.campaigns.plausibility import check_plausibility, check_unattended
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
@@ -98,7 +98,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
 
     plan, folder = CampaignPlan("", ()), loaded.path.resolve().parent
     if any(entry.on_alarm == "propose" for entry in config.schedule):
-        plan = paced(campaign_plan(config.alarm.campaign, site.machine, folder), site.max_feed_mm_min)
+        plan = paced(campaign_source(config.alarm.campaign, folder).plan(site.machine), site.max_feed_mm_min)
         dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     return ServiceSetup(
         machine=config.name,
@@ -216,13 +216,15 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore]
 
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[ServiceStore], MeasureCampaign]:
     """Return how a full campaign is measured that a person starts, given the service's store."""
+    from abbe.service.campaigns.builtin_recipes import campaign_source
     from abbe.service.clock import SystemClock
-    from abbe.service.jobs.guided_campaign import full_campaign, named_now, run_guided_campaign
+    from abbe.service.jobs.guided_campaign import named_now, run_guided_campaign
     from abbe.service.jobs.investigate import InvestigationContext
 
     def on(store: ServiceStore) -> MeasureCampaign:
         async def measure(order: CampaignOrder) -> JobOutcome:
-            plan, source = full_campaign(order.recipe, site.machine, folder)
+            source = campaign_source(order.recipe, folder)
+            plan = source.plan(site.machine)
             context = named_now(InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live), order.recipe)
             return await run_guided_campaign(context, source, order.by)
 
@@ -233,13 +235,12 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
 
 def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
     """The full campaigns that can be started on this machine: the shipped one, and what the machine file names for alarms."""
-    from abbe.service.campaigns.builtin_recipes import IDENTIFICATION
-    from abbe.service.jobs.guided_campaign import full_campaign
+    from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, campaign_source
     from abbe.service.sequences.check import dry_run_campaign, paced
 
     def fits(name: str) -> bool:
         try:
-            plan = paced(full_campaign(name, site.machine, folder)[0], site.max_feed_mm_min)
+            plan = paced(campaign_source(name, folder).plan(site.machine), site.max_feed_mm_min)
             dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
         except AbbeError:
             return False
