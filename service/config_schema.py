@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections import Counter
 from datetime import date
 from typing import Annotated, Literal, Self
@@ -263,8 +264,8 @@ class OpcUa(Section):
         default="", description="of this server, PEM file (relative to the machine file's folder); empty: not encrypted"
     )
     key: str = Field(default="", description="private key of the certificate, PEM file")
-    clients: list[str] = Field(
-        default_factory=list,
+    clients: tuple[str, ...] = Field(
+        default=(),
         description="certificates of the programs that may read, PEM or DER files; without any: every program on this computer",
     )
 
@@ -273,6 +274,19 @@ class OpcUa(Section):
         if bool(self.certificate) != bool(self.key):
             raise ValueError("certificate and key belong together, expected both or none")
         return self
+
+    @property
+    def exposed(self) -> bool:
+        """Whether other computers can reach it: then encryption, and a certificate known here, are required of every client."""
+        try:
+            return not ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host != "localhost"
+
+    @property
+    def guarded(self) -> bool:
+        """Whether only those with a known certificate may read."""
+        return self.exposed or bool(self.clients)
 
 
 def _public_key(text: str) -> str:

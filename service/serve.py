@@ -108,13 +108,13 @@ class Service:
         begin = self._begin((*recipes, *self._jobs.full.names))
         self._web = WebProcess(begin, listening, snapshots.now, self._jobs, clock, setup.live, orders)
         self._opcua = self._make_opcua()
-        doc = {"host": setup.host, "port": listening.getsockname()[1]}
+        doc = {"host": setup.web.host, "port": listening.getsockname()[1]}
         book.write(AuditEvent(who=this_account(), action="abbe serve", target=setup.machine, outcome="begun", doc=doc))
 
     def _begin(self, recipes: tuple[str, ...]) -> Begin:
         setup = self._setup
         broker = "" if setup.broker is None else str(setup.broker)
-        hosts = (*LOCAL, *setup.names, *(() if setup.host in EVERYWHERE else (setup.host,)))
+        hosts = (*LOCAL, *setup.web.names, *(() if setup.web.host in EVERYWHERE else (setup.web.host,)))
         return Begin(
             "begin",
             PROTOCOL,
@@ -123,16 +123,16 @@ class Service:
             setup.store_url,
             broker,
             hosts,
-            setup.certificate,
-            setup.key,
+            setup.web.certificate,
+            setup.web.key,
             recipes,
             self._listening.getsockname()[1],
-            setup.behind_tls,
+            setup.web.behind_tls,
             tuple(setup.schedules),
             RulesSummary(**asdict(setup.rules)),
-            setup.told,
+            setup.summary,
             self._jobs.full.names,
-            setup.page_memory_mb,
+            setup.web.memory_mb,
             setup.control,
         )
 
@@ -292,17 +292,17 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
     for number in (signal.SIGTERM, signal.SIGINT):
         # signal.signal rather than add_signal_handler: it works on Windows too, and the loop is woken either way.
         signal.signal(number, from_any_thread)
-    reach = partial(check_exposure, tls=bool(setup.certificate), names=setup.names, behind_tls=setup.behind_tls)
-    await asyncio.to_thread(reach, setup.host, lambda: _admins(setup.store_url))
-    check_certificate(setup.certificate, setup.key)
-    listening = bind(setup.host, setup.port)
+    reach = partial(check_exposure, tls=bool(setup.web.certificate), names=setup.web.names, behind_tls=setup.web.behind_tls)
+    await asyncio.to_thread(reach, setup.web.host, lambda: _admins(setup.store_url))
+    check_certificate(setup.web.certificate, setup.web.key)
+    listening = bind(setup.web.host, setup.web.port)
     try:
         store = await asyncio.to_thread(ServiceStore.open, setup.store_url)
         if words := database_seen_by_others(setup.store_url):
             log.warning("database", text=words)
         try:
             host, port = listening.getsockname()[:2]
-            scheme = "https" if setup.certificate else "http"
+            scheme = "https" if setup.web.certificate else "http"
             for line in setup.warnings:
                 log.warning("machine file", text=line)
             log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)

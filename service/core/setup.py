@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from abbe.service.capture.live import LiveFeed
-from abbe.service.channel.messages import PAGE_MEMORY_MB, MachineSummary
+from abbe.service.channel.messages import MachineSummary
 from abbe.service.clock import Clock
+from abbe.service.config_schema import OpcUa, Web
 from abbe.service.core.orders import MeasureCampaign, OrderActions
 from abbe.service.core.push_recovery import Recover
 from abbe.service.devices.urls import control_of
 from abbe.service.domain.schedule import Schedule, Window
 from abbe.service.mqtt.broker import Broker
 from abbe.service.mqtt.topics import Topics
-from abbe.service.plant.opcua.setup import OpcUaSetup
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.alarm_manager import Duties
 from abbe.service.scheduler.ports import Check, Readiness
@@ -41,29 +41,23 @@ class ServiceSetup:
     store_url : str
         Where everything is kept.
     broker : Broker or None
-        Where everything is told.
+        Where results are published.
     topics : Topics
         Under which names.
-    host, port : str, int
-        Where the page is.
+    web : Web
+        Where the page is served, to whom, with which certificate: the section of the machine file, its files with their whole paths.
     check : callable
         Given the open store, returns ``check(recipe, progress)``.
     maintenance : tuple of Window
         Nothing starts by itself in these.
     ready : callable
         Given the clock, returns who knows the preconditions.
-    names : tuple of str
-        Under which other computers ask for the page.
-    certificate, key : str
-        PEM files of the page; empty: plain HTTP.
-    opcua : OpcUaSetup or None
+    opcua : OpcUa or None
         Where OPC UA clients may read; checked.
     recipes : tuple of str
         What a person may start at any time, besides those of the timetable.
     recover : callable, optional
         Given the open store, returns how what an earlier end has left open is closed.
-    behind_tls : bool
-        A reverse proxy on this computer takes off the TLS.
     rules : Rules
         Limits, certificates and temperatures that reports add to the data.
     duties : callable, optional
@@ -72,12 +66,10 @@ class ServiceSetup:
         Given the open store, how the table in force is looked at; None: nobody watches it.
     live : LiveFeed, optional
         What ``check`` shows of its paths, for the page.
-    told : MachineTold, optional
+    summary : MachineSummary, optional
         What the page calculates dry runs from.
     actions : callable, optional
         Given the open store, what a person can order of tables; None: nothing.
-    page_memory_mb : int
-        Most that the page's process gets, MiB.
     campaigns : tuple of str
         Full campaigns that a person may start, if ``campaign`` is there.
     campaign : callable, optional
@@ -91,25 +83,19 @@ class ServiceSetup:
     store_url: str
     broker: Broker | None
     topics: Topics
-    host: str
-    port: int
+    web: Web
     check: Callable[[ServiceStore], Check]
     maintenance: tuple[Window, ...] = ()
     ready: Callable[[Clock], Readiness] = lambda _: AlwaysReady()
-    names: tuple[str, ...] = ()
-    certificate: str = ""
-    key: str = ""
-    opcua: OpcUaSetup | None = None
+    opcua: OpcUa | None = None
     recipes: tuple[str, ...] = ()
     recover: Callable[[ServiceStore], Recover] | None = None
-    behind_tls: bool = False
     rules: Rules = field(default_factory=Rules)
     duties: Callable[[ServiceStore], Duties] | None = None
     table: Callable[[ServiceStore], LookAtTable] | None = None
     live: LiveFeed | None = None
-    told: MachineSummary | None = None
+    summary: MachineSummary | None = None
     actions: Callable[[ServiceStore], OrderActions] | None = None
-    page_memory_mb: int = PAGE_MEMORY_MB
     campaigns: tuple[str, ...] = ()
     campaign: Callable[[ServiceStore], MeasureCampaign] | None = None
     warnings: tuple[str, ...] = ()

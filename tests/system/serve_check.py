@@ -14,13 +14,13 @@ from typing import Any
 
 import aiomqtt
 
+from abbe.service.config_schema import OpcUa, Web
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.broker import parse
 from abbe.service.mqtt.topics import Topics
-from abbe.service.plant.opcua.setup import OpcUaSetup
 from abbe.service.sequences.control import Control, State
 from abbe.service.serve import serve
 
@@ -85,10 +85,9 @@ def main() -> int:
             given["store"],
             broker,
             topics,
-            "127.0.0.1",
-            given["port"],
+            Web(port=given["port"]),
             lambda _: check,
-            opcua=OpcUaSetup(port=given["opcua"]) if "opcua" in given else None,
+            opcua=OpcUa(port=given["opcua"]) if "opcua" in given else None,
         )
     )
 

@@ -17,6 +17,7 @@ from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.compensation.push_approved import Approved, PushOrder
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
+from abbe.service.config_schema import Web
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
@@ -106,7 +107,7 @@ def main() -> int:
     yearly = Schedule("yearly", "0 0 1 1 *", "UTC", "quick-check")
     return serve(
         ServiceSetup(
-            "sim", site.doc, {"cnc": ready["cnc"]}, (yearly,), given["store"], None, Topics("plant/abbe", "sim"), "127.0.0.1", 0,
+            "sim", site.doc, {"cnc": ready["cnc"]}, (yearly,), given["store"], None, Topics("plant/abbe", "sim"), Web(port=0),
             lambda _: None, recover=lambda store: lambda: recover_at_start(store, site), duties=duties_on(site, given["last"]),
         )
     )  # fmt: skip

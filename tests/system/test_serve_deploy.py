@@ -30,7 +30,7 @@ def test_the_example_is_a_complete_machine_file() -> None:
     assert [schedule.name for schedule in setup.schedules] == ["weekly"]
     assert set(setup.devices) == {"ballbar", "laser", "cnc", "fixture"}
     assert setup.broker is not None
-    assert setup.host == "127.0.0.1"
+    assert setup.web.host == "127.0.0.1"
 
 
 def test_the_unit_is_valid(unit: Path) -> None:
@@ -49,7 +49,7 @@ def test_the_page_s_memory_leaves_the_core_half_of_the_unit_s() -> None:
     text = (DEPLOY / "abbe.service").read_text()
     most = re.search(r"(?m)^MemoryMax=(\d+)G$", text)
     assert most is not None
-    assert setup_of(load_machine(DEPLOY / "machine.example.toml")).page_memory_mb <= int(most[1]) * 1024 / 2
+    assert setup_of(load_machine(DEPLOY / "machine.example.toml")).web.memory_mb <= int(most[1]) * 1024 / 2
     assert re.search(r"(?m)^OOMPolicy=continue$", text)
     assert f"mem_limit: {most[1]}g" in (DEPLOY / "compose.yaml").read_text()
 

@@ -17,14 +17,13 @@ if TYPE_CHECKING:
     from abbe.service.compensation.ordered_rollback import BackOrder
     from abbe.service.compensation.push_approved import PushOrder
     from abbe.service.config import LoadedMachine
-    from abbe.service.config_schema import AlarmSection
+    from abbe.service.config_schema import AlarmSection, OpcUa, Web
     from abbe.service.core.orders import CampaignOrder, MeasureCampaign, OrderActions
     from abbe.service.core.setup import ServiceSetup
     from abbe.service.domain.job_state import JobOutcome
     from abbe.service.domain.progress import ProgressSink
     from abbe.service.jobs.investigate import Note
     from abbe.service.mqtt.broker import Broker
-    from abbe.service.plant.opcua.setup import OpcUaSetup
     from abbe.service.scheduler.alarm_manager import Duties
     from abbe.service.scheduler.ports import Check, CheckResult
     from abbe.service.scheduler.store import ServiceStore
@@ -108,24 +107,18 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         store_url=loaded.database_url,
         broker=_broker(loaded),
         topics=Topics(config.mqtt.topic_prefix, config.name),
-        host=config.web.host,
-        port=config.web.port if port is None else port,
+        web=_web(loaded, port),
         check=check_on,
         maintenance=tuple(config.maintenance),
         ready=lambda clock: Ready(look_at(site.urls), config.schedule, site.temperature_c, config.staffed, clock),
-        names=tuple(config.web.names),
-        certificate=_beside(loaded.path, config.web.certificate),
-        key=_beside(loaded.path, config.web.key),
         opcua=_opcua(loaded),
         recipes=tuple(name for name in sorted(RECIPES) if _fits(name, site)),
         recover=lambda store: lambda: recover_at_start(store, site),
-        behind_tls=config.web.behind_tls,
-        page_memory_mb=config.web.memory_mb,
         rules=rules_of(config),
         duties=duties_on(config.alarm, site, plan, live=live),
         table=(lambda store: look_at_table(site, store)) if config.alarm.watch_table else None,
         live=live,
-        told=_told(site),
+        summary=_summary(site),
         actions=None if site.urls.cnc is None else order_actions_on(config.alarm, site),
         campaigns=_campaigns(config.alarm.campaign, site, folder),
         campaign=None if site.urls.cnc is None else campaign_on(site, folder, live),
@@ -133,7 +126,13 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     )
 
 
-def _told(site: Site) -> MachineSummary:
+def _web(loaded: LoadedMachine, port: int | None) -> Web:
+    web = loaded.machine.web
+    files = {"certificate": _beside(loaded.path, web.certificate), "key": _beside(loaded.path, web.key)}
+    return web.model_copy(update=files if port is None else files | {"port": port})
+
+
+def _summary(site: Site) -> MachineSummary:
     from abbe.service.channel.messages import MachineSummary
 
     doc = site.doc
@@ -157,15 +156,16 @@ def _broker(loaded: LoadedMachine) -> Broker | None:
     return broker
 
 
-def _opcua(loaded: LoadedMachine) -> OpcUaSetup | None:
-    from abbe.service.plant.opcua.setup import OpcUaSetup
+def _opcua(loaded: LoadedMachine) -> OpcUa | None:
+    from abbe.service.plant.opcua.setup import check_opcua
 
     given = loaded.machine.opcua
     if not given.enabled:
         return None
     clients = tuple(_beside(loaded.path, name) for name in given.clients)
-    setup = OpcUaSetup(given.host, given.port, _beside(loaded.path, given.certificate), _beside(loaded.path, given.key), clients)
-    setup.check()
+    files = {"certificate": _beside(loaded.path, given.certificate), "key": _beside(loaded.path, given.key), "clients": clients}
+    setup = given.model_copy(update=files)
+    check_opcua(setup)
     return setup
 
 

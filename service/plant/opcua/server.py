@@ -13,11 +13,12 @@ from asyncua import Server, ua
 from asyncua.common.connection import TransportLimits
 
 from abbe.service.clock import Clock
+from abbe.service.config_schema import OpcUa
 from abbe.service.errors import ConfigError, StoreError
 from abbe.service.plant.facts import FactsSource
 from abbe.service.plant.opcua.picture import picture_of
 from abbe.service.plant.opcua.readonly import ReadOnlyServer, seal
-from abbe.service.plant.opcua.setup import OpcUaSetup, trusted
+from abbe.service.plant.opcua.setup import trusted
 from abbe.service.plant.opcua.space import NAMESPACE, Space
 
 log = structlog.get_logger("abbe.opcua")
@@ -33,8 +34,8 @@ class OpcUaServer:
 
     Parameters
     ----------
-    setup : OpcUaSetup
-        Where to listen, who may read; checked (`OpcUaSetup.check`).
+    setup : OpcUa
+        Where to listen, who may read; checked (`abbe.service.plant.opcua.setup.check_opcua`).
     source : FactsSource
         What is shown.
     clock : Clock
@@ -43,7 +44,7 @@ class OpcUaServer:
         Name of the machine; version of this program.
     """
 
-    def __init__(self, setup: OpcUaSetup, source: FactsSource, clock: Clock, machine: str, version: str) -> None:
+    def __init__(self, setup: OpcUa, source: FactsSource, clock: Clock, machine: str, version: str) -> None:
         self._setup, self._source, self._clock = setup, source, clock
         self._machine, self._version = machine, version
         self.port = 0

@@ -7,7 +7,6 @@ import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from copy import copy
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,10 +22,11 @@ from asyncua.server.standard_address_space import standard_address_space
 from asyncua.ua.uaerrors import UaStatusCodeError
 
 from abbe.service.clock import SystemClock
+from abbe.service.config_schema import OpcUa
 from abbe.service.errors import ConfigError
 from abbe.service.plant.opcua import server as served
 from abbe.service.plant.opcua.server import OpcUaServer
-from abbe.service.plant.opcua.setup import OpcUaSetup
+from abbe.service.plant.opcua.setup import check_opcua
 from tests.certificates import Signed, issued
 from tests.service.plant.facts_for_tests import RUNNING, Source, check, facts
 
@@ -35,7 +35,7 @@ CLIENT_URI = "urn:plant:scada"
 
 
 @asynccontextmanager
-async def running(setup: OpcUaSetup, source: Source) -> AsyncIterator[OpcUaServer]:
+async def running(setup: OpcUa, source: Source) -> AsyncIterator[OpcUaServer]:
     stop = asyncio.Event()
     part = OpcUaServer(setup, source, SystemClock(), "mill-7", "0.1.0")
     task = asyncio.create_task(part.run(stop))
@@ -118,7 +118,7 @@ class Turned:
 
 
 async def test_what_is_shown_follows_the_facts(source: Source) -> None:
-    async with running(OpcUaSetup(port=0), source) as part, client_of(part) as client:
+    async with running(OpcUa(port=0), source) as part, client_of(part) as client:
         assert await value(client, "State") == "idle"
         assert (await value(client, "LastResult/Verdict"), await value(client, "LastResult/Number")) == ("fail", 2)
         figure = client.get_node(f"{BASE}/LastResult/Figures/body_diagonal_um")
@@ -182,7 +182,7 @@ async def every_node(client: Client) -> list[tuple[ua.NodeId, ua.NodeClass]]:
 
 
 async def test_no_node_can_be_written_and_no_method_called(source: Source) -> None:
-    async with running(OpcUaSetup(port=0), source) as part, client_of(part) as client:
+    async with running(OpcUa(port=0), source) as part, client_of(part) as client:
         nodes = await every_node(client)
         ours = [nodeid for nodeid, _ in nodes if nodeid.NamespaceIndex == 2]
         assert len(ours) > 60
@@ -219,7 +219,7 @@ async def test_no_node_can_be_written_and_no_method_called(source: Source) -> No
 
 
 async def test_nothing_can_be_added_or_removed_or_registered_and_nobody_logs_in_by_name(source: Source) -> None:
-    async with running(OpcUaSetup(port=0), source) as part, client_of(part) as client:
+    async with running(OpcUa(port=0), source) as part, client_of(part) as client:
         named = client_of(part)
         named.set_user("admin")
         named.set_password("admin")
@@ -253,10 +253,10 @@ def scada(tmp_path: Path) -> Signed:
 
 
 @pytest.fixture
-def guarded(tmp_path: Path, scada: Signed) -> OpcUaSetup:
+def guarded(tmp_path: Path, scada: Signed) -> OpcUa:
     own = issued(tmp_path, "abbe", None, addresses=("127.0.0.1",), uri="urn:abbe:mill-7")
-    setup = OpcUaSetup("127.0.0.1", 0, str(own.pem), str(own.key_pem), (str(scada.pem),))
-    setup.check()
+    setup = OpcUa(host="127.0.0.1", port=0, certificate=str(own.pem), key=str(own.key_pem), clients=(str(scada.pem),))
+    check_opcua(setup)
     return setup
 
 
@@ -270,7 +270,7 @@ async def encrypted(part: OpcUaServer, channel: Signed, user: Signed | None, own
     return client
 
 
-async def test_a_known_client_reads_encrypted(source: Source, guarded: OpcUaSetup, scada: Signed) -> None:
+async def test_a_known_client_reads_encrypted(source: Source, guarded: OpcUa, scada: Signed) -> None:
     async with running(guarded, source) as part:
         client = await encrypted(part, scada, scada, guarded.certificate)
         async with client:
@@ -284,10 +284,10 @@ async def test_a_known_client_reads_encrypted(source: Source, guarded: OpcUaSetu
         ]
 
 
-async def test_everybody_else_is_refused(tmp_path: Path, source: Source, guarded: OpcUaSetup, scada: Signed) -> None:
+async def test_everybody_else_is_refused(tmp_path: Path, source: Source, guarded: OpcUa, scada: Signed) -> None:
     stranger = issued(tmp_path, "stranger", None, uri=CLIENT_URI)
     old = issued(tmp_path, "old", None, uri=CLIENT_URI, days=(-30, -1))
-    setup = replace(guarded, clients=(*guarded.clients, str(old.pem)))
+    setup = guarded.model_copy(update={"clients": (*guarded.clients, str(old.pem))})
     async with running(setup, source) as part:
         own = setup.certificate
         in_clear = client_of(part)
@@ -321,29 +321,29 @@ async def test_everybody_else_is_refused(tmp_path: Path, source: Source, guarded
 @pytest.mark.parametrize(
     ("setup", "words"),
     [
-        (OpcUaSetup("0.0.0.0"), "needs certificate, key and clients"),
-        (OpcUaSetup("192.0.2.7", 4840, "c.pem", "k.pem"), "needs certificate, key and clients"),
-        (OpcUaSetup("plant.example", 4840), "needs certificate, key and clients"),
-        (OpcUaSetup(clients=("x.pem",)), "needs certificate"),
-        (OpcUaSetup(certificate="gone.pem", key="gone.key"), "no such file"),
-        (OpcUaSetup("0.0.0.0", 4840, "c.pem", "k.pem", ("gone.pem",)), "clients: gone.pem"),
+        (OpcUa(host="0.0.0.0"), "needs certificate, key and clients"),
+        (OpcUa(host="192.0.2.7", port=4840, certificate="c.pem", key="k.pem"), "needs certificate, key and clients"),
+        (OpcUa(host="plant.example", port=4840), "needs certificate, key and clients"),
+        (OpcUa(clients=("x.pem",)), "needs certificate"),
+        (OpcUa(certificate="gone.pem", key="gone.key"), "no such file"),
+        (OpcUa(host="0.0.0.0", port=4840, certificate="c.pem", key="k.pem", clients=("gone.pem",)), "clients: gone.pem"),
     ],
 )
-def test_an_exposed_server_needs_to_know_its_clients(setup: OpcUaSetup, words: str) -> None:
+def test_an_exposed_server_needs_to_know_its_clients(setup: OpcUa, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        setup.check()
+        check_opcua(setup)
 
 
 def test_a_client_that_is_no_certificate(tmp_path: Path) -> None:
     (tmp_path / "x.pem").write_text("-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n")
     with pytest.raises(ConfigError, match="is no certificate"):
-        OpcUaSetup("0.0.0.0", 4840, "c.pem", "k.pem", (str(tmp_path / "x.pem"),)).check()
+        check_opcua(OpcUa(host="0.0.0.0", port=4840, certificate="c.pem", key="k.pem", clients=(str(tmp_path / "x.pem"),)))
 
 
 def test_without_the_extra_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"needs the package 'asyncua' - pip install 'abbe\[opcua\]'"):
-        OpcUaSetup().check()
+        check_opcua(OpcUa())
 
 
 class Paced(SystemClock):
@@ -360,7 +360,7 @@ class Paced(SystemClock):
 async def test_a_port_that_somebody_has_is_tried_again(source: Source) -> None:
     clock, stop = Paced(), asyncio.Event()
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        part = OpcUaServer(OpcUaSetup(port=int(taken.getsockname()[1])), source, clock, "mill-7", "0.1.0")
+        part = OpcUaServer(OpcUa(port=int(taken.getsockname()[1])), source, clock, "mill-7", "0.1.0")
         task = asyncio.create_task(part.run(stop))
         async with asyncio.timeout(within(30)):
             assert [await clock.pauses.get(), await clock.pauses.get()] == [served.AGAIN_S, served.AGAIN_S]
