@@ -19,6 +19,16 @@ class CheckFailure:
     device: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class CheckFigure:
+    """One figure of a check, in the unit at the end of its name. ``expanded``: its uncertainty, k = 2; None: not known."""
+
+    name: str
+    value: float | None
+    expanded: float | None
+    limit: float | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verification:
     """One check. Figures end in their unit; uncertainties are expanded, k = 2. ``push``: the one that it decided on, 0 for none."""
@@ -39,3 +49,9 @@ class Verification:
     text: str
     cause: CheckFailure | None = None
     push: int = 0
+
+    @property
+    def figures(self) -> tuple[CheckFigure, ...]:
+        """Its figures, in their order."""
+        found = self.values.items()
+        return tuple(CheckFigure(name, value, self.uncertainties.get(name), self.limits.get(name)) for name, value in found)

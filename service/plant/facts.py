@@ -1,4 +1,4 @@
-"""What the plant is told of the machine at one moment: the same for OPC UA and MTConnect."""
+"""What OPC UA and MTConnect show of the machine at one moment."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Protocol
 
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.progress import RunningCheck
+from abbe.service.domain.verification import Verification
+from abbe.service.verification.verified_by import VerifiedBy
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,31 +44,7 @@ def unit_of(key: str) -> Unit | None:
 
 
 @dataclass(frozen=True, slots=True)
-class PlantFigure:
-    """One figure of a check. ``expanded``: its uncertainty, k = 2. What is None is not known."""
-
-    key: str
-    value: float | None
-    expanded: float | None
-    limit: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One check that has ended."""
-
-    number: int
-    schedule: str
-    recipe: str
-    started_utc: datetime
-    duration_s: float
-    verdict: str
-    text: str
-    figures: tuple[PlantFigure, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Alarm:
+class PlantAlarm:
     """Something a person should look at."""
 
     code: str
@@ -86,36 +64,25 @@ class TableInForce:
 
 
 @dataclass(frozen=True, slots=True)
-class Verified:
-    """Which measurement stands behind the table in force: ``verified``, ``unverified`` or ``unknown``, and in words since what.
-
-    ``holds``: whether the verdict of the last check is of the table in force.
-    """
-
-    state: str
-    text: str
-    holds: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Facts:
-    """Everything at one moment; checks and alarms newest first. ``table``: None when the journal does not know."""
+    """Everything at one moment; checks and alarms newest first. ``table``: None when the journal does not know; ``verified``: which
+    measurement stands behind it, None: not known here."""
 
     machine: str
     version: str
     now_utc: datetime
     running: RunningCheck | None
     next_utc: datetime | None
-    checks: tuple[Check, ...]
-    alarms: tuple[Alarm, ...]
+    checks: tuple[Verification, ...]
+    alarms: tuple[PlantAlarm, ...]
     devices: tuple[DeviceStatus, ...]
     table: TableInForce | None = None
-    verified: Verified = Verified("unknown", "", True)
+    verified: VerifiedBy | None = None
 
     @property
     def verdict(self) -> str | None:
         """Of the last check, where it is of the table in force; else whether anything measured that table. None: no check yet."""
-        if not self.verified.holds:
+        if self.verified is not None and not self.verified.holds:
             return self.verified.state
         return self.checks[0].verdict if self.checks else None
 

@@ -9,7 +9,9 @@ from typing import Any, Protocol
 
 from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.service_records import SlotRecord
-from abbe.service.plant.facts import Alarm, Check, Facts, PlantFigure, TableInForce, Verified
+from abbe.service.domain.verification import CheckFailure, Verification
+from abbe.service.plant.facts import Facts, PlantAlarm, TableInForce
+from abbe.service.queries.status import Status
 
 SHOWN_ALARMS = 20
 _NOT_RUN = {"missed": "SCH-001", "skipped": "SCH-002", "interrupted": "SCH-007"}
@@ -33,15 +35,15 @@ class Gatherer:
     Parameters
     ----------
     status : callable
-        Gives what the status page shows (`abbe.service.web.schemas.Status`): machine, job, devices, next due and last checks.
+        Gives what the status page shows : machine, job, devices, next due and last checks.
     archive : Archive, optional
         Slots and pushes. Without it there are only the alarms of failed checks, and no table.
     """
 
-    def __init__(self, status: Callable[[], Awaitable[Any]], archive: Archive | None = None, control: str = "") -> None:
+    def __init__(self, status: Callable[[], Awaitable[Status]], archive: Archive | None = None, control: str = "") -> None:
         self._status, self._archive, self._control = status, archive, control
         self._revision = ""
-        self._slow: tuple[tuple[Alarm, ...], TableInForce | None] = ((), None)
+        self._slow: tuple[tuple[PlantAlarm, ...], TableInForce | None] = ((), None)
 
     async def facts(self) -> Facts:
         """Return the facts of this moment. Slots and pushes are read anew when the status has changed, or the minute.
@@ -56,7 +58,7 @@ class Gatherer:
         if self._archive is not None and revision != self._revision:
             self._slow = await asyncio.to_thread(self._read, self._archive, status.machine)
             self._revision = revision
-        failed = [_alarm_of(check) for check in status.last if check.cause is not None]
+        failed = [_alarm_of(check, check.cause) for check in status.last if check.cause is not None]
         alarms = sorted([*failed, *self._slow[0]], key=lambda alarm: alarm.at_utc, reverse=True)
         return Facts(
             machine=status.machine,
@@ -64,34 +66,27 @@ class Gatherer:
             now_utc=status.now_utc,
             running=status.job,
             next_utc=min((due.due_utc for due in status.next_due), default=None),
-            checks=tuple(_check(one) for one in status.last if not one.push or one.verdict == "pass"),  # else of a table not in force
+            checks=tuple(one for one in status.last if not one.push or one.verdict == "pass"),  # else of a table not in force
             alarms=tuple(alarms[:SHOWN_ALARMS]),
             devices=tuple(status.devices),
             table=self._slow[1],
-            verified=_verified(status.verified),
+            verified=status.verified,
         )
 
-    def _read(self, archive: Archive, machine: str) -> tuple[tuple[Alarm, ...], TableInForce | None]:
+    def _read(self, archive: Archive, machine: str) -> tuple[tuple[PlantAlarm, ...], TableInForce | None]:
         slots = archive.slots_not_run(machine, SHOWN_ALARMS)
         return tuple(_slot_alarm(slot) for slot in slots), table_in_force(archive.last_push(machine, self._control))
 
 
-def _verified(one: Any) -> Verified:
-    return Verified(one.state, one.text, one.why in ("check", "never"))
+def _alarm_of(check: Verification, cause: CheckFailure) -> PlantAlarm:
+    return PlantAlarm(cause.code, cause.what, check.started_utc, cause.device)
 
 
-def _check(one: Any) -> Check:
-    figures = (PlantFigure(key, value, one.uncertainties.get(key), one.limits.get(key)) for key, value in one.values.items())
-    return Check(one.id, one.schedule, one.recipe, one.started_utc, one.duration_s, one.verdict, one.text, tuple(figures))
-
-
-def _alarm_of(check: Any) -> Alarm:
-    return Alarm(check.cause.code, check.cause.what, check.started_utc, check.cause.device)
-
-
-def _slot_alarm(slot: SlotRecord) -> Alarm:
+def _slot_alarm(slot: SlotRecord) -> PlantAlarm:
     text = slot.reason or f"{slot.schedule}: slot {slot.slot_utc} was {slot.state}"
-    return Alarm(_NOT_RUN.get(slot.state.partition(":")[0], "SCH-001"), text, datetime.fromisoformat(slot.finished_utc or slot.claimed_utc))
+    return PlantAlarm(
+        _NOT_RUN.get(slot.state.partition(":")[0], "SCH-001"), text, datetime.fromisoformat(slot.finished_utc or slot.claimed_utc)
+    )
 
 
 def table_in_force(journal: Sequence[PushEntryRecord]) -> TableInForce | None:

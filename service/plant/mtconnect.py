@@ -13,7 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from abbe.service.plant.facts import Check, Facts
+from abbe.service.domain.verification import Verification
+from abbe.service.plant.facts import Facts
 
 VERSION = "1.8"
 BUFFER = 4096
@@ -77,15 +78,15 @@ class Agent:
         self._put("msg", now, f"{job.stage}: {job.message}" if job and job.stage else UNAVAILABLE)
         if not facts.checks:
             self._put("result", now, UNAVAILABLE)
-        for check in sorted(facts.checks[1:], key=lambda one: one.number):
-            if check.number > self._seen:
+        for check in sorted(facts.checks[1:], key=lambda one: one.id):
+            if check.id > self._seen:
                 self._put("result", now, _result(check, check.verdict))
         if facts.checks:  # an earlier table's verdict is none of the table in force
             self._put("result", now, _result(facts.checks[0], facts.verdict or ""))
-            self._seen = facts.checks[0].number
+            self._seen = facts.checks[0].id
         table = facts.table
         known = (("bank", str(table.bank)), ("crc32", f"{table.crc:08x}"), ("push", str(table.push))) if table else ()
-        told = (("verified", facts.verified.state), ("verified_text", facts.verified.text)) if facts.verified.text else ()
+        told = () if facts.verified is None else (("verified", facts.verified.state), ("verified_text", facts.verified.text))
         self._put("table", now, (*known, *told) if known else UNAVAILABLE)
         self._put("system", now, *_condition(facts))
 
@@ -190,20 +191,20 @@ def _write(parent: ET.Element, one: Observation) -> None:
         ET.SubElement(written, "Entry", key=_clean(key).replace(" ", "_")).text = _clean(value)
 
 
-def _result(check: Check, verdict: str) -> Entries:
+def _result(check: Verification, verdict: str) -> Entries:
     """Figures with their unit at the end of the key; beside each its expanded uncertainty (k = 2) and its limit."""
-    head = {"number": str(check.number), "verdict": verdict, "schedule": check.schedule, "recipe": check.recipe}
+    head = {"number": str(check.id), "verdict": verdict, "schedule": check.schedule, "recipe": check.recipe}
     for figure in check.figures:
-        three = {figure.key: figure.value, f"{figure.key}.expanded": figure.expanded, f"{figure.key}.limit": figure.limit}
+        three = {figure.name: figure.value, f"{figure.name}.expanded": figure.expanded, f"{figure.name}.limit": figure.limit}
         head |= {key: repr(float(value)) for key, value in three.items() if value is not None}
     return (*head.items(), ("started_utc", _stamp(check.started_utc)))
 
 
 def _condition(facts: Facts) -> tuple[str, str, str]:
     """Text, level and code of what the last check says of the machine."""
-    if not facts.verified.holds:
-        code = facts.verified.state
-        return ("", "Normal", "") if code == "verified" else (facts.verified.text, "Warning", code)
+    if facts.verified is not None and not facts.verified.holds:
+        state = facts.verified.state
+        return ("", "Normal", "") if state == "verified" else (facts.verified.text, "Warning", state)
     if not facts.checks:
         return "", "Unavailable", ""
     last = facts.checks[0]

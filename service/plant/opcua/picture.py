@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from abbe.service.plant.facts import Alarm, Check, Facts, Unit, unit_of
+from abbe.service.domain.verification import Verification
+from abbe.service.plant.facts import Facts, PlantAlarm, Unit, unit_of
 
 Value = str | bool | int | float | datetime | list[str] | list[datetime] | None
 Kind = Literal["text", "flag", "count", "real", "time", "texts", "times"]
@@ -57,10 +58,10 @@ def _running(facts: Facts) -> Picture:
     }
 
 
-def _last(check: Check | None, verdict: str | None) -> Picture:
+def _last(check: Verification | None, verdict: str | None) -> Picture:
     """The last check. Its verdict stands only where it is of the table in force."""
     out = {
-        "LastResult/Number": Leaf(check.number if check else None, "count"),
+        "LastResult/Number": Leaf(check.id if check else None, "count"),
         "LastResult/Verdict": Leaf(verdict, "text"),
         "LastResult/Text": Leaf(_short(check.text) if check else None, "text"),
         "LastResult/Schedule": Leaf(check.schedule if check else None, "text"),
@@ -69,28 +70,28 @@ def _last(check: Check | None, verdict: str | None) -> Picture:
         "LastResult/Duration": Leaf(check.duration_s if check else None, "real", unit_of("duration_s")),
     }
     for figure in check.figures if check else ():
-        unit = unit_of(figure.key)
-        out[f"LastResult/Figures/{figure.key}"] = Leaf(figure.value, "real", unit)
-        out[f"LastResult/Uncertainties/{figure.key}"] = Leaf(figure.expanded, "real", unit)
-        out[f"LastResult/Limits/{figure.key}"] = Leaf(figure.limit, "real", unit)
+        unit = unit_of(figure.name)
+        out[f"LastResult/Figures/{figure.name}"] = Leaf(figure.value, "real", unit)
+        out[f"LastResult/Uncertainties/{figure.name}"] = Leaf(figure.expanded, "real", unit)
+        out[f"LastResult/Limits/{figure.name}"] = Leaf(figure.limit, "real", unit)
     return out
 
 
-def _past(checks: tuple[Check, ...]) -> Picture:
+def _past(checks: tuple[Verification, ...]) -> Picture:
     shown = checks[:PAST_CHECKS]
     figures = [
-        json.dumps({figure.key: [figure.value, figure.expanded, figure.limit] for figure in check.figures}, allow_nan=False)
+        json.dumps({figure.name: [figure.value, figure.expanded, figure.limit] for figure in check.figures}, allow_nan=False)
         for check in shown
     ]
     return {
-        "Results/Numbers": Leaf([str(check.number) for check in shown], "texts"),
-        "Results/Verdicts": Leaf([check.verdict for check in shown], "texts"),
+        "Results/Numbers": Leaf([str(check.id) for check in shown], "texts"),
+        "Results/Verdicts": Leaf([str(check.verdict) for check in shown], "texts"),
         "Results/Started": Leaf([check.started_utc for check in shown], "times"),
         "Results/Figures": Leaf(figures, "texts"),
     }
 
 
-def _alarms(alarms: tuple[Alarm, ...]) -> Picture:
+def _alarms(alarms: tuple[PlantAlarm, ...]) -> Picture:
     return {
         "Alarms/Count": Leaf(len(alarms), "count"),
         "Alarms/Codes": Leaf([alarm.code for alarm in alarms], "texts"),
@@ -101,15 +102,15 @@ def _alarms(alarms: tuple[Alarm, ...]) -> Picture:
 
 
 def _table(facts: Facts) -> Picture:
-    table = facts.table
+    table, verified = facts.table, facts.verified
     return {
         "CompensationTable/Known": Leaf(table is not None, "flag"),
         "CompensationTable/Bank": Leaf(table.bank if table else None, "count"),
         "CompensationTable/Crc32": Leaf(f"{table.crc:08x}" if table else None, "text"),
         "CompensationTable/Push": Leaf(table.push if table else None, "count"),
         "CompensationTable/Since": Leaf(table.since_utc if table else None, "time"),
-        "CompensationTable/Verified": Leaf({"verified": True, "unverified": False}.get(facts.verified.state), "flag"),
-        "CompensationTable/VerifiedText": Leaf(facts.verified.text or None, "text"),
+        "CompensationTable/Verified": Leaf({"verified": True, "unverified": False}.get(verified.state if verified else ""), "flag"),
+        "CompensationTable/VerifiedText": Leaf(verified.text if verified else None, "text"),
     }
 
 

@@ -9,8 +9,9 @@ from typing import Any
 
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.progress import RunningCheck
+from abbe.service.domain.verification import Verdict, Verification
 from abbe.service.errors import StoreError
-from abbe.service.plant.facts import Alarm, Check, Facts, PlantFigure, TableInForce
+from abbe.service.plant.facts import Facts, PlantAlarm, TableInForce
 from tests.patience import within
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -19,10 +20,23 @@ RUNNING = RunningCheck(
 )
 
 
-def check(number: int, verdict: str = "pass", **figures: float | None) -> Check:
+def check(number: int, verdict: Verdict = "pass", **figures: float | None) -> Verification:
     chosen = figures or {"body_diagonal_um": 11.8, "helix_rms_um": 1.4}
-    rows = tuple(PlantFigure(key, value, 1.1, 20.0) for key, value in chosen.items())
-    return Check(number, "weekly", "quick-check", NOON - timedelta(hours=100 - number), 61.0, verdict, f"check {number}: {verdict}", rows)
+    at = NOON - timedelta(hours=100 - number)
+    return Verification(
+        id=number,
+        machine="mill-7",
+        schedule="weekly",
+        recipe="quick-check",
+        slot_utc=at,
+        started_utc=at,
+        duration_s=61.0,
+        verdict=verdict,
+        values=chosen,
+        uncertainties=dict.fromkeys(chosen, 1.1),
+        limits=dict.fromkeys(chosen, 20.0),
+        text=f"check {number}: {verdict}",
+    )
 
 
 def facts(**changes: Any) -> Facts:
@@ -37,7 +51,7 @@ def facts(**changes: Any) -> Facts:
         running=None,
         next_utc=NOON + timedelta(days=1),
         checks=(check(2, "fail"), check(1)),
-        alarms=(Alarm("DRV-002", "open: refused", NOON - timedelta(hours=98), "cnc"),),
+        alarms=(PlantAlarm("DRV-002", "open: refused", NOON - timedelta(hours=98), "cnc"),),
         devices=devices,
         table=TableInForce(1, 0xBEEF, 4, NOON),
     )

@@ -88,9 +88,9 @@ async def test_facts_of_a_real_store(store: ServiceStore) -> None:
     board.job_progress(STEP)
     board.changes += 1
     known = await gatherer.facts()
-    assert [(one.number, one.verdict) for one in known.checks] == [(2, "pass"), (1, "cannot tell")]
+    assert [(one.id, one.verdict) for one in known.checks] == [(2, "pass"), (1, "cannot tell")]
     (figure,) = known.checks[0].figures
-    assert (figure.key, figure.value, figure.expanded, figure.limit) == ("body_diagonal_um", 11.8, 1.1, 20.0)
+    assert (figure.name, figure.value, figure.expanded, figure.limit) == ("body_diagonal_um", 11.8, 1.1, 20.0)
     assert sorted((alarm.code, alarm.text) for alarm in known.alarms) == [("DRV-002", "refused"), ("SCH-001", "mill-7/weekly was missed")]
     assert known.table is not None
     assert (known.table.bank, known.table.crc) == (0, 11)
