@@ -17,7 +17,8 @@ from abbe.service.campaigns.plan_instruments import at_this_machine
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import ConfigError
 from abbe.service.rendering.document import Document, Lines, Picture, Section, TextTable
-from abbe.service.rendering.plots.setups import SetupPath, setups_picture
+from abbe.service.rendering.plots.setups import setups_picture
+from abbe.service.rendering.plots.views import DrawnTest
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe
 from abbe.service.sequences.recipes.recipe_file import recipe_text
@@ -161,7 +162,7 @@ def plan_report(site: Site, planned: PlannedCampaign) -> Document:
     """The picture of the set-ups and what each measurement buys."""
     plan = planned.plan
     paths = [
-        SetupPath(int(s.setup_id.removeprefix("S")), _kind(s.test), words(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
+        DrawnTest(int(s.setup_id.removeprefix("S")), _kind(s.test), words(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
         for s, run in zip(plan.steps, plan.runs, strict=True)
     ]
     lead = [f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_words(plan), *planned.notes]

@@ -39,9 +39,12 @@ class Rehearsal:
             Options that do not go together, or a file that would overwrite what it is made of.
         """
         from abbe.service.errors import ConfigError
+        from abbe.service.rendering.document_page import form_of
 
         if self.picture is not None and not self.dry_run:
             raise ConfigError("--picture draws a dry run", "add --dry-run")
+        if self.picture is not None:
+            form_of(self.picture)
         if self.path and not self.dry_run:
             raise ConfigError("--path prints the positions of a dry run", "add --dry-run")
         if bool(self.nc) != (self.out is not None):

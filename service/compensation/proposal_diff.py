@@ -6,39 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abbe.models.arrays import F1
 from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.errors import TableRefused
 from abbe.service.rendering.document import Document, Picture, Section, TextTable
-from abbe.service.rendering.plots.table_change import DiffCurve, change_plot
+from abbe.service.rendering.plots.table_change import CurveChange, change_plot
 from abbe.service.storage.store import Store
 
 ACTIVE = "ACTIVE"
 HEADINGS = ("table", "old max (µm)", "new max (µm)", "largest change (µm)", "U (µm)", "at (mm)", "rms change (µm)")
-
-
-@dataclass(frozen=True, slots=True)
-class CurveChange:
-    """One table of two sets on the grid of the new one, mm. ``u_mm``: standard uncertainty of the new entries."""
-
-    moved: str
-    corrected: str
-    position_mm: F1
-    old_mm: F1
-    new_mm: F1
-    u_mm: F1
-
-    @property
-    def change_mm(self) -> F1:
-        """New minus old."""
-        return np.asarray(self.new_mm - self.old_mm)
-
-    @property
-    def worst(self) -> int:
-        """Index of the largest change."""
-        return int(np.abs(self.change_mm).argmax())
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +92,12 @@ def diff_report(found: TableDifference, proposed: Proposed) -> Document:
         f"(U = {2e3 * p.u_model_mm:.1f} µm, k = 2). The {largest(found)}.",
         *(f"Against it: {reason}" for reason in proposed.reasons),
     )
-    curves = tuple(DiffCurve(c.moved, c.corrected, c.position_mm, c.old_mm * 1e3, c.new_mm * 1e3, c.u_mm * 1e3) for c in found.curves)
     title = f"{found.new} against {found.old.split(' (')[0]}"
     caption = (
         "Corrections are added to the command. Band: expanded uncertainty (k = 2) of the new entries against the first one of their table."
     )
     sections = (
-        Section("What changes", [*lead, Picture(caption, [change_plot(curves)], "wide")]),
+        Section("What changes", [*lead, Picture(caption, [change_plot(found.curves)], "wide")]),
         Section("The nine tables", [TextTable(HEADINGS, rows(found))]),
     )
     return Document(kind="table-change", title=title, sections=sections, signatures=())

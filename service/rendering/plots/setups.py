@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from abbe.service.rendering.plots.isometric import Paper, ViewWindow, depth, draw_box, label_edges
+from abbe.service.rendering.plots.views import DrawnTest
 from abbe.service.rendering.svg import Svg
 
 F2 = NDArray[np.float64]
@@ -20,38 +20,14 @@ STYLES = {"bar": "c1", "line": "c2", "diagonal": "c3"}
 NAMES = {"bar": "ball-bar, its cup", "line": "laser along an axis", "diagonal": "laser along a body diagonal"}
 
 
-@dataclass(frozen=True, slots=True)
-class SetupPath:
-    """One planned measurement in space.
-
-    Parameters
-    ----------
-    number : int
-        Of its set-up.
-    kind : "bar", "line" or "diagonal"
-    words : str
-        What it is; shown when the pointer rests on it.
-    path_mm : array, shape (n, 3)
-        Commanded positions.
-    mount_mm : array, shape (3,)
-        Where the cup stands or the laser line starts.
-    """
-
-    number: int
-    kind: str
-    words: str
-    path_mm: F2
-    mount_mm: NDArray[np.float64]
-
-
-def setups_picture(stroke_mm: F2, paths: Sequence[SetupPath], *, key: str = "setups") -> str:
+def setups_picture(stroke_mm: F2, paths: Sequence[DrawnTest], *, key: str = "setups") -> str:
     """Isometric view of the strokes with all paths and, at each set-up, its number.
 
     Parameters
     ----------
     stroke_mm : array, shape (3, 2)
         First and last position of X, Y, Z.
-    paths : sequence of SetupPath
+    paths : sequence of DrawnTest
         In the order of measuring.
     """
     count = len({p.number for p in paths})

@@ -26,17 +26,17 @@ CORNERS = ((70.0, 40.0), (70.0, 420.0), (450.0, 420.0))
 
 @dataclass(frozen=True, slots=True)
 class DrawnTest:
-    """One test in space.
+    """One test, planned or rehearsed, in space.
 
     Parameters
     ----------
-    order : int
-        Place in the campaign, from 1.
-    kind : "bar" or "laser"
+    number : int
+        Its place in the campaign, or its set-up's, from 1.
+    kind : "bar", "laser", "line" or "diagonal"
     words : str
         What it is; shown when the pointer rests on it.
     path_mm : array, shape (n, 3)
-        Commanded positions that are read, in order.
+        Commanded positions, in order.
     mount_mm : array, shape (3,)
         Where the cup stands or the laser line starts.
     radius_mm : float
@@ -45,13 +45,13 @@ class DrawnTest:
         Whether its set-up begins with it: its number is drawn.
     """
 
-    order: int
+    number: int
     kind: str
     words: str
     path_mm: F2
     mount_mm: F1
-    radius_mm: float
-    mounts: bool
+    radius_mm: float = 0.0
+    mounts: bool = True
 
 
 def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views", unit: Unit = MM) -> str:
@@ -66,7 +66,7 @@ def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views"
     unit : Unit, optional
         What the reader sees places in.
     """
-    words = "; ".join(f"{t.order}: {t.words}" for t in tests)
+    words = "; ".join(f"{t.number}: {t.words}" for t in tests)
     svg = Svg(WIDTH, HEIGHT, key, f"Paths of {len(tests)} tests in three views", words)
     size = float((stroke_mm[:, 1] - stroke_mm[:, 0]).max()) * 1.04
     for (a, b, title), corner in zip(VIEWS, CORNERS, strict=True):
@@ -83,7 +83,7 @@ def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views"
             if test.mounts:
                 x, y = panel.at(test.mount_mm[a], test.mount_mm[b])
                 svg.dot((x, y), 4.0, f"f-{STYLES[test.kind]}", test.words)
-                svg.text((x + 6.0, y - 5.0), test.order, "t-head t-halo")
+                svg.text((x + 6.0, y - 5.0), test.number, "t-head t-halo")
     names = {"bar": "ball-bar: path, its bar, cup", "laser": "laser: path, where it starts"}
     used = [k for k in STYLES if any(t.kind == k for t in tests)]
     svg.legend((450.0, 70.0), [(f"s-{STYLES[used[0]]}", names[used[0]])] if used else [])
@@ -108,4 +108,4 @@ def _draw(svg: Svg, panel: Panel, test: DrawnTest, plane: tuple[int, int]) -> No
     if test.radius_mm:
         end = test.path_mm[0]
         svg.line(panel.at(test.mount_mm[a], test.mount_mm[b]), panel.at(end[a], end[b]), "key")
-        svg.dot(panel.at(end[a], end[b]), 2.5, "key-head", f"{test.order}: the bar where its path begins")
+        svg.dot(panel.at(end[a], end[b]), 2.5, "key-head", f"{test.number}: the bar where its path begins")

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from abbe.service.compensation.proposal_diff import ACTIVE, HEADINGS, compare, largest, rows
 from abbe.service.queries.proposals import ProposalDetail, ProposalSummary, proposal
 from abbe.service.queries.reader import Reader
-from abbe.service.rendering.plots.table_change import DiffCurve, change_plot
+from abbe.service.rendering.plots.table_change import change_plot
 from abbe.service.web.frame import current
 from abbe.service.web.units import INCH
 
@@ -59,9 +59,8 @@ def proposal_screen(reader: Reader, number: int) -> ProposalScreen:
     """
     found = proposal(reader, number)
     difference = compare(reader.store, number, ACTIVE)
-    curves = [DiffCurve(c.moved, c.corrected, c.position_mm, c.old_mm * 1e3, c.new_mm * 1e3, c.u_mm * 1e3) for c in difference.curves]
     # The SVG writer has escaped every text; escaping again would show the reader the tags.
-    picture = Markup(change_plot(curves))  # noqa: S704
+    picture = Markup(change_plot(difference.curves))  # noqa: S704
     headings = [_heading(h) for h in HEADINGS]
     return ProposalScreen(found, _facts(found), largest(difference), headings, [_row(r) for r in rows(difference)], picture)
 
