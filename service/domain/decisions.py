@@ -49,19 +49,25 @@ class ProposalRejection(ProposalDecision):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PushEntryRecord:
-    """One transition of a push, chained by ``prev`` to the entry before it in the same journal. Never changed after writing.
+class PushTransition:
+    """One transition of a push, chained by ``prev`` to the entry before it in the same journal.
 
     ``machine``: name of the journal (`chain_of`); ``push``: number of the push in it; ``seq``: number of the entry in its push, from 0;
-    ``prev``, ``digest``: SHA-256 of the entry before and of this one. The database gives ``id``.
+    ``prev``, ``digest``: SHA-256 of the entry before and of this one.
     """
 
-    id: int = 0
     machine: str
     push: int
     seq: int
     state: str
-    doc: Doc
     utc: str
     prev: str
     digest: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushEntryRecord(PushTransition):
+    """A transition as it is stored. Never changed after writing; the database gives ``id``."""
+
+    id: int = 0
+    doc: Doc

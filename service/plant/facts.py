@@ -13,7 +13,7 @@ from abbe.service.verification.verified_by import VerifiedBy
 
 
 @dataclass(frozen=True, slots=True)
-class Unit:
+class PlantUnit:
     """A unit: how it is written, its UNECE code (OPC UA), and its name in MTConnect with the factor to it."""
 
     symbol: str
@@ -28,18 +28,18 @@ class Unit:
 
 
 UNITS = {
-    "um": Unit("µm", "4H", "MILLIMETER", 1e-3),
-    "mm": Unit("mm", "MMT", "MILLIMETER"),
-    "urad": Unit("µrad", "B97"),
-    "ppm": Unit("ppm", "59"),
-    "s": Unit("s", "SEC", "SECOND"),
-    "c": Unit("°C", "CEL", "CELSIUS"),
-    "percent": Unit("%", "P1", "PERCENT"),
+    "um": PlantUnit("µm", "4H", "MILLIMETER", 1e-3),
+    "mm": PlantUnit("mm", "MMT", "MILLIMETER"),
+    "urad": PlantUnit("µrad", "B97"),
+    "ppm": PlantUnit("ppm", "59"),
+    "s": PlantUnit("s", "SEC", "SECOND"),
+    "c": PlantUnit("°C", "CEL", "CELSIUS"),
+    "percent": PlantUnit("%", "P1", "PERCENT"),
 }
 
 
-def unit_of(key: str) -> Unit | None:
-    """Unit of a figure, which stands at the end of its name; None: it has none."""
+def unit_of(key: str) -> PlantUnit | None:
+    """PlantUnit of a figure, which stands at the end of its name; None: it has none."""
     return UNITS.get(key.rpartition("_")[2]) if "_" in key else None
 
 
@@ -54,7 +54,7 @@ class PlantAlarm:
 
 
 @dataclass(frozen=True, slots=True)
-class TableInForce:
+class ActiveTable:
     """Which compensation table the push journal knows to be active. It is what we last saw, not a question to the controller."""
 
     bank: int
@@ -64,7 +64,7 @@ class TableInForce:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class PlantFacts:
     """Everything at one moment; checks and alarms newest first. ``table``: None when the journal does not know; ``verified``: which
     measurement stands behind it, None: not known here."""
 
@@ -76,7 +76,7 @@ class Facts:
     checks: tuple[Verification, ...]
     alarms: tuple[PlantAlarm, ...]
     devices: tuple[DeviceStatus, ...]
-    table: TableInForce | None = None
+    table: ActiveTable | None = None
     verified: VerifiedBy | None = None
 
     @property
@@ -95,7 +95,7 @@ class Facts:
 class FactsSource(Protocol):
     """Where the facts come from. Reads only."""
 
-    async def facts(self) -> Facts:
+    async def facts(self) -> PlantFacts:
         """Return the facts of this moment.
 
         Raises

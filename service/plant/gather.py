@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.verification import CheckFailure, Verification
-from abbe.service.plant.facts import Facts, PlantAlarm, TableInForce
+from abbe.service.plant.facts import ActiveTable, PlantAlarm, PlantFacts
 from abbe.service.queries.status import Status
 
 SHOWN_ALARMS = 20
@@ -43,9 +43,9 @@ class Gatherer:
     def __init__(self, status: Callable[[], Awaitable[Status]], archive: Archive | None = None, control: str = "") -> None:
         self._status, self._archive, self._control = status, archive, control
         self._revision = ""
-        self._slow: tuple[tuple[PlantAlarm, ...], TableInForce | None] = ((), None)
+        self._slow: tuple[tuple[PlantAlarm, ...], ActiveTable | None] = ((), None)
 
-    async def facts(self) -> Facts:
+    async def facts(self) -> PlantFacts:
         """Return the facts of this moment. Slots and pushes are read anew when the status has changed, or the minute.
 
         Raises
@@ -60,7 +60,7 @@ class Gatherer:
             self._revision = revision
         failed = [_alarm_of(check, check.cause) for check in status.last if check.cause is not None]
         alarms = sorted([*failed, *self._slow[0]], key=lambda alarm: alarm.at_utc, reverse=True)
-        return Facts(
+        return PlantFacts(
             machine=status.machine,
             version=status.version,
             now_utc=status.now_utc,
@@ -73,7 +73,7 @@ class Gatherer:
             verified=status.verified,
         )
 
-    def _read(self, archive: Archive, machine: str) -> tuple[tuple[PlantAlarm, ...], TableInForce | None]:
+    def _read(self, archive: Archive, machine: str) -> tuple[tuple[PlantAlarm, ...], ActiveTable | None]:
         slots = archive.slots_not_run(machine, SHOWN_ALARMS)
         return tuple(_slot_alarm(slot) for slot in slots), table_in_force(archive.last_push(machine, self._control))
 
@@ -89,7 +89,7 @@ def _slot_alarm(slot: SlotRecord) -> PlantAlarm:
     )
 
 
-def table_in_force(journal: Sequence[PushEntryRecord]) -> TableInForce | None:
+def table_in_force(journal: Sequence[PushEntryRecord]) -> ActiveTable | None:
     """Which table is active after a push, as far as its journal knows.
 
     Before activation and after one that came to nothing it is the old one, after KEEP the new one, after a person's word the one that
@@ -104,7 +104,7 @@ def table_in_force(journal: Sequence[PushEntryRecord]) -> TableInForce | None:
     found = _bank_and_crc(last.state, known)
     if found is None or not all(isinstance(part, int) for part in found):
         return None
-    return TableInForce(found[0], found[1], last.push, datetime.fromisoformat(last.utc))
+    return ActiveTable(found[0], found[1], last.push, datetime.fromisoformat(last.utc))
 
 
 def _bank_and_crc(state: str, known: Mapping[str, Any]) -> tuple[Any, Any] | None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from abbe.service.domain.verification import Verification
-from abbe.service.plant.facts import Facts
+from abbe.service.plant.facts import PlantFacts
 
 VERSION = "1.8"
 BUFFER = 4096
@@ -69,7 +69,7 @@ class Agent:
         self._next = 1
         self._seen = 0
 
-    def update(self, facts: Facts) -> None:
+    def update(self, facts: PlantFacts) -> None:
         """Take in what is new."""
         now, job = facts.now_utc, facts.running
         self._put("avail", now, "AVAILABLE")
@@ -101,7 +101,7 @@ class Agent:
             gone = self._buffer.popleft()
             self._before[gone.item] = gone
 
-    def probe(self, facts: Facts) -> bytes:
+    def probe(self, facts: PlantFacts) -> bytes:
         """Return the Devices document."""
         root = _root("MTConnectDevices", self._header(facts.now_utc, assetBufferSize="0", assetCount="0"))
         name = _clean(facts.machine)
@@ -115,14 +115,14 @@ class Agent:
             ET.SubElement(items, "DataItem", attributes)
         return _bytes(root)
 
-    def current(self, facts: Facts, query: Mapping[str, str]) -> bytes:
+    def current(self, facts: PlantFacts, query: Mapping[str, str]) -> bytes:
         """Return the Streams document of what holds now, or held when observation ``at`` was made."""
         _only(query, {"at"})
         at = self._number(query, "at", self._next - 1, self._first, self._next - 1)
         held = self._before | {one.item: one for one in self._buffer if one.sequence <= at}
         return self._streams(facts, list(held.values()), at + 1)
 
-    def sample(self, facts: Facts, query: Mapping[str, str]) -> bytes:
+    def sample(self, facts: PlantFacts, query: Mapping[str, str]) -> bytes:
         """Return the Streams document of up to ``count`` observations from number ``from`` on."""
         _only(query, {"from", "count"})
         start = self._number(query, "from", self._first, self._first, self._next)
@@ -146,7 +146,7 @@ class Agent:
             raise MtconnectRefusal("OUT_OF_RANGE", f"{name} is {text[:40]}, expected {least} to {most}", 404)
         return number
 
-    def _streams(self, facts: Facts, found: list[Observation], following: int) -> bytes:
+    def _streams(self, facts: PlantFacts, found: list[Observation], following: int) -> bytes:
         numbers = {"nextSequence": following, "firstSequence": self._first, "lastSequence": self._next - 1}
         root = _root("MTConnectStreams", self._header(facts.now_utc, **{key: str(value) for key, value in numbers.items()}))
         name = _clean(facts.machine)
@@ -200,7 +200,7 @@ def _result(check: Verification, verdict: str) -> Entries:
     return (*head.items(), ("started_utc", _stamp(check.started_utc)))
 
 
-def _condition(facts: Facts) -> tuple[str, str, str]:
+def _condition(facts: PlantFacts) -> tuple[str, str, str]:
     """Text, level and code of what the last check says of the machine."""
     if facts.verified is not None and not facts.verified.holds:
         state = facts.verified.state

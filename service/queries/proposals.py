@@ -13,7 +13,7 @@ from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.errors import NotStored, Unusable
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import JournalEntry
-from abbe.service.queries.reader import Doc, Reader, as_stored, of_row
+from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
 from abbe.service.storage.base import utc_text
 
 ProposalState = Literal["refused", "rejected", "proposed", "approved", "expired", "superseded", "pushed", "kept", "rolled back", "changed"]
@@ -30,16 +30,12 @@ class PredictedRms:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProposalSummary:
+class ProposalSummary(StoredResult):
     """Proposed tables. ``state`` changed: the row is not what was stored, so nothing else can be said of it. ``by``: account."""
 
-    number: int
-    machine: str
     solution: int
-    created_utc: str
     state: ProposalState
     why: str
-    campaign: str = ""
     by: str = ""
     predicted_rms_um: PredictedRms | None = None
 
@@ -97,7 +93,7 @@ def _summary(reader: Reader, row: Doc, standings: _Standings) -> ProposalSummary
             proposed = load(reader.store, row["id"])
             now = standings.of(row["id"], proposed)
     except (Unusable, NotStored) as error:
-        return of_row(ProposalSummary, row, solution=row["solution_id"], state="changed", why=error.detail)
+        return of_row(ProposalSummary, row, campaign="", solution=row["solution_id"], state="changed", why=error.detail)
     return of_row(ProposalSummary, row, **_known(row, proposed, now))
 
 

@@ -5,22 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from abbe.service.domain.decisions import PushTransition
 from abbe.service.queries.reader import Reader, of_row
 from abbe.service.tables.table_history import TableHistory, table_history
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PushEntry:
+class PushEntry(PushTransition):
     """One transition of one push in the journal of a machine, chained to the one before it."""
 
     number: int
-    machine: str
-    push: int
-    seq: int
-    state: str
-    utc: str
-    prev: str
-    digest: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

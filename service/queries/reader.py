@@ -77,6 +77,16 @@ class Reader:
         return found
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredResult:
+    """What every result of a campaign has in its list. ``number``: by which it is asked for."""
+
+    number: int
+    campaign: str
+    machine: str
+    created_utc: str
+
+
 def of_row(kind: type[T], row: Mapping[str, Any], **known: Any) -> T:
     """A row of the store as a record: every field has the name of its column, ``number`` that of ``id``; ``known`` comes first."""
     values = {"number": row["id"], **row, **known}

@@ -13,19 +13,15 @@ from abbe.service.domain.results import StepRecord
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import Unusable
 from abbe.service.identification.solution_field import node_map, stored_field
-from abbe.service.queries.reader import Reader, as_stored, of_row, read_as
+from abbe.service.queries.reader import Reader, StoredResult, as_stored, of_row, read_as
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SolutionSummary:
+class SolutionSummary(StoredResult):
     """What a solver found from some runs."""
 
-    number: int
-    campaign: str
-    machine: str
     kind: str
     runs: list[int]
-    created_utc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,13 +32,9 @@ class SolutionDetail(SolutionSummary):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DiscoverySummary:
+class DiscoverySummary(StoredResult):
     """One search for what a campaign's model lacks. ``state``, ``why``: the last state that it reached; empty: none yet."""
 
-    number: int
-    campaign: str
-    machine: str
-    created_utc: str
     state: str
     why: str
 

@@ -27,7 +27,7 @@ class BarSamples:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stretch:
+class SampleStretch:
     """Rows ``first`` to ``first + count - 1`` of ``total``."""
 
     run: int
@@ -37,7 +37,7 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Samples(Stretch):
+class Samples(SampleStretch):
     """A stretch of one channel as it arrived: ball-bar samples in columns, or records of another device."""
 
     channel: str
@@ -46,7 +46,7 @@ class Samples(Stretch):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunColumns(Stretch):
+class RunColumns(SampleStretch):
     """A stretch of the evaluated columns of a run (``abbe-run/1``): every reading with its place. null: the column is sealed."""
 
     columns: dict[str, list[float | None] | None]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
-from abbe.service.plant.facts import Facts, FactsSource
+from abbe.service.plant.facts import FactsSource, PlantFacts
 from abbe.service.plant.mtconnect import Agent, MtconnectRefusal
 from abbe.service.users.roles import Permission
 from abbe.service.web.login.access import needs
@@ -22,7 +22,7 @@ class MtconnectAccess:
         self._source = source
         self._agent: Agent | None = None
 
-    async def answer(self, request: Request, write: Callable[[Agent, Facts, Mapping[str, str]], bytes]) -> Response:
+    async def answer(self, request: Request, write: Callable[[Agent, PlantFacts, Mapping[str, str]], bytes]) -> Response:
         """Return a document, or the Error document of what cannot be answered."""
         facts = await self._source.facts()
         if self._agent is None:

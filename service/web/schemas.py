@@ -24,13 +24,13 @@ LONGEST_RECIPE = 180
 """The channel takes words of 200 characters, and the rate stands behind the name."""
 
 
-class Answer(BaseModel):
+class ApiAnswer(BaseModel):
     """Base of all answers. Times are UTC, ISO 8601; units stand in the names."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class ListPage(Answer):
+class ListPage(ApiAnswer):
     """A page of a list, newest first."""
 
     next_cursor: Annotated[int | None, Field(description="Give it as `cursor` for the next page; null: this is the last one.")]
@@ -84,65 +84,65 @@ class CheckList(ListPage):
     verifications: Sequence[Verification]
 
 
-class LatestChecks(Answer):
+class LatestChecks(ApiAnswer):
     """Checks of this service's machine, newest first."""
 
     verifications: Sequence[Verification]
 
 
-class DeviceList(Answer):
+class DeviceList(ApiAnswer):
     """Devices of this service's machine. They are not asked for this answer."""
 
     machine: str
     devices: Sequence[DeviceStatus]
 
 
-class Recipe(Answer):
+class Recipe(ApiAnswer):
     """A builtin recipe that a schedule can name."""
 
     name: str
     about: str
 
 
-class RecipeList(Answer):
+class RecipeList(ApiAnswer):
     """Builtin recipes."""
 
     recipes: Sequence[Recipe]
 
 
-class ErrorList(Answer):
+class ErrorList(ApiAnswer):
     """All codes of errors, and what they mean."""
 
     errors: Sequence[ErrorEntry]
 
 
-class Timetable(Answer):
+class Timetable(ApiAnswer):
     """The timetable of this service's machine."""
 
     machine: str
     schedules: Sequence[ScheduleState]
 
 
-class JobList(Answer):
+class JobList(ApiAnswer):
     """The latest jobs, newest first, and what can be started."""
 
     recipes: Sequence[str]
     jobs: Sequence[JobState]
 
 
-class UserList(Answer):
+class UserList(ApiAnswer):
     """All users."""
 
     users: Sequence[UserSummary]
 
 
-class AuditList(Answer):
+class AuditList(ApiAnswer):
     """Records, oldest first."""
 
     records: Sequence[AuditEvent]
 
 
-class Me(Answer):
+class Me(ApiAnswer):
     """Who asks. ``csrf_token`` is empty for tokens and onlookers."""
 
     name: str
@@ -151,7 +151,7 @@ class Me(Answer):
     csrf_token: str
 
 
-class Decision(Answer):
+class Decision(ApiAnswer):
     """What was decided, by whom. ``expiry``: of an approval."""
 
     proposal: int
@@ -162,13 +162,13 @@ class Decision(Answer):
     reason: str | None = None
 
 
-class Health(Answer):
+class Health(ApiAnswer):
     """The process answers, or is ready to work."""
 
     status: Literal["ok"] = "ok"
 
 
-class Problem(Answer):
+class Problem(ApiAnswer):
     """RFC 9457 problem details."""
 
     type: str = "about:blank"

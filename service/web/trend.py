@@ -27,7 +27,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class _Scale:
+class _PixelScale:
     """Maps [low, high] to pixels."""
 
     low: float
@@ -70,26 +70,26 @@ def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo, chang
     )
 
 
-def _changes(changes: Sequence[datetime], x: _Scale) -> list[str]:
+def _changes(changes: Sequence[datetime], x: _PixelScale) -> list[str]:
     """A line where another table came into force."""
     lines = [f"M{x(moment.timestamp()):.1f} {TOP + 4}V{HEIGHT - BOTTOM}" for moment in changes]
     return [f'<path class="changed" d="{line}"/>' for line in lines]
 
 
-def _time_scale(points: Sequence[Point], changes: Sequence[datetime]) -> _Scale:
+def _time_scale(points: Sequence[Point], changes: Sequence[datetime]) -> _PixelScale:
     first, last = points[0].at.timestamp(), max([points[-1].at, *changes]).timestamp()
     # A single check, or several within a minute, still get an axis with a length.
     margin = max((last - first) * 0.04, 30.0)
-    return _Scale(first - margin, last + margin, LEFT, WIDTH - RIGHT)
+    return _PixelScale(first - margin, last + margin, LEFT, WIDTH - RIGHT)
 
 
-def _value_scale(points: Sequence[Point]) -> _Scale:
+def _value_scale(points: Sequence[Point]) -> _PixelScale:
     highs = [point.value + point.uncertainty for point in points] + [point.limit for point in points if point.limit is not None]
     lows = [point.value - point.uncertainty for point in points]
     step = _step(max(highs) - min(0.0, *lows))
     low = math.floor(min(0.0, *lows) / step) * step
     high = math.ceil(max(highs) * 1.04 / step) * step
-    return _Scale(low, max(high, low + step), HEIGHT - BOTTOM, TOP + 4)
+    return _PixelScale(low, max(high, low + step), HEIGHT - BOTTOM, TOP + 4)
 
 
 def _step(length: float) -> float:
@@ -99,7 +99,7 @@ def _step(length: float) -> float:
     return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough)
 
 
-def _grid(y: _Scale) -> list[str]:
+def _grid(y: _PixelScale) -> list[str]:
     step = _step(y.high - y.low)
     lines = []
     for index in range(round((y.high - y.low) / step) + 1):
@@ -109,7 +109,7 @@ def _grid(y: _Scale) -> list[str]:
     return lines
 
 
-def _dates(points: Sequence[Point], x: _Scale, zone: tzinfo) -> list[str]:
+def _dates(points: Sequence[Point], x: _PixelScale, zone: tzinfo) -> list[str]:
     length = timedelta(seconds=x.high - x.low)
     form = "%H:%M:%S" if length < timedelta(minutes=10) else "%H:%M" if length < timedelta(hours=36) else "%d %b"
     texts = []
@@ -125,7 +125,7 @@ def _dates(points: Sequence[Point], x: _Scale, zone: tzinfo) -> list[str]:
     return texts
 
 
-def _limit(points: Sequence[Point], x: _Scale, y: _Scale) -> list[str]:
+def _limit(points: Sequence[Point], x: _PixelScale, y: _PixelScale) -> list[str]:
     """Draw the limit as a line with steps: a limit changed in the machine file did not hold before."""
     known = [(x(point.at.timestamp()), y(point.limit)) for point in points if point.limit is not None]
     if not known:
@@ -139,7 +139,7 @@ def _limit(points: Sequence[Point], x: _Scale, y: _Scale) -> list[str]:
     ]
 
 
-def _mark(point: Point, px: float, y: _Scale, unit: str) -> list[str]:
+def _mark(point: Point, px: float, y: _PixelScale, unit: str) -> list[str]:
     """Draw bar and mark. The verdict is a shape as well as a colour."""
     top, bottom, middle = y(point.value + point.uncertainty), y(point.value - point.uncertainty), y(point.value)
     bar = f'<path class="bar" d="M{px:.1f} {top:.1f}V{bottom:.1f}M{px - 4:.1f} {top:.1f}h8M{px - 4:.1f} {bottom:.1f}h8"/>'

@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Literal
 
 from abbe.service.domain.verification import Verification
-from abbe.service.plant.facts import Facts, PlantAlarm, Unit, unit_of
+from abbe.service.plant.facts import PlantAlarm, PlantFacts, PlantUnit, unit_of
 
 Value = str | bool | int | float | datetime | list[str] | list[datetime] | None
 Kind = Literal["text", "flag", "count", "real", "time", "texts", "times"]
@@ -22,14 +22,14 @@ class Leaf:
 
     value: Value
     kind: Kind
-    unit: Unit | None = None
+    unit: PlantUnit | None = None
 
 
 Picture = dict[str, Leaf]
 """Variables by their path under the machine's object, e.g. ``LastResult/Figures/body_diagonal_um``."""
 
 
-def picture_of(facts: Facts) -> Picture:
+def picture_of(facts: PlantFacts) -> Picture:
     """Return what is shown of the machine."""
     return {
         "State": Leaf(facts.state, "text"),
@@ -44,7 +44,7 @@ def picture_of(facts: Facts) -> Picture:
     }
 
 
-def _running(facts: Facts) -> Picture:
+def _running(facts: PlantFacts) -> Picture:
     now = facts.running
     return {
         "Check/Active": Leaf(now is not None, "flag"),
@@ -101,7 +101,7 @@ def _alarms(alarms: tuple[PlantAlarm, ...]) -> Picture:
     }
 
 
-def _table(facts: Facts) -> Picture:
+def _table(facts: PlantFacts) -> Picture:
     table, verified = facts.table, facts.verified
     return {
         "CompensationTable/Known": Leaf(table is not None, "flag"),
@@ -114,7 +114,7 @@ def _table(facts: Facts) -> Picture:
     }
 
 
-def _devices(facts: Facts) -> Picture:
+def _devices(facts: PlantFacts) -> Picture:
     out: Picture = {}
     for device in facts.devices:
         out[f"Devices/{device.role}/State"] = Leaf(device.state, "text")

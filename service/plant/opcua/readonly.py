@@ -27,7 +27,7 @@ ACTIVATION_S = 10.0
 READING = ua.AccessLevel.CurrentRead.mask | ua.AccessLevel.HistoryRead.mask
 
 
-class Reader(InternalSession):
+class ClientSession(InternalSession):
     """A client's session."""
 
     async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
@@ -108,7 +108,7 @@ class ReadOnlyServer(InternalServer):
 
     def create_session(self, name: str, user: Any = None, external: bool = False) -> InternalSession:
         """Return a session; one from outside can only read."""
-        return Reader(self, self.aspace, self.subscription_service, name, user=User(role=UserRole.Anonymous), external=external)
+        return ClientSession(self, self.aspace, self.subscription_service, name, user=User(role=UserRole.Anonymous), external=external)
 
     def register_server(self, server: Any, conf: Any = None) -> None:
         """Refuse: this is no discovery server, and the service needs no session."""

@@ -6,7 +6,7 @@ from datetime import datetime
 
 from asyncua import Node, Server, ua
 
-from abbe.service.plant.facts import Unit
+from abbe.service.plant.facts import PlantUnit
 from abbe.service.plant.opcua.picture import Kind, Leaf, Picture
 
 NAMESPACE = "urn:abbe:machine"
@@ -106,5 +106,5 @@ def _data(leaf: Leaf, now: datetime) -> ua.DataValue:
     return ua.DataValue(ua.Variant(leaf.value, variant), ua.StatusCode(ua.StatusCodes.Good), now, now)
 
 
-def _engineering(unit: Unit) -> ua.EUInformation:
+def _engineering(unit: PlantUnit) -> ua.EUInformation:
     return ua.EUInformation(UNECE, unit.number, ua.LocalizedText(unit.symbol), ua.LocalizedText(unit.symbol))

@@ -1,4 +1,4 @@
-"""Facts that tests turn."""
+"""PlantFacts that tests turn."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.verification import Verdict, Verification
 from abbe.service.errors import StoreError
-from abbe.service.plant.facts import Facts, PlantAlarm, TableInForce
+from abbe.service.plant.facts import ActiveTable, PlantAlarm, PlantFacts
 from tests.patience import within
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -39,12 +39,12 @@ def check(number: int, verdict: Verdict = "pass", **figures: float | None) -> Ve
     )
 
 
-def facts(**changes: Any) -> Facts:
+def facts(**changes: Any) -> PlantFacts:
     devices = (
         DeviceStatus(role="laser", url="", state="answered", at_utc=NOON),
         DeviceStatus(role="cnc", url="", state="fault", text="refused\x07by peer"),
     )
-    known = Facts(
+    known = PlantFacts(
         machine="mill-7",
         version="0.1.0",
         now_utc=NOON,
@@ -53,7 +53,7 @@ def facts(**changes: Any) -> Facts:
         checks=(check(2, "fail"), check(1)),
         alarms=(PlantAlarm("DRV-002", "open: refused", NOON - timedelta(hours=98), "cnc"),),
         devices=devices,
-        table=TableInForce(1, 0xBEEF, 4, NOON),
+        table=ActiveTable(1, 0xBEEF, 4, NOON),
     )
     return replace(known, **changes)
 
@@ -62,7 +62,7 @@ class Source:
     """A FactsSource whose facts are set by the test; None: the database does not answer."""
 
     def __init__(self) -> None:
-        self.now: Facts | None = facts()
+        self.now: PlantFacts | None = facts()
         self._questions: asyncio.Queue[None] = asyncio.Queue()
 
     async def asked_again(self, times: int = 2) -> None:
@@ -73,7 +73,7 @@ class Source:
             for _ in range(times):
                 await self._questions.get()
 
-    async def facts(self) -> Facts:
+    async def facts(self) -> PlantFacts:
         self._questions.put_nowait(None)
         if self.now is None:
             raise StoreError("the database is locked")

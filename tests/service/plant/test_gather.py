@@ -1,4 +1,4 @@
-"""Facts are what the page, the slots and the journal of pushes say; and a picture of them shows nothing that is not known."""
+"""PlantFacts are what the page, the slots and the journal of pushes say; and a picture of them shows nothing that is not known."""
 
 from __future__ import annotations
 

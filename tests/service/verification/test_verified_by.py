@@ -20,7 +20,7 @@ from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.core.board import Board
 from abbe.service.domain.schedule import Schedule
-from abbe.service.plant.facts import Facts
+from abbe.service.plant.facts import PlantFacts
 from abbe.service.plant.gather import Gatherer
 from abbe.service.plant.mtconnect import Agent
 from abbe.service.plant.opcua.picture import picture_of
@@ -93,7 +93,7 @@ class World:
         past = asyncio.run(self._view().verifications(50))
         return render(environment(), self.status(), past)
 
-    def facts(self) -> Facts:
+    def facts(self) -> PlantFacts:
         return asyncio.run(Gatherer(self._view().status, self.store).facts())
 
     def report(self, check: int) -> Document:
